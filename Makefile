@@ -1,0 +1,104 @@
+# Every target sets up what it needs in the virtual environment $(VENV): the first run installs,
+# later runs reuse it until pyproject.toml changes. The one prerequisite is Python >= 3.11 with pip.
+
+PYTHON ?= python3
+VENV ?= .venv
+WORKERS ?= 2
+
+BIN := $(VENV)/bin
+export JAX_PLATFORMS ?= cpu
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+# Two targets would run pip in the same environment.
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help demo test slow lint format types docs examples bench bench-smoke build clean distclean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
+	  || sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1: \2/p' Makefile
+	@echo "Another Python than '$(PYTHON)': make TARGET PYTHON=python3.12"
+
+# ---- Set-up: one stamp per optional extra of pyproject.toml ----
+
+$(BIN)/python:
+	@command -v "$(PYTHON)" >/dev/null || { \
+	  echo "There is no '$(PYTHON)' here. Install Python 3.11 or newer, or name one:" \
+	       "make TARGET PYTHON=/path/to/python3" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "diffrax-conserve needs Python 3.11 or newer, but '$(PYTHON)' is" \
+	       "$$("$(PYTHON)" --version 2>&1). Name a newer one: make TARGET PYTHON=python3.12" >&2; \
+	  exit 1; }
+	@echo "Creating the virtual environment $(VENV)"
+# Debian's Python has no ensurepip unless python3-venv is installed; there the pip outside installs
+# the one inside.
+	@"$(PYTHON)" -m venv --clear "$(VENV)" >/dev/null 2>&1 || { \
+	  "$(PYTHON)" -m venv --clear --without-pip "$(VENV)" && \
+	  "$(PYTHON)" -m pip --python "$(BIN)/python" install --quiet pip; }
+
+$(VENV)/.installed-%: pyproject.toml | $(BIN)/python
+	@echo "Installing diffrax-conserve[$*] into $(VENV)"
+	@$(BIN)/python -m pip install --quiet --editable '.[$*]'
+	@touch $@
+
+PLOTS := $(VENV)/.installed-plots
+TEST := $(VENV)/.installed-test
+DEV := $(VENV)/.installed-dev
+DOCS := $(VENV)/.installed-docs
+
+# ---- What a newcomer runs ----
+
+demo: $(PLOTS) ## reproduce two of the paper's examples into out/
+	$(BIN)/python -m diffrax_conserve reproduce rigid-body --out out/rigid-body
+	$(BIN)/python -m diffrax_conserve reproduce kepler --out out/kepler
+
+test: $(TEST) ## run the tests, without the slow ones
+	$(BIN)/python -m pytest -n $(WORKERS) -m "not slow and not examples"
+
+# ---- What a developer runs ----
+
+slow: $(TEST) ## run the slow tests
+	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+
+lint: $(DEV) ## check style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(DEV) ## fix what `make lint` can fix by itself
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(DEV) ## check the types of the package
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(DOCS) ## build the documentation into site/, strictly
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
+examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
+	$(BIN)/python -m pytest -n $(WORKERS) -qq -m examples tests/test_docs.py
+	@echo "Every example ran."
+
+bench: $(PLOTS) ## measure the overhead of the projection
+	$(BIN)/python benchmarks/overhead.py
+
+bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
+	$(BIN)/python benchmarks/overhead.py --smoke
+
+# The environment of the check is new and its folder is not this one: only the wheel can be imported.
+build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own
+	rm -rf dist
+	$(BIN)/python -m build
+	@root=$$PWD; tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; set -e; \
+	"$(BIN)/python" -m venv --without-pip "$$tmp/venv"; \
+	"$(BIN)/python" -m pip --python "$$tmp/venv/bin/python" install --quiet "$$root"/dist/*.whl; \
+	cd "$$tmp"; \
+	venv/bin/python -c 'import diffrax_conserve as d; print(d.__version__, d.__file__)'; \
+	venv/bin/python -m diffrax_conserve list
+
+clean: ## remove what the targets wrote, but not the virtual environment
+	rm -rf dist site out .pytest_cache .ruff_cache .hypothesis
+
+distclean: clean ## remove the virtual environment too
+	rm -rf "$(VENV)"

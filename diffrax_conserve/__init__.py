@@ -1,0 +1,12 @@
+from ._diagnostics import drift as drift
+from ._manifold import Constraint as Constraint
+from ._manifold import FirstIntegral as FirstIntegral
+from ._projection import AbstractProjection as AbstractProjection
+from ._projection import Newton as Newton
+from ._projection import ProjectionInfo as ProjectionInfo
+from ._projection import SimplifiedNewton as SimplifiedNewton
+from ._projection import project as project
+from ._solver import RK4 as RK4
+from ._solver import ManifoldProjection as ManifoldProjection
+
+__version__ = "0.1.0"

@@ -1,0 +1,106 @@
+"""How well a solution was conserved."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from ._custom_types import Args, Manifold, Values
+from ._manifold import check_manifold, conserved_values, evaluate, targets
+
+
+def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
+    r"""The residual of every constraint at every saved time, relative to its scale.
+
+    For a first integral $I$ this is
+
+    $$\frac{I(t_k, y_k) - I(t_0, y_0)}{|I(t_0, y_0)| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
+
+    where $(t_0, y_0)$ is the first saved state; for a `Constraint`, $g(t_k, y_k)$ over the same
+    scale. The scale is what roundoff is relative to: a momentum that vanishes as the sum of large
+    terms is not divided by zero.
+
+    **Arguments:**
+
+    - `sol`: what `diffrax.diffeqsolve` returned. It needs saved times; save `t0` too (as in
+        `SaveAt(t0=True, steps=True)`) if the drift from the initial state is wanted. For a batch
+        of solutions use `jax.vmap`.
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `args`: as given to `diffeqsolve`.
+
+    **Returns:**
+
+    A PyTree like the values of the functions in `manifold`, with a leading axis of saved times.
+    Rows that diffrax padded (times `inf`) are zero.
+
+    **Raises:**
+
+    `ValueError` if the solution holds no saved states, or is a batch.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+        sol = diffrax.diffeqsolve(
+            term,
+            dfc.ManifoldProjection(diffrax.Tsit5(), square),
+            t0=0,
+            t1=9,
+            dt0=0.1,
+            y0=jnp.array([1.0, 0.0]),
+            saveat=diffrax.SaveAt(t0=True, steps=True),
+        )
+        print(jnp.max(jnp.abs(dfc.drift(sol, square))))
+        ```
+    """
+    check_manifold(manifold)
+    if sol.ts is None or sol.ys is None:
+        raise ValueError(
+            "`drift` needs saved states, but `sol` holds none. Save some, for example with "
+            "`saveat=SaveAt(t0=True, steps=True)`."
+        )
+    if sol.ts.ndim != 1:
+        raise ValueError(
+            f"`drift` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch write "
+            "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
+        )
+    ts, ys = sol.ts, sol.ys
+    t0, y0 = ts[0], jtu.tree_map(lambda y: y[0], ys)
+    values = conserved_values(manifold, t0, y0, args)
+    target = targets(manifold, values, evaluate(manifold, t0, y0, args))
+    jacobian = jax.jacrev(lambda y: evaluate(manifold, t0, y, args))(y0)
+
+    def scale(value, rows):
+        terms = jtu.tree_map(lambda y, row: _contract_abs(row, y), y0, rows)
+        return jnp.abs(value) + sum(jtu.tree_leaves(terms))
+
+    outer = jtu.tree_structure(target)
+    scales = [
+        scale(value, rows)
+        for value, rows in zip(
+            jtu.tree_leaves(target), outer.flatten_up_to(jacobian), strict=True
+        )
+    ]
+
+    def relative(t, y):
+        padded = ~jnp.isfinite(t)
+        y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
+        t = jnp.where(padded, t0, t)
+        leaves = jtu.tree_leaves(evaluate(manifold, t, y, args))
+        out = [
+            jnp.where(padded, 0, (x - jnp.asarray(v, x.dtype)) / jnp.where(s > 0, s, 1))
+            for x, v, s in zip(leaves, jtu.tree_leaves(target), scales, strict=True)
+        ]
+        return jtu.tree_unflatten(outer, out)
+
+    return jax.vmap(relative)(ts, ys)
+
+
+def _contract_abs(row, y):
+    axes = tuple(range(row.ndim - y.ndim, row.ndim))
+    return jnp.sum(jnp.abs(row) * jnp.abs(y), axis=axes)

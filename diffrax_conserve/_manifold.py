@@ -1,0 +1,216 @@
+"""What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
+
+import abc
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
+
+
+class AbstractConserved(eqx.Module):
+    """One entry of a manifold: a function of `(t, y, args)` and what its value must be."""
+
+    fn: eqx.AbstractVar[ConstraintFn]
+
+    @abc.abstractmethod
+    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values | None:
+        """What `fn` is kept at in a solve that starts at `(t, y, args)`; `None` means zero."""
+
+
+@final
+class FirstIntegral(AbstractConserved):
+    r"""A function $I(t, y, args)$ that is constant along the exact solution.
+
+    The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
+    that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        def energy(t, y, args):
+            q, p = y
+            return 0.5 * (p**2 + q**2)
+
+        integral = dfc.FirstIntegral(energy)
+        ```
+    """
+
+    fn: ConstraintFn
+    value: Values | None
+
+    def __init__(self, fn: ConstraintFn, *, value: Values | None = None):
+        self.fn = fn
+        self.value = value
+
+    def __check_init__(self):
+        _check_callable(self)
+
+    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        return self.fn(t, y, args) if self.value is None else self.value
+
+
+FirstIntegral.__init__.__doc__ = r"""**Arguments:**
+
+- `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
+    be differentiated) that returns a PyTree of real arrays. Every array element is one first
+    integral.
+- `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
+    from the initial state of the solve.
+"""
+
+
+@final
+class Constraint(AbstractConserved):
+    r"""A function $g(t, y, args)$ that is zero along the exact solution.
+
+    The manifold is $\{y : g(t, y, args) = 0\}$.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        import diffrax_conserve as dfc
+
+        unit_length = dfc.Constraint(lambda t, q, args: jnp.sum(q**2) - 1)
+        ```
+    """
+
+    fn: ConstraintFn
+
+    def __check_init__(self):
+        _check_callable(self)
+
+    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> None:
+        del t, y, args
+
+
+Constraint.__init__.__doc__ = r"""**Arguments:**
+
+- `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
+    be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
+    constraint.
+"""
+
+
+def _check_callable(entry: AbstractConserved) -> None:
+    if not callable(entry.fn):
+        name = type(entry).__name__
+        raise TypeError(
+            f"`{name}(fn)` takes a callable `fn(t, y, args)`, but `fn` is {entry.fn!r}. "
+            f"Write for example `{name}(lambda t, y, args: ...)`."
+        )
+
+
+def is_entry(x: Any) -> bool:
+    return isinstance(x, AbstractConserved)
+
+
+def check_manifold(manifold: Manifold) -> None:
+    """Raises unless `manifold` is a non-empty PyTree of `FirstIntegral`s and `Constraint`s."""
+    entries = _named_entries(manifold)
+    for name, entry in entries:
+        if not is_entry(entry):
+            remedy = (
+                "Wrap it: `FirstIntegral(fn)` keeps `fn(t, y, args)` at its initial value, "
+                "`Constraint(fn)` keeps it at zero."
+                if callable(entry)
+                else "Each leaf must be a `FirstIntegral(fn)` or a `Constraint(fn)`."
+            )
+            raise TypeError(
+                f"`{name}` is {entry!r}, which is neither a `FirstIntegral` nor a `Constraint`. "
+                + remedy
+            )
+    if not entries:
+        raise ValueError(
+            f"`manifold` is {manifold!r}, which holds no `FirstIntegral` and no `Constraint`: "
+            "there is nothing to conserve. Give at least one, or use the solver without projection."
+        )
+
+
+def _named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+    return [(f"manifold{jtu.keystr(path)}", entry) for path, entry in flat]
+
+
+def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """`manifold` with each entry replaced by `fn(t, y, args)`."""
+    return jtu.tree_map(
+        lambda entry: jtu.tree_map(jnp.asarray, entry.fn(t, y, args)), manifold, is_leaf=is_entry
+    )
+
+
+def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """`manifold` with each entry replaced by its conserved value (`None` for a constraint)."""
+    return jtu.tree_map(
+        lambda entry: jtu.tree_map(jnp.asarray, entry.conserved_value(t, y, args)),
+        manifold,
+        is_leaf=is_entry,
+    )
+
+
+def targets(manifold: Manifold, values: Values, outputs: Values) -> Values:
+    """What `evaluate` must equal: the conserved values, and zero for each constraint."""
+    return jtu.tree_map(
+        lambda entry, value, output: jtu.tree_map(jnp.zeros_like, output)
+        if isinstance(entry, Constraint)
+        else value,
+        manifold,
+        values,
+        outputs,
+        is_leaf=is_entry,
+    )
+
+
+def check_values(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> None:
+    """Raises unless every function of the manifold returns real floating-point arrays, as many in
+    all as there are unknowns or fewer, and `values` is shaped as what they return."""
+    entries = _named_entries(manifold)
+    expected = jtu.tree_structure(manifold, is_leaf=is_entry).flatten_up_to(values)
+    count = 0
+    for (name, entry), value in zip(entries, expected, strict=True):
+        output = eqx.filter_eval_shape(entry.fn, t, y, args)
+        for leaf in jtu.tree_leaves(output):
+            _check_output(name, leaf)
+        count += sum(leaf.size for leaf in jtu.tree_leaves(output))
+        if isinstance(entry, FirstIntegral) and _shapes(output) != _shapes(value):
+            raise ValueError(
+                f"The conserved value of `{name}` has the structure {_shapes(value)}, but its "
+                f"`fn(t, y, args)` returns {_shapes(output)}. Both must be the same."
+            )
+    unknowns = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
+    if count == 0:
+        raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
+    if count > unknowns:
+        raise ValueError(
+            f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
+            "unknowns: no state can satisfy them in general. Remove dependent ones."
+        )
+
+
+def _check_output(name: str, leaf: Any) -> None:
+    if not hasattr(leaf, "dtype"):
+        if isinstance(leaf, float):
+            return
+        got = f"{leaf!r}, which is no array"
+    elif not jnp.issubdtype(leaf.dtype, jnp.floating):
+        got = f"an array of dtype {leaf.dtype}"
+    else:
+        return
+    raise TypeError(
+        f"`fn` of `{name}` must return a PyTree of real floating-point arrays, but it returned "
+        f"{got}. Convert it, for example by `jnp.asarray(..., dtype=float)`, or split a complex "
+        "value into its real and its imaginary part."
+    )
+
+
+def _shapes(tree: Any) -> Any:
+    return jtu.tree_map(jnp.shape, tree)

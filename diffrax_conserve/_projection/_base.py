@@ -1,0 +1,94 @@
+"""What every projection takes and returns, and when it may call itself successful."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._custom_types import Y
+from ._jacobian import Residual, Vector
+
+
+class ProjectionInfo(eqx.Module):
+    """How a projection went.
+
+    **Attributes:**
+
+    - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
+        residual is within its tolerance.
+    - `num_steps`: how many iterations were made.
+    - `residual_before`, `residual_after`: the largest residual of the candidate and of the
+        projected state, each relative to the scale of its own constraint,
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
+    - `correction`: the Euclidean norm of the projected state minus the candidate.
+    """
+
+    result: optx.RESULTS
+    num_steps: Int[Array, ""]
+    residual_before: Float[Array, ""]
+    residual_after: Float[Array, ""]
+    correction: Float[Array, ""]
+
+
+class AbstractProjection(eqx.Module):
+    """A way to return from a candidate to the manifold."""
+
+    metric: eqx.AbstractVar[PyTree[Array] | None]
+
+    @abc.abstractmethod
+    def solve(
+        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
+    ) -> tuple[Y, ProjectionInfo]:
+        """The state on the manifold that belongs to `candidate`.
+
+        **Arguments:**
+
+        - `residual`: `y ↦ g(y)`, whose closed-over arrays are part of its PyTree.
+        - `magnitude`: the absolute conserved values, as `residual` returns them.
+        - `candidate`: the state to be projected.
+        - `weights`: `M⁻¹`, the inverse of the metric, shaped like the candidate.
+        """
+
+
+def tolerances(
+    magnitude: Vector, terms: Vector, rtol: float | Array | None, atol: float | Array | None
+) -> tuple[Vector, Vector]:
+    """The scale of each constraint, and the residual at which it counts as satisfied.
+
+    The scale is what roundoff is relative to: the conserved value and the terms that cancel in it.
+    """
+    scale = jtu.tree_map(lambda a, b: a + b.astype(a.dtype), magnitude, terms)
+
+    def tolerance(x: Array) -> Array:
+        # Evaluating a residual and rounding the state each cost about one unit of roundoff.
+        relative = ROUNDOFF_MULTIPLE * jnp.finfo(x.dtype).eps if rtol is None else rtol
+        absolute = 0 if atol is None else atol
+        return jnp.asarray(relative, x.dtype) * x + jnp.asarray(absolute, x.dtype)
+
+    return scale, jtu.tree_map(tolerance, scale)
+
+
+ROUNDOFF_MULTIPLE = 4
+
+
+def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
+    """Whether every residual is within its tolerance. NaN never is."""
+    satisfied = jtu.tree_map(lambda g, tol: jnp.all(jnp.abs(g) <= tol), residual, tolerance)
+    flags = jtu.tree_leaves(satisfied)
+    out = flags[0]
+    for flag in flags[1:]:
+        out = out & flag
+    return out
+
+
+def largest_relative(residual: Vector, scale: Vector) -> Float[Array, ""]:
+    """The largest residual relative to its scale."""
+
+    def relative(g: Array, s: Array) -> Array:
+        tiny = jnp.finfo(s.dtype).tiny
+        return jnp.max(jnp.abs(g) / jnp.maximum(s, tiny))
+
+    return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(relative, residual, scale))))

@@ -1,0 +1,210 @@
+"""The constraint Jacobian `G`, and linear solves with Gram matrices `G W Hᵀ`.
+
+Vectors of `m` numbers (residuals, multipliers) come in two forms, and code that uses them must
+treat them as PyTrees: for few constraints a tuple of `m` scalars, so that each product, sum and
+2×2 solve is plain elementwise arithmetic that XLA fuses into the step around it (a `linalg` call on
+a 2×2 matrix costs more than the step itself); for many, one array of shape `(m,)`.
+"""
+
+import abc
+import functools as ft
+from collections.abc import Callable
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree, Real
+
+from .._custom_types import Y
+from .._tree import tree_dot, tree_mul, working_dtype
+
+Vector = tuple[Real[Array, ""], ...] | Real[Array, " m"]
+Residual = Callable[[Y], Vector]
+
+# Up to this many constraints are unrolled: work and compile time grow as m², against a call into
+# LAPACK that costs some microseconds however small the matrix.
+UNROLLED_MAX = 6
+
+
+class AbstractJacobian(eqx.Module):
+    """The rows `∂g_i/∂y` at one state, each shaped like the state."""
+
+    @abc.abstractmethod
+    def pullback(self, multiplier: Vector) -> Y:
+        """`Gᵀ λ`, shaped like the state."""
+
+    @abc.abstractmethod
+    def pushforward(self, y: Y) -> Vector:
+        """`G y`."""
+
+    @abc.abstractmethod
+    def scale(self, y: Y) -> Vector:
+        """`Σ_k |y_k ∂g_i/∂y_k|`, the size of the terms that cancel in `g_i`."""
+
+    @abc.abstractmethod
+    def gram_solver(
+        self,
+        weights: Y,
+        other: "AbstractJacobian | None" = None,
+        damping: Real[Array, ""] | float = 0.0,
+    ) -> Callable[[Vector], Vector]:
+        """`b ↦ (G W Hᵀ)⁻¹ b`, with `H = G` if `other` is not given.
+
+        `damping` is added to the diagonal after the rows are scaled to a diagonal of ones.
+        """
+
+
+def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
+    """`g(y)` and `G(y)`."""
+    struct = eqx.filter_eval_shape(residual, y)
+    if isinstance(struct, tuple):
+        # One reverse pass per constraint, each of which touches only what that constraint depends
+        # on; XLA merges the forward passes.
+        outs, rows = zip(
+            *(jax.value_and_grad(lambda y, i=i: residual(y)[i])(y) for i in range(len(struct))),
+            strict=True,
+        )
+        return outs, _Unrolled(rows)
+    out, vjp = jax.vjp(residual, y)
+    (rows,) = jax.vmap(vjp)(jnp.eye(out.size, dtype=out.dtype))
+    return out, _Dense(rows)
+
+
+@final
+class _Unrolled(AbstractJacobian):
+    rows: tuple[Y, ...]
+
+    def pullback(self, multiplier: Vector) -> Y:
+        def combine(*leaves: Array) -> Array:
+            terms = [c.astype(x.dtype) * x for c, x in zip(multiplier, leaves, strict=True)]
+            return sum(terms[1:], start=terms[0])
+
+        return jtu.tree_map(combine, *self.rows)
+
+    def pushforward(self, y: Y) -> Vector:
+        dtype = working_dtype(y)
+        return tuple(tree_dot(row, y, dtype) for row in self.rows)
+
+    def scale(self, y: Y) -> Vector:
+        magnitude = jtu.tree_map(jnp.abs, y)
+        dtype = working_dtype(y)
+        return tuple(tree_dot(jtu.tree_map(jnp.abs, r), magnitude, dtype) for r in self.rows)
+
+    def gram_solver(
+        self,
+        weights: Y,
+        other: AbstractJacobian | None = None,
+        damping: Real[Array, ""] | float = 0.0,
+    ) -> Callable[[Vector], Vector]:
+        columns = self.rows if other is None else other.rows
+        dtype = working_dtype(columns[0])
+        weighted = [tree_mul(column, weights) for column in columns]
+        symmetric = other is None
+        gram: list[list[Array]] = []
+        for i, row in enumerate(self.rows):
+            gram.append(
+                [
+                    gram[j][i] if symmetric and j < i else tree_dot(row, weighted[j], dtype)
+                    for j in range(len(columns))
+                ]
+            )
+        return _unrolled_solver(gram, damping)
+
+
+@final
+class _Dense(AbstractJacobian):
+    rows: PyTree[Array]  # each leaf with a leading axis of length m
+
+    def pullback(self, multiplier: Vector) -> Y:
+        return jtu.tree_map(
+            lambda x: jnp.tensordot(
+                multiplier.astype(x.dtype), x, axes=1, precision=lax.Precision.HIGHEST
+            ),
+            self.rows,
+        )
+
+    def pushforward(self, y: Y) -> Vector:
+        dtype = working_dtype(y)
+        return jax.vmap(lambda row: tree_dot(row, y, dtype))(self.rows)
+
+    def scale(self, y: Y) -> Vector:
+        magnitude = jtu.tree_map(jnp.abs, y)
+        dtype = working_dtype(y)
+        return jax.vmap(lambda row: tree_dot(jtu.tree_map(jnp.abs, row), magnitude, dtype))(
+            self.rows
+        )
+
+    def gram_solver(
+        self,
+        weights: Y,
+        other: AbstractJacobian | None = None,
+        damping: Real[Array, ""] | float = 0.0,
+    ) -> Callable[[Vector], Vector]:
+        columns = self.rows if other is None else other.rows
+        dtype = working_dtype(columns)
+
+        def product(row: Array, column: Array, weight: Array) -> Array:
+            m = row.shape[0]
+            weighted = column * weight.astype(column.dtype)[None]
+            return jnp.matmul(
+                row.reshape(m, -1), weighted.reshape(m, -1).T, precision=lax.Precision.HIGHEST
+            ).astype(dtype)
+
+        products = jtu.tree_leaves(jtu.tree_map(product, self.rows, columns, weights))
+        gram = ft.reduce(jnp.add, products)
+        inverse = _reciprocal(jnp.diagonal(gram))
+        damping = damping + _least_damping(gram.shape[0], dtype)
+        factors = jax.scipy.linalg.lu_factor(
+            gram * inverse[:, None] + damping * jnp.eye(gram.shape[0], dtype=dtype)
+        )
+        return lambda b: jax.scipy.linalg.lu_solve(factors, b * inverse)
+
+
+# Rows are scaled so that the diagonal of the Gram matrix is 1 (a row that vanishes stays zero, and
+# so does its multiplier), then a damping at the level of roundoff is added. Dependent constraints
+# leave a consistent singular system, whose solution the damping makes unique; what it adds along
+# the null vector n moves the state by `Gᵀ n = 0`. Anything larger would stall the iteration near
+# points where gradients are merely almost parallel.
+
+
+def _least_damping(m: int, dtype: jnp.dtype) -> float:
+    return 4 * m * float(jnp.finfo(dtype).eps)
+
+
+def _reciprocal(diagonal: Array) -> Array:
+    positive = diagonal > 0
+    return jnp.where(positive, 1 / jnp.where(positive, diagonal, 1), 0)
+
+
+def _unrolled_solver(
+    gram: list[list[Array]], damping: Real[Array, ""] | float
+) -> Callable[[Vector], Vector]:
+    """LU factors, without pivoting: a Gram matrix is positive semi-definite, and one of two nearby
+    Jacobians nearly so."""
+    m = len(gram)
+    least = _least_damping(m, gram[0][0].dtype)
+    inverse = [_reciprocal(gram[i][i]) for i in range(m)]
+    lu = [[gram[i][j] * inverse[i] for j in range(m)] for i in range(m)]
+    pivots = []
+    for k in range(m):
+        pivots.append(1 / jnp.maximum(lu[k][k] + (least + damping), least))
+        for i in range(k + 1, m):
+            lu[i][k] = lu[i][k] * pivots[k]
+            for j in range(k + 1, m):
+                lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
+
+    def solve(b: Vector) -> Vector:
+        x = [b[i] * inverse[i] for i in range(m)]
+        for i in range(1, m):
+            for j in range(i):
+                x[i] = x[i] - lu[i][j] * x[j]
+        for i in reversed(range(m)):
+            for j in range(i + 1, m):
+                x[i] = x[i] - lu[i][j] * x[j]
+            x[i] = x[i] * pivots[i]
+        return tuple(x)
+
+    return solve

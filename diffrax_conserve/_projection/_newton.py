@@ -1,0 +1,192 @@
+"""Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
+
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, PyTree, Real
+
+from .._custom_types import Y
+from .._tree import tree_add, tree_dot, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
+from ._base import AbstractProjection, ProjectionInfo, largest_relative, tolerances, within
+from ._jacobian import Residual, Vector, linearise
+
+# Above this many unknowns the optimality system is solved iteratively, matrix-free.
+_DENSE_MAX = 256
+
+
+@final
+class Newton(AbstractProjection):
+    r"""Projects to the nearest point of the manifold, with a fresh Jacobian in each iteration.
+
+    Finds the stationary point of the distance, $(y, \lambda)$ with
+
+    $$y = \hat y + M^{-1} G(y)^\top \lambda, \qquad g(y) = 0,$$
+
+    in two phases. First a damped Gauss-Newton iteration reaches the manifold, with step halving
+    and a damping $\min(10^{-2}, |g|^2)$ of the row-scaled Gram matrix, which vanishes with the
+    (relative) residual: it passes near points where gradients become parallel, and converges
+    quadratically elsewhere. Then Newton's method on both equations moves along the manifold to
+    the point nearest to the candidate. That costs second derivatives of the constraint functions
+    and linear solves with all unknowns, so for the candidates of an integrator, which are close,
+    use [`diffrax_conserve.SimplifiedNewton`][].
+
+    The result is differentiated by the implicit function theorem on both equations.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        circle = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        y, info = dfc.project(circle, jnp.array([3.0, 4.0]), projection=dfc.Newton())
+        ```
+
+    ??? cite "Reference"
+
+        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
+        2006, Section IV.4, equations (4.3).
+    """
+
+    rtol: float | Array | None
+    atol: float | Array | None
+    max_steps: int = eqx.field(static=True)
+    metric: PyTree[Array] | None
+
+    def __init__(
+        self,
+        *,
+        rtol: float | Array | None = None,
+        atol: float | Array | None = None,
+        max_steps: int = 50,
+        metric: PyTree[Array] | None = None,
+    ):
+        self.rtol = rtol
+        self.atol = atol
+        self.max_steps = max_steps
+        self.metric = metric
+
+    def solve(
+        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
+    ) -> tuple[Y, ProjectionInfo]:
+        # The iterations are not differentiated: the optimality system is.
+        fixed = jtu.tree_map(
+            lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x,
+            (residual, magnitude, candidate, weights, self.rtol, self.atol),
+        )
+        start, multiplier, count = _reach(*fixed, self.max_steps)
+        y, nearest = _nearest(residual, candidate, weights, start, multiplier, self.max_steps)
+
+        before, at_candidate = linearise(residual, candidate)
+        after, at_y = linearise(residual, y)
+        scale_before, _ = tolerances(magnitude, at_candidate.scale(candidate), self.rtol, self.atol)
+        scale, tolerance = tolerances(magnitude, at_y.scale(y), self.rtol, self.atol)
+        correction = tree_sub(y, candidate)
+        info = ProjectionInfo(
+            result=optx.RESULTS.where(
+                within(after, tolerance) & (nearest.result == optx.RESULTS.successful),
+                optx.RESULTS.successful,
+                optx.RESULTS.where(
+                    jnp.isfinite(largest_relative(after, scale)),
+                    optx.RESULTS.nonlinear_max_steps_reached,
+                    optx.RESULTS.nonfinite,
+                ),
+            ),
+            num_steps=count + nearest.stats["num_steps"],
+            residual_before=largest_relative(before, scale_before),
+            residual_after=largest_relative(after, scale),
+            correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(correction))),
+        )
+        return y, lax.stop_gradient(info)
+
+
+def _reach(
+    residual: Residual,
+    magnitude: Vector,
+    candidate: Y,
+    weights: Y,
+    rtol: float | Array | None,
+    atol: float | Array | None,
+    max_steps: int,
+) -> tuple[Y, Vector, Array]:
+    """A damped Gauss-Newton iteration from the candidate to some point of the manifold, the
+    multipliers there that suit the candidate best, and the number of iterations."""
+
+    def squared(g: Vector, scale: Vector) -> Real[Array, ""]:
+        return jnp.square(jnp.linalg.norm(jnp.stack(_relative(g, scale)).astype(dtype)))
+
+    dtype = working_dtype(candidate)
+
+    def iterate(carry: tuple[Y, Array, Array]) -> tuple[Y, Array, Array]:
+        y, _, count = carry
+        g, jacobian = linearise(residual, y)
+        scale, tolerance = tolerances(magnitude, jacobian.scale(y), rtol, atol)
+        merit = squared(g, scale)
+        gram_solve = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
+        step = tree_mul(jacobian.pullback(gram_solve(g)), weights)
+
+        def worse(halving: tuple[Array, Y]) -> Array:
+            fraction, trial = halving
+            return (fraction > 1e-3) & ~(squared(residual(trial), scale) <= merit)
+
+        def halve(halving: tuple[Array, Y]) -> tuple[Array, Y]:
+            fraction = halving[0] / 2
+            return fraction, tree_sub(y, tree_scale(fraction, step))
+
+        one = jnp.ones((), dtype)
+        _, trial = lax.while_loop(worse, halve, (one, tree_sub(y, step)))
+        done = within(g, tolerance)
+        y = jtu.tree_map(lambda a, b: jnp.where(done, a, b), y, trial)
+        return y, done | ~jnp.isfinite(merit), count + jnp.where(done, 0, 1)
+
+    def unfinished(carry: tuple[Y, Array, Array]) -> Array:
+        _, done, count = carry
+        return ~done & (count < max_steps)
+
+    start = (candidate, jnp.asarray(False), jnp.asarray(0))
+    y, _, count = lax.while_loop(unfinished, iterate, start)
+    _, jacobian = linearise(residual, y)
+    multiplier = jacobian.gram_solver(weights)(jacobian.pushforward(tree_sub(y, candidate)))
+    return y, multiplier, count
+
+
+def _relative(g: Vector, scale: Vector) -> list[Array]:
+    ratios = jtu.tree_map(lambda a, s: jnp.where(s > 0, a / jnp.where(s > 0, s, 1), a), g, scale)
+    return [jnp.linalg.norm(jnp.atleast_1d(x)) for x in jtu.tree_leaves(ratios)]
+
+
+def _nearest(
+    residual: Residual, candidate: Y, weights: Y, start: Y, multiplier: Vector, max_steps: int
+) -> tuple[Y, optx.Solution]:
+    """Newton's method on `y = ŷ + M⁻¹ G(y)ᵀ λ`, `g(y) = 0`."""
+
+    def optimality(unknowns: tuple[Y, Vector], args) -> tuple[Y, Vector]:
+        y, multiplier = unknowns
+        residual, candidate, weights = args
+        g, vjp = eqx.filter_vjp(residual, y)
+        (direction,) = vjp(multiplier)
+        return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
+
+    size = tree_size((candidate, multiplier))
+    tolerance = float(jnp.finfo(working_dtype(candidate)).eps) ** (2 / 3)
+    if size <= _DENSE_MAX:
+        # Dependent constraints make the system singular but consistent.
+        linear_solver = lx.AutoLinearSolver(well_posed=False)
+    else:
+        linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
+    solution = optx.root_find(
+        optimality,
+        optx.Newton(rtol=tolerance, atol=tolerance, norm=optx.max_norm, linear_solver=linear_solver),
+        jax.tree.map(lax.stop_gradient, (start, multiplier)),
+        (residual, candidate, weights),
+        adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
+        max_steps=max_steps,
+        throw=False,
+    )
+    return solution.value[0], solution

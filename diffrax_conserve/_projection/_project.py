@@ -1,0 +1,158 @@
+"""`project`: one state to the manifold. Also what the solver and the interpolation call."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import check_manifold, check_values, conserved_values, evaluate, targets
+from .._manifold import FirstIntegral, is_entry
+from .._tree import working_dtype
+from ._base import AbstractProjection, ProjectionInfo
+from ._jacobian import UNROLLED_MAX, Vector
+from ._newton import Newton
+
+
+def project(
+    manifold: Manifold,
+    y: Y,
+    *,
+    t: RealScalarLike = 0.0,
+    args: Args = None,
+    value: Values | None = None,
+    projection: AbstractProjection | None = None,
+) -> tuple[Y, ProjectionInfo]:
+    r"""Projects one state to the manifold $\{y : g(t, y, args) = 0\}$.
+
+    Use it to make an initial state consistent, or to move a state to another value of its
+    integrals.
+
+    **Arguments:**
+
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `y`: the candidate, any PyTree of real floating-point arrays.
+    - `t`, `args`: passed to the functions of the manifold.
+    - `value`: what each `FirstIntegral` is to be kept at: a PyTree like `manifold`, with the
+        conserved value in the place of each `FirstIntegral` and `None` in the place of each
+        `Constraint`. Not needed where each `FirstIntegral` has a `value` of its own.
+    - `projection`: how to get there. Default: `Newton()`, the nearest point.
+
+    **Returns:**
+
+    The state on the manifold, shaped like `y`, and a
+    [`diffrax_conserve.ProjectionInfo`][]. `info.result` says whether it succeeded: nothing is
+    raised at run time.
+
+    **Raises:**
+
+    `TypeError` or `ValueError` if the manifold, the metric or the conserved values do not fit.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        y, info = dfc.project(sphere, jnp.array([1.0, 2.0, 2.0]))  # y = (1/3, 2/3, 2/3)
+        ```
+    """
+    check_manifold(manifold)
+    projection = Newton() if projection is None else projection
+    y = jtu.tree_map(jnp.asarray, y)
+    if value is None:
+        for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
+            if isinstance(entry, FirstIntegral) and entry.value is None:
+                raise ValueError(
+                    "`project` was given a `FirstIntegral` without a conserved value, so every "
+                    "state would do. Pass `value=...`, for example "
+                    "`value=integral.fn(t, y_start, args)`, or write "
+                    "`FirstIntegral(fn, value=...)`."
+                )
+        value = conserved_values(manifold, t, y, args)
+    check_state(y)
+    check_values(manifold, value, t, y, args)
+    check_metric(projection.metric, y)
+    return apply(projection, manifold, value, t, y, args)
+
+
+def apply(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+) -> tuple[Y, ProjectionInfo]:
+    """`project` without its checks."""
+    dtype = working_dtype(candidate)
+    outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
+    shaped = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), outputs)
+    target = targets(manifold, values, shaped)
+    unrolled = sum(x.size for x in jtu.tree_leaves(outputs)) <= UNROLLED_MAX
+
+    def vector(tree: PyTree[Array]) -> Vector:
+        leaves = [x.astype(dtype) for x in jtu.tree_leaves(tree)]
+        if not unrolled:
+            return jnp.concatenate([x.reshape(-1) for x in leaves])
+        return tuple(x.reshape(-1)[i] if x.ndim else x for x in leaves for i in range(x.size))
+
+    def residual(y: Y) -> Vector:
+        out = evaluate(manifold, t, y, args)
+        return vector(jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, target))
+
+    # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
+    residual = eqx.filter_closure_convert(residual, candidate)
+    magnitude = vector(jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), shaped, target))
+    return projection.solve(residual, magnitude, candidate, _inverse(projection.metric, candidate))
+
+
+def check_state(y: Y) -> None:
+    """Raises unless every leaf of the state is a real floating-point array."""
+    for leaf in jtu.tree_leaves(y):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise TypeError(
+                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but a projection needs "
+                "real floating-point states. Split a complex leaf into its real and its imaginary "
+                "part."
+            )
+
+
+def check_metric(metric: PyTree[Array] | None, y: Y) -> PyTree[Array] | None:
+    """Returns `metric`, checked: positive weights, structured like the state."""
+    if metric is None:
+        return None
+    if jtu.tree_structure(metric) != jtu.tree_structure(y):
+        raise ValueError(
+            f"`metric` has the structure {jtu.tree_structure(metric)}, but the state has "
+            f"{jtu.tree_structure(y)}. Give one weight (or an array of weights) for each leaf of "
+            "the state."
+        )
+
+    def check(weight: Array, leaf: Array) -> Array:
+        if jnp.shape(weight) not in ((), jnp.shape(leaf)):
+            raise ValueError(
+                f"`metric` has a leaf of shape {jnp.shape(weight)} for a leaf of the state of "
+                f"shape {jnp.shape(leaf)}. Give a scalar or an array of the same shape."
+            )
+        message = "`metric` has weights that are not positive. Every weight must be > 0."
+        if not eqx.is_array(weight) or not isinstance(weight, jax.core.Tracer):
+            if not bool(jnp.all(jnp.asarray(weight) > 0)):
+                raise ValueError(message)
+            return weight
+        return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+
+    return jtu.tree_map(check, metric, y)
+
+
+def _inverse(metric: PyTree[Array] | None, y: Y) -> Y:
+    """`M⁻¹`, shaped like `y`; an infinite weight freezes its component."""
+    if metric is None:
+        return jtu.tree_map(jnp.ones_like, y)
+    return jtu.tree_map(
+        lambda weight, leaf: jnp.broadcast_to(1 / jnp.asarray(weight, leaf.dtype), leaf.shape),
+        metric,
+        y,
+    )

@@ -1,0 +1,168 @@
+"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4: one Jacobian, few
+iterations. For candidates that are as close as an integrator's local error."""
+
+from typing import final
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Int, PyTree
+
+from .._custom_types import Y
+from .._tree import tree_add, tree_dot, tree_mul, tree_sub, working_dtype
+from ._base import AbstractProjection, ProjectionInfo, largest_relative, tolerances, within
+from ._jacobian import AbstractJacobian, Residual, Vector, linearise
+
+# Iterations that are written out before the loop: enough for nearly every step of an integrator,
+# so that in a batch no lane waits for a loop that it does not need.
+INLINE_STEPS = 2
+
+
+@final
+class SimplifiedNewton(AbstractProjection):
+    r"""Projects along the gradients at the candidate, with the constraint Jacobian frozen there.
+
+    For the candidate $\hat y$, with $G = \partial g/\partial y\,(\hat y)$ and the metric $M$,
+    solves $g(\hat y + M^{-1} G^\top \lambda) = 0$ for the multipliers $\lambda \in \mathbb{R}^m$ by
+
+    $$\lambda \leftarrow \lambda - (G M^{-1} G^\top)^{-1} g(\hat y + M^{-1} G^\top \lambda).$$
+
+    It converges linearly, with a rate proportional to the distance of the candidate, which for a
+    step of an integrator is the local error: each iteration gains as many digits as the step has.
+    For candidates far away use [`diffrax_conserve.Newton`][].
+
+    The result is differentiated by the implicit function theorem applied to $\lambda$: exactly for
+    the state that is returned, however many iterations were made.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        energy = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        projection = dfc.SimplifiedNewton(max_steps=10)
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy, projection=projection)
+        ```
+
+    ??? cite "Reference"
+
+        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
+        2006, Section IV.4, equations (4.4) to (4.6).
+    """
+
+    rtol: float | Array | None
+    atol: float | Array | None
+    max_steps: int = eqx.field(static=True)
+    metric: PyTree[Array] | None
+
+    def __init__(
+        self,
+        *,
+        rtol: float | Array | None = None,
+        atol: float | Array | None = None,
+        max_steps: int = 20,
+        metric: PyTree[Array] | None = None,
+    ):
+        self.rtol = rtol
+        self.atol = atol
+        self.max_steps = max_steps
+        self.metric = metric
+
+    def solve(
+        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
+    ) -> tuple[Y, ProjectionInfo]:
+        y, _, info = _solve(
+            residual, candidate, weights, magnitude, self.rtol, self.atol, max_steps=self.max_steps
+        )
+        return y, info
+
+
+def _displaced(
+    jacobian: AbstractJacobian, multiplier: Vector, candidate: Y, weights: Y
+) -> Y:
+    """`ŷ + M⁻¹ Gᵀ λ`."""
+    return tree_add(candidate, tree_mul(jacobian.pullback(multiplier), weights))
+
+
+@eqx.filter_custom_jvp
+def _solve(
+    residual: Residual,
+    candidate: Y,
+    weights: Y,
+    magnitude: Vector,
+    rtol: float | Array | None,
+    atol: float | Array | None,
+    *,
+    max_steps: int,
+) -> tuple[Y, Vector, ProjectionInfo]:
+    before, jacobian = linearise(residual, candidate)
+    scale, tolerance = tolerances(magnitude, jacobian.scale(candidate), rtol, atol)
+    gram_solve = jacobian.gram_solver(weights)
+
+    def iterate(carry: tuple[Vector, Vector, Int[Array, ""]]):
+        multiplier, g, count = carry
+        multiplier = jtu.tree_map(jnp.subtract, multiplier, gram_solve(g))
+        g = residual(_displaced(jacobian, multiplier, candidate, weights))
+        return multiplier, g, count + 1
+
+    def unfinished(carry: tuple[Vector, Vector, Int[Array, ""]]) -> Array:
+        _, g, count = carry
+        return ~within(g, tolerance) & (count < max_steps) & _finite(g)
+
+    carry = (jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
+    for _ in range(min(INLINE_STEPS, max_steps)):
+        carry = iterate(carry)
+    multiplier, after, count = lax.while_loop(unfinished, iterate, carry)
+
+    y = _displaced(jacobian, multiplier, candidate, weights)
+    result = optx.RESULTS.where(
+        within(after, tolerance),
+        optx.RESULTS.successful,
+        optx.RESULTS.where(
+            _finite(after), optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.nonfinite
+        ),
+    )
+    correction = tree_sub(y, candidate)
+    info = ProjectionInfo(
+        result=result,
+        num_steps=count,
+        residual_before=largest_relative(before, scale),
+        residual_after=largest_relative(after, scale),
+        correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(correction))),
+    )
+    return y, multiplier, info
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents, *, max_steps):
+    """The implicit function theorem for `λ` in `g(ŷ + M⁻¹ G(ŷ)ᵀ λ) = 0`.
+
+    With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
+    `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`.
+    """
+    y, multiplier, info = _solve(*primals, max_steps=max_steps)
+    residual, candidate, weights, *_ = primals
+
+    def displaced(residual: Residual, candidate: Y, weights: Y) -> tuple[Y, Vector]:
+        # `Gᵀ λ` by one reverse pass, not row by row.
+        _, vjp = eqx.filter_vjp(residual, candidate)
+        (direction,) = vjp(multiplier)
+        y = tree_add(candidate, tree_mul(direction, weights))
+        return y, residual(y)
+
+    _, (t_y, t_g) = eqx.filter_jvp(displaced, primals[:3], tangents[:3])
+    _, at_candidate = linearise(residual, candidate)
+    _, at_y = linearise(residual, y)
+    t_multiplier = at_y.gram_solver(weights, at_candidate)(jtu.tree_map(jnp.negative, t_g))
+    t_y = _displaced(at_candidate, t_multiplier, t_y, weights)
+    t_info = jtu.tree_map(lambda _: None, info)
+    return (y, multiplier, info), (t_y, t_multiplier, t_info)
+
+
+def _finite(g: Vector) -> Array:
+    flags = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(g)]
+    return jnp.all(jnp.stack(flags))

@@ -1,0 +1,32 @@
+"""What the terms given to a solver's `init` and `step` say about the solve around it."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax._term import (
+    AdjointTerm,
+    WrapTerm,
+)  # private: nothing public tells a solver the direction of time
+from jaxtyping import Array, PyTree, Real
+
+from .._custom_types import RealScalarLike
+
+
+def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[Array, ""]:
+    """`-1` in a solve with `t1 < t0`, where `diffeqsolve` negates every time that a solver sees;
+    otherwise `1`. In the dtype of `t`."""
+    wrapped = [x for x in _leaves(terms, WrapTerm) if isinstance(x, WrapTerm)]
+    direction = wrapped[0].direction if wrapped else 1
+    return jnp.asarray(direction, jnp.result_type(t))
+
+
+def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
+    """Whether this is the backward solve of a `diffrax.BacksolveAdjoint`."""
+    inner = [x.term if isinstance(x, WrapTerm) else x for x in _leaves(terms, WrapTerm)]
+    return any(isinstance(x, AdjointTerm) for x in inner)
+
+
+def _leaves(terms: PyTree[dfx.AbstractTerm], kind: type) -> list[Any]:
+    return jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, kind))

@@ -1,0 +1,62 @@
+"""PyTree arithmetic: states as vectors, with real dtypes kept leaf by leaf."""
+
+import functools as ft
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, PyTree, Real
+
+from ._custom_types import RealScalarLike, Y
+
+
+def tree_add(a: Y, b: Y) -> Y:
+    """`a + b`, in the dtypes of `a`."""
+    return jtu.tree_map(lambda x, y: x + y.astype(x.dtype), a, b)
+
+
+def tree_sub(a: Y, b: Y) -> Y:
+    """`a - b`."""
+    return jtu.tree_map(lambda x, y: x - y, a, b)
+
+
+def tree_scale(factor: RealScalarLike, a: Y) -> Y:
+    """`factor * a`, in the dtypes of `a`."""
+    return jtu.tree_map(lambda x: jnp.asarray(factor, x.dtype) * x, a)
+
+
+def tree_mul(a: Y, b: Y) -> Y:
+    """The elementwise product, in the dtypes of `a`."""
+    return jtu.tree_map(lambda x, y: x * y.astype(x.dtype), a, b)
+
+
+def tree_dot(a: Y, b: Y, dtype: jnp.dtype) -> Real[Array, ""]:
+    """The Euclidean inner product `Σ a b` as a scalar of `dtype`.
+
+    An elementwise product and a sum, not `jnp.vdot`: XLA fuses it into its surroundings, and it is
+    never done in a reduced precision on an accelerator.
+    """
+    products = jtu.tree_map(lambda x, y: jnp.sum(x * y).astype(dtype), a, b)
+    return ft.reduce(jnp.add, jtu.tree_leaves(products))
+
+
+def tree_all_finite(a: PyTree[Array]) -> Array:
+    """Whether there is no NaN and no infinity in `a`."""
+    finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]
+    return jnp.all(jnp.stack(finite)) if finite else jnp.asarray(True)
+
+
+def working_dtype(y: Y) -> jnp.dtype:
+    """The dtype that holds every leaf of `y` without loss."""
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.result_type(*jtu.tree_leaves(y))
+
+
+def roundoff(*trees: PyTree[Array]) -> float:
+    """The unit roundoff (machine epsilon) of the coarsest dtype among the leaves."""
+    return max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(trees))
+
+
+def tree_size(a: PyTree[Array]) -> int:
+    """The number of scalars in `a`."""
+    return sum(jnp.size(x) for x in jtu.tree_leaves(a))

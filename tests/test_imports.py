@@ -1,0 +1,178 @@
+"""The import graph: it has no cycle, it points one way, and optional packages stay optional.
+
+The imports are read from the source, so those inside functions and under `TYPE_CHECKING` count too.
+"""
+
+import ast
+import graphlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "diffrax_conserve"
+ROOT = Path(__file__).parents[1] / PACKAGE
+
+# Which parts of the package each part may import; itself is understood. A part is a file or a folder
+# directly under the package. `diffrax_conserve` itself stands for its `__init__.py`.
+_TYPES = {"_custom_types"}
+_TREE = _TYPES | {"_tree"}
+_MANIFOLD = _TREE | {"_manifold"}
+_PROJECTION = _MANIFOLD | {"_projection"}
+_INTERPOLATION = _PROJECTION | {"_interpolation"}
+# The learned side: a network is wrapped by a solver, and trained by what lies above the solvers.
+_NETWORK = _PROJECTION | {"_network"}
+_SOLVER = _INTERPOLATION | {"_network", "_solver"}
+_CORE = _SOLVER | {"_diagnostics"}
+_LEARNED = _CORE | {"_training", "_serialisation"}
+MAY_IMPORT = {
+    "_custom_types": set(),
+    "_tree": _TYPES,
+    "_manifold": _TREE,
+    "_projection": _MANIFOLD,
+    "_interpolation": _PROJECTION,
+    "_network": _PROJECTION,
+    "_solver": _INTERPOLATION | {"_network"},
+    "_diagnostics": _SOLVER,
+    "_training": _CORE,
+    "_serialisation": _CORE,
+    "_plot": _TYPES,
+    "systems": _CORE,
+    "testing": _CORE | {"systems"},
+    PACKAGE: _LEARNED | {"systems"},
+    "_reproduce": _LEARNED | {"_plot", "systems", PACKAGE},
+    "__main__": _LEARNED | {"_plot", "_reproduce", "systems", PACKAGE},
+}
+
+# Packages that only one part may import, because they are optional.
+CONFINED = {"hypothesis": "testing", "matplotlib": "_plot"}
+
+# Private names of other packages, `(file, name)`, that have no public equivalent. Each use says why.
+PRIVATE_ALLOWED: set[tuple[str, str]] = set()
+
+
+def source_files() -> list[Path]:
+    return sorted(ROOT.rglob("*.py"))
+
+
+def module_name(file: Path) -> str:
+    parts = file.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(file): file for file in source_files()}
+
+
+def part(module: str) -> str:
+    """The file or folder directly under the package that `module` belongs to."""
+    return (module.split(".") + [PACKAGE])[1] if "." in module else PACKAGE
+
+
+def imports(file: Path) -> Iterator[str]:
+    """The absolute names of everything that `file` imports, `from a import b` being `a.b`."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = file.relative_to(ROOT.parent).parts[: -node.level]
+                base = ".".join([*package, *filter(None, [base])])
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def internal_imports(module: str) -> set[str]:
+    """The modules of the package that `module` imports."""
+    found = set()
+    for name in imports(MODULES[module]):
+        if name.split(".")[0] == PACKAGE:
+            # `from ._solver import RK4` imports the module `_solver`; `from . import _tree`, `_tree`.
+            found.add(name if name in MODULES else name.rpartition(".")[0])
+    return found - {module}
+
+
+def test_every_internal_import_names_a_module():
+    for module in MODULES:
+        assert internal_imports(module) <= MODULES.keys(), module
+
+
+def test_no_import_cycle():
+    graph = {module: internal_imports(module) for module in MODULES}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail("an import cycle: " + " <- ".join(error.args[1]))
+
+
+def test_the_layers_themselves_point_one_way():
+    graphlib.TopologicalSorter(MAY_IMPORT).prepare()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_follow_the_layers(module):
+    own = part(module)
+    assert own in MAY_IMPORT, f"`{own}` is new: say in MAY_IMPORT what it may import"
+    used = {part(other) for other in internal_imports(module)} - {own}
+    assert used <= MAY_IMPORT[own], f"{module} may not import {sorted(used - MAY_IMPORT[own])}"
+
+
+@pytest.mark.parametrize(("package", "owner"), CONFINED.items())
+def test_optional_packages_are_imported_in_one_part_only(package, owner):
+    users = {
+        part(module)
+        for module, file in MODULES.items()
+        if any(name.split(".")[0] == package for name in imports(file))
+    }
+    assert users <= {owner}
+
+
+def test_importing_the_package_needs_no_optional_package():
+    code = f"import sys, {PACKAGE}; print([p for p in {list(CONFINED)!r} if p in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def external_names(file: Path) -> Iterator[str]:
+    """The names from other packages in `file`: imported, or reached as attributes of an import."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    yield from (name for name in imports(file) if name.split(".")[0] != PACKAGE)
+    modules = {
+        alias.asname or alias.name.split(".")[0]: alias.name if alias.asname else ""
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+    for node in ast.walk(tree):
+        dotted = ast.unparse(node) if isinstance(node, ast.Attribute) else ""
+        root, _, rest = dotted.partition(".")
+        if rest and root in modules:
+            yield f"{modules[root] or root}.{rest}"
+
+
+def is_private(name: str) -> bool:
+    return any(
+        piece == "internal" or (piece.startswith("_") and not piece.endswith("__"))
+        for piece in name.split(".")
+    )
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_private_names_of_other_packages(module):
+    file = MODULES[module]
+    path = file.relative_to(ROOT).as_posix()
+    used = {(path, name) for name in external_names(file) if is_private(name)}
+    assert used <= PRIVATE_ALLOWED
+
+
+def test_the_package_exports_names_and_a_version_and_does_nothing_else():
+    for statement in ast.parse((ROOT / "__init__.py").read_text(encoding="utf-8")).body:
+        if isinstance(statement, ast.ImportFrom):
+            assert statement.level == 1, ast.unparse(statement)
+            assert all(alias.asname == alias.name for alias in statement.names), (
+                f"`{ast.unparse(statement)}`: write `from ._x import Y as Y`"
+            )
+        else:
+            assert isinstance(statement, ast.Assign), ast.unparse(statement)
+            assert [ast.unparse(target) for target in statement.targets] == ["__version__"]
