@@ -14,11 +14,13 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     For a first integral $I$ this is
 
-    $$\frac{I(t_k, y_k) - I(t_0, y_0)}{|I(t_0, y_0)| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
+    $$\frac{I(t_k, y_k) - I_0}{|I_0| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
 
-    where $(t_0, y_0)$ is the first saved state; for a `Constraint`, $g(t_k, y_k)$ over the same
-    scale. The scale is what roundoff is relative to: a momentum that vanishes as the sum of large
-    terms is not divided by zero.
+    where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
+    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
+
+    The scale is what roundoff is relative to: a momentum that vanishes as the sum of large terms is
+    not divided by zero.
 
     **Arguments:**
 
@@ -82,9 +84,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     outer = jtu.tree_structure(target)
     scales = [
         scale(value, rows)
-        for value, rows in zip(
-            jtu.tree_leaves(target), outer.flatten_up_to(jacobian), strict=True
-        )
+        for value, rows in zip(jtu.tree_leaves(target), outer.flatten_up_to(jacobian), strict=True)
     ]
 
     def relative(t, y):

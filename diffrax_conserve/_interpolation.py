@@ -59,8 +59,8 @@ class Target(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold."""
 
-    t0: RealScalarLike
-    t1: RealScalarLike
+    t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
     target: Target
 

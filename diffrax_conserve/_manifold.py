@@ -4,10 +4,8 @@ import abc
 from typing import Any, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 
@@ -158,9 +156,9 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
 def targets(manifold: Manifold, values: Values, outputs: Values) -> Values:
     """What `evaluate` must equal: the conserved values, and zero for each constraint."""
     return jtu.tree_map(
-        lambda entry, value, output: jtu.tree_map(jnp.zeros_like, output)
-        if isinstance(entry, Constraint)
-        else value,
+        lambda entry, value, output: (
+            jtu.tree_map(jnp.zeros_like, output) if isinstance(entry, Constraint) else value
+        ),
         manifold,
         values,
         outputs,
@@ -168,9 +166,7 @@ def targets(manifold: Manifold, values: Values, outputs: Values) -> Values:
     )
 
 
-def check_values(
-    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
-) -> None:
+def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless every function of the manifold returns real floating-point arrays, as many in
     all as there are unknowns or fewer, and `values` is shaped as what they return."""
     entries = _named_entries(manifold)

@@ -1,4 +1,4 @@
-"""Executes the code of the README, the docs and the docstrings, and checks that the docs are complete.
+"""Executes the code of the README, docs and docstrings, and checks that the reference is complete.
 
 The ```` ```python ```` blocks of one page, or of one docstring, run in order in one namespace, in a
 new folder and in the state of a new interpreter: float32 unless the page enables float64.

@@ -3,10 +3,12 @@
 import abc
 
 import equinox as eqx
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Y
 from ._jacobian import Residual, Vector
@@ -36,7 +38,7 @@ class ProjectionInfo(eqx.Module):
 class AbstractProjection(eqx.Module):
     """A way to return from a candidate to the manifold."""
 
-    metric: eqx.AbstractVar[PyTree[Array] | None]
+    metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
 
     @abc.abstractmethod
     def solve(
@@ -51,6 +53,20 @@ class AbstractProjection(eqx.Module):
         - `candidate`: the state to be projected.
         - `weights`: `M⁻¹`, the inverse of the metric, shaped like the candidate.
         """
+
+
+def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
+    """`metric`, checked at once where its values are known, and otherwise when they are."""
+    message = "`metric` has a weight that is not positive. Every weight must be greater than 0."
+
+    def check(weight: ArrayLike) -> ArrayLike:
+        if isinstance(weight, jax.core.Tracer):
+            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+        if not np.all(np.asarray(weight) > 0):
+            raise ValueError(message)
+        return weight
+
+    return jtu.tree_map(check, metric)
 
 
 def tolerances(

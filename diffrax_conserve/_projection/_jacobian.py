@@ -9,7 +9,7 @@ a 2×2 matrix costs more than the step itself); for many, one array of shape `(m
 import abc
 import functools as ft
 from collections.abc import Callable
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jaxtyping import Array, PyTree, Real
 from .._custom_types import Y
 from .._tree import tree_dot, tree_mul, working_dtype
 
-Vector = tuple[Real[Array, ""], ...] | Real[Array, " m"]
+Vector = PyTree[Real[Array, "..."]]  # a tuple of m scalars, or an array of shape (m,)
 Residual = Callable[[Y], Vector]
 
 # Up to this many constraints are unrolled: work and compile time grow as m², against a call into
@@ -48,10 +48,10 @@ class AbstractJacobian(eqx.Module):
     def gram_solver(
         self,
         weights: Y,
-        other: "AbstractJacobian | None" = None,
+        other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
     ) -> Callable[[Vector], Vector]:
-        """`b ↦ (G W Hᵀ)⁻¹ b`, with `H = G` if `other` is not given.
+        """`b ↦ (G W Hᵀ)⁻¹ b`, where `H` is `other`, a Jacobian of the same kind, or `G`.
 
         `damping` is added to the diagonal after the rows are scaled to a diagonal of ones.
         """
@@ -80,7 +80,7 @@ class _Unrolled(AbstractJacobian):
     def pullback(self, multiplier: Vector) -> Y:
         def combine(*leaves: Array) -> Array:
             terms = [c.astype(x.dtype) * x for c, x in zip(multiplier, leaves, strict=True)]
-            return sum(terms[1:], start=terms[0])
+            return ft.reduce(jnp.add, terms)
 
         return jtu.tree_map(combine, *self.rows)
 
@@ -96,7 +96,7 @@ class _Unrolled(AbstractJacobian):
     def gram_solver(
         self,
         weights: Y,
-        other: AbstractJacobian | None = None,
+        other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
     ) -> Callable[[Vector], Vector]:
         columns = self.rows if other is None else other.rows
@@ -140,7 +140,7 @@ class _Dense(AbstractJacobian):
     def gram_solver(
         self,
         weights: Y,
-        other: AbstractJacobian | None = None,
+        other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
     ) -> Callable[[Vector], Vector]:
         columns = self.rows if other is None else other.rows

@@ -1,19 +1,25 @@
 """Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
 
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, ArrayLike, PyTree, Real
 
 from .._custom_types import Y
 from .._tree import tree_add, tree_dot, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
-from ._base import AbstractProjection, ProjectionInfo, largest_relative, tolerances, within
+from ._base import (
+    AbstractProjection,
+    ProjectionInfo,
+    largest_relative,
+    positive_weights,
+    tolerances,
+    within,
+)
 from ._jacobian import Residual, Vector, linearise
 
 # Above this many unknowns the optimality system is solved iteratively, matrix-free.
@@ -57,7 +63,7 @@ class Newton(AbstractProjection):
     rtol: float | Array | None
     atol: float | Array | None
     max_steps: int = eqx.field(static=True)
-    metric: PyTree[Array] | None
+    metric: PyTree[ArrayLike] | None
 
     def __init__(
         self,
@@ -65,22 +71,19 @@ class Newton(AbstractProjection):
         rtol: float | Array | None = None,
         atol: float | Array | None = None,
         max_steps: int = 50,
-        metric: PyTree[Array] | None = None,
+        metric: PyTree[ArrayLike] | None = None,
     ):
         self.rtol = rtol
         self.atol = atol
         self.max_steps = max_steps
-        self.metric = metric
+        self.metric = positive_weights(metric)
 
     def solve(
         self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
     ) -> tuple[Y, ProjectionInfo]:
         # The iterations are not differentiated: the optimality system is.
-        fixed = jtu.tree_map(
-            lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x,
-            (residual, magnitude, candidate, weights, self.rtol, self.atol),
-        )
-        start, multiplier, count = _reach(*fixed, self.max_steps)
+        fixed = _stop_gradient((residual, magnitude, candidate, weights))
+        start, multiplier, count = _reach(*fixed, projection=self)
         y, nearest = _nearest(residual, candidate, weights, start, multiplier, self.max_steps)
 
         before, at_candidate = linearise(residual, candidate)
@@ -111,9 +114,8 @@ def _reach(
     magnitude: Vector,
     candidate: Y,
     weights: Y,
-    rtol: float | Array | None,
-    atol: float | Array | None,
-    max_steps: int,
+    *,
+    projection: Newton,
 ) -> tuple[Y, Vector, Array]:
     """A damped Gauss-Newton iteration from the candidate to some point of the manifold, the
     multipliers there that suit the candidate best, and the number of iterations."""
@@ -126,7 +128,9 @@ def _reach(
     def iterate(carry: tuple[Y, Array, Array]) -> tuple[Y, Array, Array]:
         y, _, count = carry
         g, jacobian = linearise(residual, y)
-        scale, tolerance = tolerances(magnitude, jacobian.scale(y), rtol, atol)
+        scale, tolerance = tolerances(
+            magnitude, jacobian.scale(y), projection.rtol, projection.atol
+        )
         merit = squared(g, scale)
         gram_solve = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
         step = tree_mul(jacobian.pullback(gram_solve(g)), weights)
@@ -147,13 +151,23 @@ def _reach(
 
     def unfinished(carry: tuple[Y, Array, Array]) -> Array:
         _, done, count = carry
-        return ~done & (count < max_steps)
+        return ~done & (count < projection.max_steps)
 
     start = (candidate, jnp.asarray(False), jnp.asarray(0))
     y, _, count = lax.while_loop(unfinished, iterate, start)
     _, jacobian = linearise(residual, y)
     multiplier = jacobian.gram_solver(weights)(jacobian.pushforward(tree_sub(y, candidate)))
     return y, multiplier, count
+
+
+def _stop_gradient(tree: PyTree[Any]) -> Any:
+    return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def _state_norm(unknowns: tuple[Y, Vector]) -> Array:
+    # Where gradients are nearly parallel the state is well determined, the multipliers are not.
+    y, _ = unknowns
+    return optx.max_norm(y)
 
 
 def _relative(g: Vector, scale: Vector) -> list[Array]:
@@ -182,8 +196,8 @@ def _nearest(
         linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
     solution = optx.root_find(
         optimality,
-        optx.Newton(rtol=tolerance, atol=tolerance, norm=optx.max_norm, linear_solver=linear_solver),
-        jax.tree.map(lax.stop_gradient, (start, multiplier)),
+        optx.Newton(rtol=tolerance, atol=tolerance, norm=_state_norm, linear_solver=linear_solver),
+        (start, multiplier),
         (residual, candidate, weights),
         adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
         max_steps=max_steps,

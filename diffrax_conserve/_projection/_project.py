@@ -4,11 +4,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import check_manifold, check_values, conserved_values, evaluate, targets
-from .._manifold import FirstIntegral, is_entry
+from .._manifold import (
+    FirstIntegral,
+    check_manifold,
+    check_values,
+    conserved_values,
+    evaluate,
+    is_entry,
+    targets,
+)
 from .._tree import working_dtype
 from ._base import AbstractProjection, ProjectionInfo
 from ._jacobian import UNROLLED_MAX, Vector
@@ -120,34 +127,25 @@ def check_state(y: Y) -> None:
             )
 
 
-def check_metric(metric: PyTree[Array] | None, y: Y) -> PyTree[Array] | None:
-    """Returns `metric`, checked: positive weights, structured like the state."""
+def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
+    """Raises unless `metric` is structured like the state."""
     if metric is None:
-        return None
+        return
     if jtu.tree_structure(metric) != jtu.tree_structure(y):
         raise ValueError(
             f"`metric` has the structure {jtu.tree_structure(metric)}, but the state has "
             f"{jtu.tree_structure(y)}. Give one weight (or an array of weights) for each leaf of "
             "the state."
         )
-
-    def check(weight: Array, leaf: Array) -> Array:
+    for weight, leaf in zip(jtu.tree_leaves(metric), jtu.tree_leaves(y), strict=True):
         if jnp.shape(weight) not in ((), jnp.shape(leaf)):
             raise ValueError(
                 f"`metric` has a leaf of shape {jnp.shape(weight)} for a leaf of the state of "
                 f"shape {jnp.shape(leaf)}. Give a scalar or an array of the same shape."
             )
-        message = "`metric` has weights that are not positive. Every weight must be > 0."
-        if not eqx.is_array(weight) or not isinstance(weight, jax.core.Tracer):
-            if not bool(jnp.all(jnp.asarray(weight) > 0)):
-                raise ValueError(message)
-            return weight
-        return eqx.error_if(weight, ~jnp.all(weight > 0), message)
-
-    return jtu.tree_map(check, metric, y)
 
 
-def _inverse(metric: PyTree[Array] | None, y: Y) -> Y:
+def _inverse(metric: PyTree[ArrayLike] | None, y: Y) -> Y:
     """`M⁻¹`, shaped like `y`; an infinite weight freezes its component."""
     if metric is None:
         return jtu.tree_map(jnp.ones_like, y)

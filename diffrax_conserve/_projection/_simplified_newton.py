@@ -8,11 +8,18 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import tree_add, tree_dot, tree_mul, tree_sub, working_dtype
-from ._base import AbstractProjection, ProjectionInfo, largest_relative, tolerances, within
+from ._base import (
+    AbstractProjection,
+    ProjectionInfo,
+    largest_relative,
+    positive_weights,
+    tolerances,
+    within,
+)
 from ._jacobian import AbstractJacobian, Residual, Vector, linearise
 
 # Iterations that are written out before the loop: enough for nearly every step of an integrator,
@@ -57,7 +64,7 @@ class SimplifiedNewton(AbstractProjection):
     rtol: float | Array | None
     atol: float | Array | None
     max_steps: int = eqx.field(static=True)
-    metric: PyTree[Array] | None
+    metric: PyTree[ArrayLike] | None
 
     def __init__(
         self,
@@ -65,12 +72,12 @@ class SimplifiedNewton(AbstractProjection):
         rtol: float | Array | None = None,
         atol: float | Array | None = None,
         max_steps: int = 20,
-        metric: PyTree[Array] | None = None,
+        metric: PyTree[ArrayLike] | None = None,
     ):
         self.rtol = rtol
         self.atol = atol
         self.max_steps = max_steps
-        self.metric = metric
+        self.metric = positive_weights(metric)
 
     def solve(
         self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
@@ -81,9 +88,7 @@ class SimplifiedNewton(AbstractProjection):
         return y, info
 
 
-def _displaced(
-    jacobian: AbstractJacobian, multiplier: Vector, candidate: Y, weights: Y
-) -> Y:
+def _displaced(jacobian: AbstractJacobian, multiplier: Vector, candidate: Y, weights: Y) -> Y:
     """`ŷ + M⁻¹ Gᵀ λ`."""
     return tree_add(candidate, tree_mul(jacobian.pullback(multiplier), weights))
 
@@ -154,7 +159,10 @@ def _solve_jvp(primals, tangents, *, max_steps):
         y = tree_add(candidate, tree_mul(direction, weights))
         return y, residual(y)
 
-    _, (t_y, t_g) = eqx.filter_jvp(displaced, primals[:3], tangents[:3])
+    out, t_out = eqx.filter_jvp(displaced, primals[:3], tangents[:3])
+    t_y, t_g = jtu.tree_map(
+        lambda x, t: jnp.zeros_like(x) if t is None else t, out, t_out, is_leaf=lambda t: t is None
+    )
     _, at_candidate = linearise(residual, candidate)
     _, at_y = linearise(residual, y)
     t_multiplier = at_y.gram_solver(weights, at_candidate)(jtu.tree_map(jnp.negative, t_g))

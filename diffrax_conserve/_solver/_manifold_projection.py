@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._custom_types import (
     VF,
@@ -35,7 +35,7 @@ from ._terms import is_backsolve, time_direction
 class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     r"""Projects every step of another solver to a manifold.
 
-    The wrapped solver proposes a candidate $\hat y$ at $t_{n+1}$, and $y_{n+1}$ is its projection to
+    The wrapped solver proposes a candidate $\hat y$ at $t_{n+1}$; $y_{n+1}$ is its projection to
 
     $$\{y : I(t_{n+1}, y, args) = I(t_0, y_0, args), \quad g(t_{n+1}, y, args) = 0\}$$
 
@@ -85,7 +85,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         2006, Section IV.4.
     """
 
-    solver: dfx.AbstractSolver
+    solver: dfx.AbstractSolver[Any]
     manifold: Manifold
     projection: AbstractProjection
 
@@ -96,21 +96,22 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         *,
         projection: AbstractProjection = SimplifiedNewton(),
     ):
-        self.solver = solver
+        self.solver = solver  # pyright: ignore[reportIncompatibleVariableOverride]
         self.manifold = manifold
         self.projection = projection
 
     def __check_init__(self):
         if not isinstance(self.solver, dfx.AbstractSolver):
             raise TypeError(
-                f"`solver` is {self.solver!r}, which is not a diffrax solver. Pass an instance, for "
-                "example `ManifoldProjection(diffrax.Tsit5(), manifold)`."
+                f"`solver` is {self.solver!r}, which is not a diffrax solver. Pass an instance, "
+                "for example `ManifoldProjection(diffrax.Tsit5(), manifold)`."
             )
+        _check_nested(self.solver)
         check_manifold(self.manifold)
         if not isinstance(self.projection, AbstractProjection):
             raise TypeError(
-                f"`projection` is {self.projection!r}, which is not a projection. Pass an instance, "
-                "for example `projection=SimplifiedNewton()`."
+                f"`projection` is {self.projection!r}, which is not a projection. Pass an "
+                "instance, for example `projection=SimplifiedNewton()`."
             )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
@@ -189,9 +190,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             terms, t0, t1, y0, args, state, made_jump
         )
         direction = time_direction(terms, t1)
-        y1, info = apply(
-            self.projection, self.manifold, values, t1 * direction, candidate, args
-        )
+        y1, info = apply(self.projection, self.manifold, values, t1 * direction, candidate, args)
         success = info.result == optx.RESULTS.successful
         error = jtu.tree_map(lambda e: jnp.where(success, e, jnp.inf), error)
         result = dfx.RESULTS.where(
@@ -215,8 +214,24 @@ or a conserved value does not fit.
 """
 
 
+def _check_nested(solver: dfx.AbstractSolver) -> None:
+    inner = _innermost(solver)
+    if (
+        inner is not solver
+        and isinstance(inner, dfx.AbstractImplicitSolver)
+        and not eqx.is_array_like(getattr(inner.root_finder, "rtol", 0.0))
+    ):
+        raise ValueError(
+            f"`ManifoldProjection` is given a {type(solver).__name__} of the implicit solver "
+            f"{type(inner).__name__}, whose root finder takes its tolerances from the step-size "
+            "controller; diffrax hands those through one wrapper only. Give them explicitly, for "
+            f"example `{type(inner).__name__}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
+            "norm=optimistix.max_norm))`."
+        )
+
+
 def _innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
     # `HalfSolver` does not forward these itself.
-    while type(solver).__mro__ and hasattr(solver, "solver"):
+    while issubclass(type(solver), dfx.AbstractWrappedSolver):
         solver = solver.solver  # pyright: ignore
     return solver

@@ -80,9 +80,7 @@ class RK4(dfx.AbstractSolver[None]):
         k2 = stage(middle, _axpy(0.5, k1, y0))
         k3 = stage(middle, _axpy(0.5, k2, y0))
         k4 = stage(t1, _axpy(1.0, k3, y0))
-        y1 = jtu.tree_map(
-            lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4
-        )
+        y1 = jtu.tree_map(lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4)
         dense_info = dict(y0=y0, y1=y1, k0=k1, k1=stage(t1, y1))
         return y1, None, dense_info, None, dfx.RESULTS.successful
 

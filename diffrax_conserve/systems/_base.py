@@ -1,0 +1,137 @@
+"""What every system of the catalogue offers: equations, manifold, states, a reference."""
+
+import abc
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Real
+
+from .._custom_types import Args, RealScalarLike, Y
+from .._manifold import Constraint, FirstIntegral
+
+
+def real(x: Any) -> Array:
+    """`x` as an array of floating point numbers, in the default precision unless it has its own."""
+    x = jnp.asarray(x)
+    return x if eqx.is_inexact_array(x) else x.astype(float)
+
+
+class AbstractSystem(eqx.Module):
+    r"""A differential equation $y' = f(t, y, args)$ together with what it conserves.
+
+    The parameters of the equation are the fields of the Module, so they can be changed
+    (`Kepler(mu=2.0)`) and differentiated; `args` is not used by any system of the catalogue.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        system = dfc.systems.get("kepler")
+        system.vector_field(0.0, system.y0, system.args)
+        list(system.manifold)  # ['energy', 'angular momentum']
+        ```
+    """
+
+    name: eqx.AbstractClassVar[str]
+    title: eqx.AbstractClassVar[str]
+    citation: eqx.AbstractClassVar[str]
+    # The solve that `python -m diffrax_conserve reproduce` shows: its horizon and its step.
+    t1: eqx.AbstractClassVar[float]
+    dt: eqx.AbstractClassVar[float]
+    # The labels of the two or three coordinates in `trajectories`.
+    axes: eqx.AbstractClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def vector_field(self, t: RealScalarLike, y: Any, args: Args) -> Any:
+        """The right-hand side $f(t, y, args)$; its dtype is that of `y`."""
+
+    @property
+    @abc.abstractmethod
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        """What the exact solution conserves, by name; functionally independent."""
+
+    @property
+    @abc.abstractmethod
+    def y0(self) -> Y:
+        """The initial state that the source uses, at time 0."""
+
+    @abc.abstractmethod
+    def sample(self, key: PRNGKeyArray) -> Y:
+        """One random initial state from the sampling domain; use `jax.vmap` for many."""
+
+    @abc.abstractmethod
+    def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
+        """The states at `ts`, counted from `y0`, in float64; called by `reference`."""
+
+    @abc.abstractmethod
+    def period(self, y0: Any = None) -> Float[Array, ""] | None:
+        """The period of the solution through `y0`; `None` where no closed form is known."""
+
+    @property
+    @abc.abstractmethod
+    def metric(self) -> Y | None:
+        """Weights, like `y`, for the projection; `None` where the Euclidean metric is right."""
+
+    @abc.abstractmethod
+    def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
+        """Named curves in two or three coordinates, for a phase picture of the states `ys`."""
+
+    @property
+    def args(self) -> None:
+        """The `args` for `diffrax.diffeqsolve`: parameters are fields, so there are none."""
+
+    def reference(
+        self, ts: Real[ArrayLike, " times"], y0: Any = None, *, t0: RealScalarLike = 0.0
+    ) -> Any:
+        r"""The states at the times `ts`, accurate to a few hundred roundoffs or better.
+
+        Exact where a solution in closed form exists, else by an eighth-order solve that steps
+        exactly onto `ts`; the page of each system says which.
+
+        **Arguments:**
+
+        - `ts`: times, one-dimensional, non-decreasing, none of them before `t0`.
+        - `y0`: the state at `t0`; by default the system's own `y0`.
+        - `t0`: the initial time.
+
+        **Returns:**
+
+        A PyTree like `y0`, with a leading time axis.
+
+        **Raises:**
+
+        `RuntimeError` unless `jax_enable_x64` is on: a reference needs float64.
+        """
+        if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+            raise RuntimeError(
+                "`reference` needs float64, but `jax_enable_x64` is off. Set the environment "
+                "variable `JAX_ENABLE_X64=1`, or call `jax.config.update('jax_enable_x64', True)` "
+                "before any array is made."
+            )
+        ts = jnp.asarray(ts, jnp.float64)
+        if ts.ndim != 1 or ts.size == 0:
+            raise ValueError(
+                f"`ts` must be a one-dimensional array of times, but has shape {ts.shape}. "
+                "For one time write `reference(jnp.array([t]))`."
+            )
+        y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.float64), self.y0 if y0 is None else y0)
+        return _solution(self, ts - t0, y0)
+
+    def like(self, y: Any) -> Self:
+        """This system with its parameters in the precision of `y`, so that `f` keeps it."""
+        dtype = jnp.result_type(*jtu.tree_leaves(y))
+        return jtu.tree_map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self)
+
+
+@eqx.filter_jit
+def _solution(system: AbstractSystem, ts: Float[Array, " times"], y0: Any) -> Any:
+    ts = eqx.error_if(
+        ts,
+        jnp.any(jnp.diff(ts, prepend=0.0) < 0),
+        "`reference` takes non-decreasing times `ts`, none of them before `t0`.",
+    )
+    return system.solution(ts, y0)

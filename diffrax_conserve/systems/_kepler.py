@@ -1,0 +1,157 @@
+"""Kepler's problem: one body about a fixed centre."""
+
+from typing import ClassVar, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._custom_types import Args, RealScalarLike
+from .._manifold import Constraint, FirstIntegral
+from ._base import AbstractSystem, real
+
+Pair = Float[Array, "2"]
+State = tuple[Pair, Pair]
+States = tuple[Float[Array, "times 2"], Float[Array, "times 2"]]
+
+
+@final
+class Kepler(AbstractSystem):
+    r"""Kepler's problem in its plane, `y = (q, p)` of shapes `(2,)` and `(2,)`.
+
+    $$q' = p, \qquad p' = -\mu\, q / |q|^3.$$
+
+    **Manifold**: energy $H = \tfrac12 |p|^2 - \mu / |q|$ and angular momentum
+    $L = q_1 p_2 - q_2 p_1$. The Laplace-Runge-Lenz vector `laplace_runge_lenz`, of length
+    $\mu e$, is conserved too. Left out of the manifold, because $|A|^2 = \mu^2 + 2 H L^2$ makes it
+    redundant: of $H$, $L$, $A_1$ and $A_2$ any three determine the fourth, and any three kept leave
+    no freedom but the position on the ellipse. On a circular orbit $H$ and $L$ are dependent.
+    **Reference**: exact, by Kepler's equation; bound orbits only ($H < 0$). **Samples**: ellipses
+    of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, either sense, any
+    orientation and eccentric anomaly, all uniform.
+
+    Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.2. The default state
+    is the perihelion of the ellipse with semi-major axis 1 and eccentricity 0.6.
+    """
+
+    mu: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+
+    name: ClassVar[str] = "kepler"
+    title: ClassVar[str] = "Kepler's problem"
+    citation: ClassVar[str] = (
+        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.2."
+    )
+    t1: ClassVar[float] = 20.0
+    dt: ClassVar[float] = 0.2
+    axes: ClassVar[tuple[str, ...]] = ("q₁", "q₂")
+
+    def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
+        del t, args
+        q, p = y
+        return p, -self.like(y).mu * q / jnp.sum(q**2) ** 1.5
+
+    def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        q, p = y
+        return jnp.sum(p**2) / 2 - self.like(y).mu / jnp.sqrt(jnp.sum(q**2))
+
+    def angular_momentum(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        q, p = y
+        return q[0] * p[1] - q[1] * p[0]
+
+    def laplace_runge_lenz(self, t: RealScalarLike, y: State, args: Args) -> Pair:
+        r"""$A = p \times L - \mu\, q / |q|$, which points to the perihelion."""
+        q, p = y
+        l = self.angular_momentum(t, y, args)
+        rotated = jnp.stack([p[1], -p[0]])
+        return l * rotated - self.like(y).mu * q / jnp.sqrt(jnp.sum(q**2))
+
+    @property
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        return {
+            "energy": FirstIntegral(self.energy),
+            "angular momentum": FirstIntegral(self.angular_momentum),
+        }
+
+    @property
+    def y0(self) -> State:
+        return jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])
+
+    def sample(self, key: PRNGKeyArray) -> State:
+        a_key, e_key, key = jr.split(key, 3)
+        sense_key, orientation_key, anomaly_key = jr.split(key, 3)
+        a = jr.uniform(a_key, minval=0.5, maxval=1.5)
+        e = jr.uniform(e_key, maxval=0.8)
+        b = a * jnp.sqrt(1 - e**2) * jr.rademacher(sense_key, dtype=a.dtype)
+        angle, anomaly = jr.uniform(orientation_key), jr.uniform(anomaly_key)
+        c, s = jnp.cos(2 * jnp.pi * anomaly), jnp.sin(2 * jnp.pi * anomaly)
+        q = jnp.stack([a * (c - e), b * s])
+        p = jnp.stack([-a * s, b * c]) * jnp.sqrt(self.mu / a**3) / (1 - e * c)
+        return _turn(q, 2 * jnp.pi * angle), _turn(p, 2 * jnp.pi * angle)
+
+    def solution(self, ts: Float[Array, " times"], y0: State) -> States:
+        r"""By Lagrange's coefficients: $q(t) = f q_0 + g p_0$, and the derivative of this."""
+        q, p = y0
+        r0 = jnp.sqrt(jnp.sum(q**2))
+        a, n = self._semi_major_axis(y0), 2 * jnp.pi / self.period(y0)
+        e_cos, e_sin = 1 - r0 / a, jnp.sum(q * p) / jnp.sqrt(self.mu * a)
+        e, anomaly0 = jnp.hypot(e_cos, e_sin), jnp.arctan2(e_sin, e_cos)
+        anomaly = _eccentric_anomaly(anomaly0 - e_sin + n * ts, e)
+        c, s = jnp.cos(anomaly - anomaly0), jnp.sin(anomaly - anomaly0)
+        r = a * (1 - e * jnp.cos(anomaly))
+        f = 1 - (1 - c) * a / r0
+        g = (s * r0 / a + e_sin * (1 - c)) / n
+        f_rate = -s * n * a**2 / (r * r0)
+        g_rate = 1 - (1 - c) * a / r
+        return jnp.outer(f, q) + jnp.outer(g, p), jnp.outer(f_rate, q) + jnp.outer(g_rate, p)
+
+    def period(self, y0: State | None = None) -> Float[Array, ""]:
+        a = self._semi_major_axis(self.y0 if y0 is None else y0)
+        return 2 * jnp.pi * jnp.sqrt(a**3 / self.mu)
+
+    def _semi_major_axis(self, y: State) -> Float[Array, ""]:
+        energy = self.energy(0.0, y, None)
+        energy = eqx.error_if(
+            energy,
+            energy >= 0,
+            "The exact solution of `Kepler` is for bound orbits, but the energy of `y0` is not "
+            "negative. Integrate this orbit with `diffrax.diffeqsolve` instead.",
+        )
+        return -self.mu / (2 * energy)
+
+    @property
+    def metric(self) -> None:
+        return None
+
+    def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
+        return {"orbit": ys[0]}
+
+
+Kepler.__init__.__doc__ = r"""**Arguments:**
+
+- `mu`: the strength $\mu$ of the attraction.
+"""
+
+
+def _turn(x: Pair, angle: Float[Array, ""]) -> Pair:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * x[0] - s * x[1], s * x[0] + c * x[1]])
+
+
+def _eccentric_anomaly(
+    mean_anomaly: Float[Array, " times"], e: Float[Array, ""]
+) -> Float[Array, " times"]:
+    r"""Solves Kepler's equation $E - e \sin E = M$, modulo $2\pi$.
+
+    Newton's iteration from J. M. A. Danby's start, "Fundamentals of Celestial Mechanics" (1988);
+    it has converged long before the last of its iterations unless $e$ is very close to 1.
+    """
+    m = mean_anomaly - 2 * jnp.pi * jnp.round(mean_anomaly / (2 * jnp.pi))
+
+    def newton(_: int, x: Float[Array, " times"]) -> Float[Array, " times"]:
+        return x - (x - e * jnp.sin(x) - m) / (1 - e * jnp.cos(x))
+
+    return jax.lax.fori_loop(0, 12, newton, m + 0.85 * e * jnp.sign(m))

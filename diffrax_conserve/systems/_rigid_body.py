@@ -1,0 +1,134 @@
+"""The free rigid body in its own frame."""
+
+from typing import ClassVar, final
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._custom_types import Args, RealScalarLike
+from .._manifold import Constraint, FirstIntegral
+from ._base import AbstractSystem, real
+from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
+from ._sampling import shell
+
+State = Float[Array, "3"]
+
+
+@final
+class RigidBody(AbstractSystem):
+    r"""Euler's equations of a free rigid body, `y = ω` of shape `(3,)`, in its principal frame.
+
+    $$I_1 \omega_1' = (I_2 - I_3)\, \omega_2 \omega_3 \quad\text{and cyclically},$$
+
+    $$H = \tfrac12 \sum_i I_i \omega_i^2, \qquad L = \sum_i I_i^2 \omega_i^2.$$
+
+    **Manifold**: energy $H$ and squared angular momentum $L$ (the paper prints $\omega_3^3$ for
+    $\omega_3^2$ in $L$). At a steady rotation, about a principal axis, the two are dependent.
+    **Reference**: exact, by Jacobi's elliptic functions; needs at least two distinct moments, and
+    loses accuracy at the separatrix $L = 2 H I_2$, where the motion is itself unstable.
+    **Samples**: uniform direction, $\tfrac12 \le |\omega| \le 2$ uniform.
+
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and horizon are
+    the defaults; Landau and Lifshitz, "Mechanics", §37 for the solution.
+    """
+
+    inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
+
+    name: ClassVar[str] = "rigid-body"
+    title: ClassVar[str] = "Free rigid body"
+    citation: ClassVar[str] = (
+        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
+        "L. D. Landau and E. M. Lifshitz, Mechanics, §36-37."
+    )
+    t1: ClassVar[float] = 1.75
+    dt: ClassVar[float] = 0.05
+    axes: ClassVar[tuple[str, ...]] = ("ω₁", "ω₂", "ω₃")
+
+    def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
+        del t, args
+        k1, k2, k3 = _rates(self.like(y).inertia)
+        w1, w2, w3 = y
+        return jnp.stack([k1 * w2 * w3, k2 * w3 * w1, k3 * w1 * w2])
+
+    def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        return jnp.sum(self.like(y).inertia * y**2) / 2
+
+    def squared_angular_momentum(
+        self, t: RealScalarLike, y: State, args: Args
+    ) -> Float[Array, ""]:
+        del t, args
+        return jnp.sum((self.like(y).inertia * y) ** 2)
+
+    @property
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        return {
+            "energy": FirstIntegral(self.energy),
+            "squared angular momentum": FirstIntegral(self.squared_angular_momentum),
+        }
+
+    @property
+    def y0(self) -> State:
+        return jnp.array([1.0, 1.0, 1.0])
+
+    def sample(self, key: PRNGKeyArray) -> State:
+        return shell(key, inner=0.5, outer=2.0)
+
+    def solution(self, ts: Float[Array, " times"], y0: State) -> Float[Array, "times 3"]:
+        axes, amplitudes, rate, m, u0 = _elliptic_form(self.inertia, y0)
+        sn, cn, dn = jacobi_elliptic(rate * ts + u0, m)
+        permuted = amplitudes * jnp.stack([dn, sn, cn], axis=-1)
+        return jnp.zeros_like(permuted).at[:, axes].set(permuted)
+
+    def period(self, y0: State | None = None) -> Float[Array, ""]:
+        _, _, rate, m, _ = _elliptic_form(self.inertia, self.y0 if y0 is None else y0)
+        return 4 * complete_elliptic(m) / rate
+
+    @property
+    def metric(self) -> None:
+        return None
+
+    def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
+        return {"angular velocity": ys}
+
+
+RigidBody.__init__.__doc__ = r"""**Arguments:**
+
+- `inertia`: the principal moments of inertia $(I_1, I_2, I_3)$.
+"""
+
+
+def _rates(inertia: Float[Array, "3"]) -> tuple[Array, Array, Array]:
+    i1, i2, i3 = inertia
+    return (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
+
+
+def _elliptic_form(
+    inertia: Float[Array, "3"], y0: State
+) -> tuple[Array, Array, Array, Array, Array]:
+    r"""The solution as $(\omega_a, \omega_b, \omega_c) = (A\,dn, B\,sn, C\,cn)(\lambda t + u_0)$.
+
+    Here $b$ is the axis of the middle moment of inertia. With $\omega_i' = k_i \omega_j \omega_k$,
+    inserting this form gives $\lambda^2 = -k_b k_c A^2$, $B = k_b A C / \lambda$ and
+    $m = k_a C^2 / k_c A^2$. Of the two outer axes, $a$ is the one for which $m \le 1$: the one that
+    $\omega$ circles.
+    """
+    order = jnp.argsort(inertia)
+    k = jnp.stack(_rates(inertia))
+    k_b, w_b = k[order[1]], y0[order[1]]
+
+    # A^2 and C^2 as sums of positive terms: k_b has the sign opposite to k_a and k_c.
+    squares = y0**2 - k / k_b * w_b**2
+    first, last = jnp.abs(squares / k)[order[::2]]
+    axes = jnp.where(first <= last, order[::-1], order)
+    a, _, c = axes
+
+    amplitude_a = jnp.copysign(jnp.sqrt(squares[a]), y0[a])
+    amplitude_c = jnp.sqrt(squares[c])
+    ratio = jnp.copysign(jnp.sqrt(-k_b / k[c]), k_b * amplitude_a)  # B / C
+    rate = jnp.sqrt(-k_b * k[c]) * jnp.abs(amplitude_a)
+    m = jnp.minimum(k[a] * squares[c] / (k[c] * squares[a]), 1.0)
+    u0 = incomplete_elliptic(jnp.arctan2(w_b / ratio, y0[c]), m)
+    amplitudes = jnp.stack([amplitude_a, ratio * amplitude_c, amplitude_c])
+    return axes, amplitudes, rate, m, u0

@@ -1,0 +1,129 @@
+"""Point vortices in the plane."""
+
+from typing import ClassVar, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from .._custom_types import Args, RealScalarLike
+from .._manifold import Constraint, FirstIntegral
+from ._base import real
+from ._reference import AbstractIntegratedSystem
+from ._sampling import annulus
+
+State = Float[Array, "vortices 2"]
+
+
+@final
+class PointVortices(AbstractIntegratedSystem):
+    r"""$N$ point vortices of strengths $\Gamma_i$, `y` of shape `(N, 2)`: rows $(x_i, y_i)$.
+
+    $$\Gamma_i x_i' = \frac{\partial H}{\partial y_i}, \qquad
+    \Gamma_i y_i' = -\frac{\partial H}{\partial x_i}, \qquad
+    H = -\frac{1}{4\pi} \sum_{i=1}^N \sum_{j \ne i} \Gamma_i \Gamma_j \log r_{ij},$$
+
+    with $r_{ij}^2 = (x_i - x_j)^2 + (y_i - y_j)^2$ (the paper prints $x_i - x_i$, and sums that
+    start at 0).
+
+    **Manifold**: energy $H$, linear impulse $(\sum \Gamma_i x_i, \sum \Gamma_i y_i)$ and angular
+    impulse $\sum \Gamma_i (x_i^2 + y_i^2)$. At a relative equilibrium, such as a regular polygon of
+    equal vortices, they are dependent. **Reference**: numerical; three vortices move regularly,
+    but four and more are chaotic, and then roundoff grows exponentially over long times.
+    **Samples**: each vortex uniform in area on the annulus of radii $\tfrac12$ and $\tfrac32$,
+    drawn again until all are at least $0.3 / N$ apart, since close pairs turn about each other
+    arbitrarily fast.
+
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose strengths and horizon (500 steps of
+    0.5) are the defaults; P. K. Newton, "The N-Vortex Problem" (2001).
+    """
+
+    strengths: Float[Array, " vortices"] = eqx.field(converter=real, default=(1.0, 1.0, 1.0))
+
+    name: ClassVar[str] = "point-vortices"
+    title: ClassVar[str] = "Point vortices"
+    citation: ClassVar[str] = (
+        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
+        "P. K. Newton, The N-Vortex Problem, Springer (2001)."
+    )
+    t1: ClassVar[float] = 250.0
+    dt: ClassVar[float] = 0.5
+    axes: ClassVar[tuple[str, ...]] = ("x", "y")
+
+    def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
+        del t, args
+        dx, dy, r2 = _separations(y)
+        rates = self.like(y).strengths / (2 * jnp.pi * r2)
+        return jnp.stack([-jnp.sum(rates * dy, axis=1), jnp.sum(rates * dx, axis=1)], axis=1)
+
+    def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        _, _, r2 = _separations(y)
+        gamma = self.like(y).strengths
+        # A vortex is given distance 1 from itself, hence no self-energy.
+        return -jnp.sum(gamma[:, None] * gamma * jnp.log(r2)) / (8 * jnp.pi)
+
+    def linear_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, "2"]:
+        del t, args
+        return jnp.sum(self.like(y).strengths[:, None] * y, axis=0)
+
+    def angular_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        return jnp.sum(self.like(y).strengths[:, None] * y**2)
+
+    @property
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        return {
+            "energy": FirstIntegral(self.energy),
+            "linear impulse": FirstIntegral(self.linear_impulse),
+            "angular impulse": FirstIntegral(self.angular_impulse),
+        }
+
+    @property
+    def y0(self) -> State:
+        """An irregular polygon inside the paper's annulus; the paper names no single state."""
+        k = jnp.arange(self.strengths.size, dtype=float)
+        radius, angle = 1 + 0.4 * jnp.cos(k), 2 * jnp.pi * k / self.strengths.size
+        return radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+    def sample(self, key: PRNGKeyArray) -> State:
+        shape = self.strengths.shape
+
+        def draw(key: PRNGKeyArray) -> State:
+            return annulus(key, shape, inner=0.5, outer=1.5)
+
+        def is_too_close(carry: tuple[PRNGKeyArray, State]) -> Bool[Array, ""]:
+            _, _, r2 = _separations(carry[1])
+            return jnp.min(r2) < (0.3 / self.strengths.size) ** 2
+
+        def again(carry: tuple[PRNGKeyArray, State]) -> tuple[PRNGKeyArray, State]:
+            key, draw_key = jr.split(carry[0])
+            return key, draw(draw_key)
+
+        return jax.lax.while_loop(is_too_close, again, again((key, draw(key))))[1]
+
+    def trajectories(
+        self, ys: Float[Array, "times vortices 2"]
+    ) -> dict[str, Float[Array, "times 2"]]:
+        return {f"vortex {i + 1}": ys[:, i] for i in range(self.strengths.size)}
+
+
+PointVortices.__init__.__doc__ = r"""**Arguments:**
+
+- `strengths`: the strengths $\Gamma_1, \dots, \Gamma_N$, whose number is that of the vortices.
+"""
+
+
+def _separations(
+    y: State,
+) -> tuple[
+    Float[Array, "vortices vortices"],
+    Float[Array, "vortices vortices"],
+    Float[Array, "vortices vortices"],
+]:
+    """$x_i - x_j$, $y_i - y_j$ and $r_{ij}^2$, with ones on the diagonal of the last."""
+    dx = y[:, None, 0] - y[None, :, 0]
+    dy = y[:, None, 1] - y[None, :, 1]
+    return dx, dy, dx**2 + dy**2 + jnp.eye(y.shape[0], dtype=y.dtype)
