@@ -1,6 +1,7 @@
 """What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
 
 import abc
+import math
 from typing import Any, final
 
 import equinox as eqx
@@ -166,22 +167,14 @@ def targets(manifold: Manifold, values: Values, outputs: Values) -> Values:
     )
 
 
-def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
-    """Raises unless every function of the manifold returns real floating-point arrays, as many in
-    all as there are unknowns or fewer, and `values` is shaped as what they return."""
-    entries = _named_entries(manifold)
-    expected = jtu.tree_structure(manifold, is_leaf=is_entry).flatten_up_to(values)
+def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
+    """Raises unless the functions of the manifold return real floating-point arrays, at least one
+    scalar in all and at most as many as the state has unknowns."""
     count = 0
-    for (name, entry), value in zip(entries, expected, strict=True):
-        output = eqx.filter_eval_shape(entry.fn, t, y, args)
-        for leaf in jtu.tree_leaves(output):
+    for name, entry in _named_entries(manifold):
+        for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
             _check_output(name, leaf)
-        count += sum(leaf.size for leaf in jtu.tree_leaves(output))
-        if isinstance(entry, FirstIntegral) and _shapes(output) != _shapes(value):
-            raise ValueError(
-                f"The conserved value of `{name}` has the structure {_shapes(value)}, but its "
-                f"`fn(t, y, args)` returns {_shapes(output)}. Both must be the same."
-            )
+            count += math.prod(jnp.shape(leaf))
     unknowns = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
@@ -190,6 +183,27 @@ def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, ar
             f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
             "unknowns: no state can satisfy them in general. Remove dependent ones."
         )
+
+
+def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
+    """Raises unless the conserved values are shaped as what the first integrals return."""
+    entries = _named_entries(manifold)
+    treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
+    try:
+        flat = treedef.flatten_up_to(values)
+    except ValueError as error:
+        raise ValueError(
+            f"`value` has the structure {jtu.tree_structure(values)}, which is not that of "
+            f"`manifold`, {treedef}. Put the conserved value in the place of each `FirstIntegral` "
+            "and `None` in the place of each `Constraint`."
+        ) from error
+    for (name, entry), value in zip(entries, flat, strict=True):
+        output = eqx.filter_eval_shape(entry.fn, t, y, args)
+        if isinstance(entry, FirstIntegral) and _shapes(output) != _shapes(value):
+            raise ValueError(
+                f"The conserved value of `{name}` has the structure {_shapes(value)}, but its "
+                f"`fn(t, y, args)` returns {_shapes(output)}. Both must be the same."
+            )
 
 
 def _check_output(name: str, leaf: Any) -> None:

@@ -10,6 +10,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     FirstIntegral,
     check_manifold,
+    check_outputs,
     check_values,
     conserved_values,
     evaluate,
@@ -69,6 +70,9 @@ def project(
     check_manifold(manifold)
     projection = Newton() if projection is None else projection
     y = jtu.tree_map(jnp.asarray, y)
+    check_state(y)
+    check_metric(projection.metric, y)
+    check_outputs(manifold, t, y, args)
     if value is None:
         for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
             if isinstance(entry, FirstIntegral) and entry.value is None:
@@ -79,9 +83,7 @@ def project(
                     "`FirstIntegral(fn, value=...)`."
                 )
         value = conserved_values(manifold, t, y, args)
-    check_state(y)
     check_values(manifold, value, t, y, args)
-    check_metric(projection.metric, y)
     return apply(projection, manifold, value, t, y, args)
 
 

@@ -20,7 +20,7 @@ from .._custom_types import (
     Y,
 )
 from .._interpolation import MakeManifoldInterpolation, Target
-from .._manifold import check_manifold, check_values, conserved_values
+from .._manifold import check_manifold, check_outputs, check_values, conserved_values
 from .._projection import (
     AbstractProjection,
     SimplifiedNewton,
@@ -115,7 +115,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
-    # off the wrapper.
+    # off the wrapper. `Any`: `equinox.tree_at` puts placeholders in the place of values.
 
     @property
     def term_structure(self) -> PyTree[type[dfx.AbstractTerm]]:  # pyright: ignore
@@ -126,15 +126,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         return self.solver.term_compatible_contr_kwargs
 
     @property
-    def root_finder(self) -> optx.AbstractRootFinder:
+    def root_finder(self) -> Any:
         return _innermost(self.solver).root_finder  # pyright: ignore
 
     @property
-    def root_find_max_steps(self) -> int:
+    def root_find_max_steps(self) -> Any:
         return _innermost(self.solver).root_find_max_steps  # pyright: ignore
 
     @property
-    def scan_kind(self) -> str | None:
+    def scan_kind(self) -> Any:
         return _innermost(self.solver).scan_kind  # pyright: ignore
 
     @property
@@ -171,6 +171,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         t = t0 * time_direction(terms, t0)
         check_state(y0)
         check_metric(self.projection.metric, y0)
+        check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
         return self.solver.init(terms, t0, t1, y0, args), values

@@ -23,19 +23,16 @@ class AbstractIntegratedSystem(AbstractSystem):
 
 
 def integrate(
-    system: AbstractSystem,
-    ts: Float[Array, " times"],
-    y0: Any,
-    *,
-    rtol: float = 1e-13,
-    atol: float = 1e-13,
+    system: AbstractSystem, ts: Float[Array, " times"], y0: Any, *, atol: float = 1e-15
 ) -> Any:
     """The states at `ts` by the eighth-order method of Dormand and Prince, in float64.
 
-    The solver steps exactly onto `ts`: dense output at these tolerances is off by 1e-10, four
-    orders more than the steps themselves.
+    The solver steps exactly onto `ts`: dense output is off by 1e-10 even at tolerances near
+    roundoff. These are at roundoff because the local errors add up: over the default horizons a
+    tolerance of 1e-13 leaves errors of 1e-12 to 5e-9, one of 1e-15 errors of 1e-13 to 4e-11, for
+    1.6 times the steps (measured against closed forms, and against a tolerance of 1e-16).
     """
-    controller = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
+    controller = dfx.ClipStepSizeController(dfx.PIDController(rtol=1e-15, atol=atol), step_ts=ts)
     sol = dfx.diffeqsolve(
         dfx.ODETerm(system.vector_field),
         dfx.Dopri8(),
@@ -46,6 +43,6 @@ def integrate(
         args=system.args,
         saveat=dfx.SaveAt(ts=ts),
         stepsize_controller=controller,
-        max_steps=None,
+        max_steps=10**7,
     )
     return sol.ys

@@ -55,9 +55,7 @@ class RigidBody(AbstractSystem):
         del t, args
         return jnp.sum(self.like(y).inertia * y**2) / 2
 
-    def squared_angular_momentum(
-        self, t: RealScalarLike, y: State, args: Args
-    ) -> Float[Array, ""]:
+    def squared_angular_momentum(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
         del t, args
         return jnp.sum((self.like(y).inertia * y) ** 2)
 

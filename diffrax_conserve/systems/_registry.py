@@ -1,0 +1,74 @@
+"""The catalogue by name, as the command line sees it."""
+
+import difflib
+
+from ._attitude import RigidBodyAttitude
+from ._base import AbstractSystem
+from ._cartesian_pendulum import CartesianPendulum
+from ._double_pendulum import DoublePendulum
+from ._henon_heiles import HenonHeiles
+from ._kepler import Kepler
+from ._lorenz import ConservativeLorenz
+from ._lotka_volterra import LotkaVolterra
+from ._oscillator import HarmonicOscillator
+from ._rigid_body import RigidBody
+from ._solar import OuterSolarSystem
+from ._toda import TodaLattice
+from ._vortices import PointVortices
+
+# In the order in which they are listed: the paper's five first.
+_SYSTEMS: dict[str, type[AbstractSystem]] = {
+    system.name: system
+    for system in (
+        HarmonicOscillator,
+        RigidBody,
+        DoublePendulum,
+        ConservativeLorenz,
+        PointVortices,
+        Kepler,
+        OuterSolarSystem,
+        HenonHeiles,
+        LotkaVolterra,
+        TodaLattice,
+        CartesianPendulum,
+        RigidBodyAttitude,
+    )
+}
+
+
+def names() -> tuple[str, ...]:
+    """The names of all systems of the catalogue."""
+    return tuple(_SYSTEMS)
+
+
+def get(name: str) -> AbstractSystem:
+    """The system called `name`, with its default parameters.
+
+    **Arguments:**
+
+    - `name`: one of `names()`, such as `"kepler"`.
+
+    **Returns:**
+
+    An instance of the system's class. Other parameters are given to the class itself:
+    `Kepler(mu=2.0)`.
+
+    **Raises:**
+
+    `ValueError` for an unknown name, naming those that are close to it.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        system = dfc.systems.get("rigid-body")
+        ```
+    """
+    if name not in _SYSTEMS:
+        close = difflib.get_close_matches(str(name).lower().replace("_", "-"), _SYSTEMS, cutoff=0.4)
+        hint = f"Did you mean {' or '.join(map(repr, close))}? " if close else ""
+        raise ValueError(
+            f"There is no system called {name!r}. {hint}The catalogue holds: {', '.join(_SYSTEMS)}."
+        )
+    return _SYSTEMS[name]()

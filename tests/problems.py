@@ -1,0 +1,86 @@
+"""Small problems that several test files share, written out here independently of the catalogue."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffrax_conserve as dfc
+
+INERTIA = np.array([0.1, 0.2, 0.3])
+
+
+def rigid_body(t, w, args):
+    """Free rotation: `I ω' = (I ω) × ω`."""
+    del t, args
+    inertia = jnp.asarray(INERTIA, w.dtype)
+    return jnp.cross(inertia * w, w) / inertia
+
+
+def rotational_energy(t, w, args):
+    del t, args
+    return jnp.sum(jnp.asarray(INERTIA, w.dtype) * w**2) / 2
+
+
+def squared_momentum(t, w, args):
+    del t, args
+    return jnp.sum((jnp.asarray(INERTIA, w.dtype) * w) ** 2)
+
+
+RIGID_BODY = {
+    "energy": dfc.FirstIntegral(rotational_energy),
+    "momentum": dfc.FirstIntegral(squared_momentum),
+}
+OMEGA0 = jnp.ones(3)
+
+
+def kepler(t, y, args):
+    del t, args
+    q, p = y
+    return p, -q / jnp.sum(q**2) ** 1.5
+
+
+def kepler_energy(t, y, args):
+    del t, args
+    q, p = y
+    return jnp.sum(p**2) / 2 - 1 / jnp.sqrt(jnp.sum(q**2))
+
+
+def kepler_momentum(t, y, args):
+    del t, args
+    q, p = y
+    return q[0] * p[1] - q[1] * p[0]
+
+
+KEPLER0 = (jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0]))
+KEPLER = (dfc.FirstIntegral(kepler_energy), dfc.FirstIntegral(kepler_momentum))
+
+
+def exponential(t, y, args):
+    """`u' = -e^v`, `v' = e^u`, which keeps `e^u + e^v`."""
+    del t, args
+    u, v = y
+    return jnp.stack([-jnp.exp(v), jnp.exp(u)])
+
+
+EXPONENTIAL = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.exp(y)))
+EXPONENTIAL0 = jnp.array([1.0, 0.5])
+
+
+def exponential_solution(t):
+    """Separates in `s = e^u`: with `c = e^u + e^v`, `s' = -s (c - s)`, a logistic equation."""
+    c = jnp.sum(jnp.exp(EXPONENTIAL0))
+    ratio = jnp.exp(EXPONENTIAL0[0]) / (c - jnp.exp(EXPONENTIAL0[0])) * jnp.exp(-c * t)
+    s = c * ratio / (1 + ratio)
+    return jnp.stack([jnp.log(s), jnp.log(c - s)])
+
+
+def solve(vector_field, solver, y0, *, t0=0.0, t1=1.0, dt0=0.1, args=None, **kwargs):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs
+    )
+
+
+def largest(tree):
+    """The largest absolute value in a PyTree."""
+    return max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(tree))

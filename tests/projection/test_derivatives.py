@@ -1,0 +1,175 @@
+"""Derivatives of a projection, against finite differences and against the unrolled iteration."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0
+
+PROJECTIONS = {"simplified": dfc.SimplifiedNewton(), "newton": dfc.Newton()}
+each_projection = pytest.mark.parametrize("projection", list(PROJECTIONS.values()), ids=PROJECTIONS)
+
+
+class Energy(eqx.Module):
+    """An integral with parameters of its own."""
+
+    inertia: jax.Array
+
+    def __call__(self, t, w, args):
+        return jnp.sum(self.inertia * w**2) / 2 + args["tilt"] * t * w[0]
+
+
+def momentum(t, w, args):
+    del t
+    return jnp.sum(args["squares"] * w**2)
+
+
+INPUTS = dict(
+    inertia=jnp.array([0.1, 0.2, 0.3]),
+    args={"tilt": jnp.array(0.05), "squares": jnp.array([0.01, 0.04, 0.09])},
+    values=(jnp.array(0.31), jnp.array(0.142)),
+    t=jnp.array(0.4),
+    y=OMEGA0 + jnp.array([0.02, -0.03, 0.01]),
+    metric=jnp.array([1.0, 2.0, 0.5]),
+)
+
+
+def projected(inputs, projection):
+    manifold = (dfc.FirstIntegral(Energy(inputs["inertia"])), dfc.FirstIntegral(momentum))
+    projection = eqx.tree_at(
+        lambda p: p.metric, projection, inputs["metric"], is_leaf=lambda x: x is None
+    )
+    return dfc.project(
+        manifold,
+        inputs["y"],
+        t=inputs["t"],
+        args=inputs["args"],
+        value=inputs["values"],
+        projection=projection,
+    )[0]
+
+
+def loss(inputs, projection):
+    return jnp.sum(jnp.array([1.0, -2.0, 0.5]) * projected(inputs, projection) ** 3)
+
+
+def unrolled_simplified_newton(inputs):
+    """Twelve iterations of the textbook formula, differentiated as they stand."""
+    energy = Energy(inputs["inertia"])
+
+    def g(y):
+        out = jnp.stack(
+            [energy(inputs["t"], y, inputs["args"]), momentum(inputs["t"], y, inputs["args"])]
+        )
+        return out - jnp.stack(inputs["values"])
+
+    jacobian = jax.jacrev(g)(inputs["y"]) / inputs["metric"]
+    gram = jacobian @ jax.jacrev(g)(inputs["y"]).T
+    multiplier = jnp.zeros(2)
+    for _ in range(12):
+        multiplier = multiplier - jnp.linalg.solve(gram, g(inputs["y"] + jacobian.T @ multiplier))
+    return inputs["y"] + jacobian.T @ multiplier
+
+
+def directions(seed):
+    leaves, treedef = jax.tree.flatten(INPUTS)
+    rng = np.random.default_rng(seed)
+    return jax.tree.unflatten(treedef, [jnp.asarray(rng.normal(size=x.shape)) for x in leaves])
+
+
+def move(inputs, step, direction):
+    return jax.tree.map(lambda x, d: x + step * d, inputs, direction)
+
+
+def dot(a, b):
+    return sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+@each_projection
+def test_gradient_agrees_with_finite_differences(projection):
+    """With respect to the state, time, args, conserved values, the metric and what is in `fn`."""
+    value = eqx.filter_jit(loss)
+    gradient = eqx.filter_jit(eqx.filter_grad(loss))(INPUTS, projection)
+    for seed in range(3):
+        d = directions(seed)
+        h = 1e-5
+        difference = (
+            value(move(INPUTS, h, d), projection) - value(move(INPUTS, -h, d), projection)
+        ) / (2 * h)
+        np.testing.assert_allclose(dot(gradient, d), difference, rtol=1e-6, atol=1e-8)
+    for name, part in gradient.items():
+        assert all(bool(jnp.any(x != 0)) for x in jax.tree.leaves(part)), name
+
+
+def test_derivatives_agree_with_the_unrolled_iteration():
+    def implicit(inputs):
+        return projected(inputs, dfc.SimplifiedNewton())
+
+    for transform in (jax.jacfwd, jax.jacrev):
+        ours = jax.jit(transform(implicit))(INPUTS)
+        theirs = jax.jit(transform(unrolled_simplified_newton))(INPUTS)
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
+
+
+@each_projection
+def test_forward_and_reverse_agree(projection):
+    d = directions(7)
+    _, forward = eqx.filter_jvp(lambda inputs: loss(inputs, projection), (INPUTS,), (d,))
+    reverse = dot(eqx.filter_grad(loss)(INPUTS, projection), d)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+
+
+@each_projection
+def test_second_derivatives(projection):
+    gradient = eqx.filter_jit(eqx.filter_grad(loss))
+    d = directions(3)
+    _, second = eqx.filter_jit(
+        lambda inputs, d: eqx.filter_jvp(
+            lambda x: eqx.filter_grad(loss)(x, projection), (inputs,), (d,)
+        )
+    )(INPUTS, d)
+    h = 1e-5
+    plus, minus = (gradient(move(INPUTS, s, d), projection) for s in (h, -h))
+    for a, p, m in zip(*map(jax.tree.leaves, (second, plus, minus)), strict=True):
+        np.testing.assert_allclose(a, (p - m) / (2 * h), rtol=1e-5, atol=1e-6)
+
+
+def test_gradient_with_redundant_constraints_is_that_without():
+    def run(inputs, copies):
+        manifold = (dfc.FirstIntegral(Energy(inputs["inertia"])),) * copies
+        y, _ = dfc.project(
+            manifold,
+            inputs["y"],
+            args=inputs["args"],
+            value=(inputs["values"][0],) * copies,
+            projection=dfc.SimplifiedNewton(),
+        )
+        return jnp.sum(y**3)
+
+    once, twice = (eqx.filter_grad(run)(INPUTS, copies) for copies in (1, 2))
+    for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(twice), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_many_constraints_agree_with_finite_differences():
+    chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args)
+    rng = np.random.default_rng(0)
+    q = jnp.asarray(np.stack([np.arange(9.0), np.zeros(9)], -1) + 0.02 * rng.normal(size=(9, 2)))
+
+    @jax.jit
+    def value(q, length):
+        projection = dfc.SimplifiedNewton()
+        return jnp.sum(dfc.project(chain, q, args=length, projection=projection)[0] ** 3)
+
+    dq, dl = jax.grad(value, argnums=(0, 1))(q, 1.0)
+    d, h = jnp.asarray(rng.normal(size=q.shape)), 1e-6
+    np.testing.assert_allclose(
+        jnp.sum(dq * d) + dl,
+        (value(q + h * d, 1.0 + h) - value(q - h * d, 1.0 - h)) / (2 * h),
+        rtol=1e-7,
+    )

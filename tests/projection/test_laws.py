@@ -1,0 +1,239 @@
+"""Laws that every projection obeys, at drawn candidates."""
+
+import equinox as eqx
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from hypothesis import assume, given
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
+
+EPS = np.finfo(np.float64).eps
+VALUES = {"energy": rotational_energy(0, OMEGA0, None), "momentum": squared_momentum(0, OMEGA0, None)}
+PROJECTIONS = {"simplified": dfc.SimplifiedNewton(), "newton": dfc.Newton()}
+
+
+def vectors(n, size):
+    return hnp.arrays(np.float64, n, elements=st.floats(-size, size))
+
+
+# Near the curve of the rigid body, where both projections must succeed.
+near = vectors(3, 0.05).map(lambda d: np.ones(3) + d)
+each_projection = pytest.mark.parametrize("projection", list(PROJECTIONS.values()), ids=PROJECTIONS)
+
+
+@eqx.filter_jit
+def project(manifold, y, projection, value=VALUES, t=0.0, args=None):
+    return dfc.project(manifold, y, t=t, args=args, value=value, projection=projection)
+
+
+def successful(info):
+    return bool(info.result == optx.RESULTS.successful)
+
+
+@each_projection
+@given(y=near)
+def test_success_means_that_the_residual_is_at_roundoff(projection, y):
+    projected, info = project(RIGID_BODY, y, projection)
+    assert successful(info)
+    assert info.residual_after <= 4 * EPS
+    # Independently, and relative to the conserved value alone:
+    w = np.asarray(projected, np.longdouble)
+    inertia = np.array([0.1, 0.2, 0.3])
+    assert abs(np.sum(inertia * w**2) / 2 - 0.3) <= 4e-15 * 0.3
+    assert abs(np.sum((inertia * w) ** 2) - 0.14) <= 4e-15 * 0.14
+
+
+@each_projection
+@given(y=near)
+def test_idempotent(projection, y):
+    once, _ = project(RIGID_BODY, y, projection)
+    twice, info = project(RIGID_BODY, once, projection)
+    assert successful(info)
+    np.testing.assert_allclose(twice, once, rtol=0, atol=1e-14)
+
+
+@each_projection
+@given(y=near)
+def test_permuting_the_constraints_changes_nothing(projection, y):
+    a, _ = project(tuple(RIGID_BODY.values()), y, projection, tuple(VALUES.values()))
+    b, _ = project(tuple(RIGID_BODY.values())[::-1], y, projection, tuple(VALUES.values())[::-1])
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
+
+
+@each_projection
+@given(y=near)
+def test_a_duplicated_or_dependent_constraint_changes_nothing(projection, y):
+    """The Gram matrix is singular then."""
+    energy, momentum = RIGID_BODY.values()
+    dependent = dfc.FirstIntegral(lambda t, y, args: rotational_energy(t, y, args) ** 2)
+    plain, _ = project(RIGID_BODY, y, projection)
+    for entry, value in [(energy, VALUES["energy"]), (dependent, VALUES["energy"] ** 2)]:
+        redundant = (energy, momentum, entry)
+        values = (VALUES["energy"], VALUES["momentum"], value)
+        y1, info = project(redundant, y, projection, values)
+        assert successful(info)
+        np.testing.assert_allclose(y1, plain, rtol=0, atol=1e-12)
+
+
+@each_projection
+@given(y=near, factor=st.floats(1e-8, 1e8))
+def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
+    scaled = {
+        "energy": RIGID_BODY["energy"],
+        "momentum": dfc.FirstIntegral(lambda t, y, args: args * squared_momentum(t, y, None)),
+    }
+    values = VALUES | {"momentum": factor * VALUES["momentum"]}
+    a, info = project(scaled, y, projection, values, args=jnp.asarray(factor))
+    b, _ = project(RIGID_BODY, y, projection)
+    assert successful(info)
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
+
+
+@given(y=vectors(4, 10.0), matrix=vectors((2, 4), 1.0), b=vectors(2, 10.0), weights=vectors(4, 1.0))
+def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weights):
+    assume(np.linalg.cond(matrix) < 1e3 and np.linalg.norm(matrix) > 0.1)
+    metric = np.exp(weights)
+    root = np.sqrt(metric)
+    expected = y + np.linalg.lstsq(matrix / root, b - matrix @ y, rcond=None)[0] / root
+    plane = dfc.Constraint(lambda t, y, args: args[0] @ y - args[1])
+    for kind in (dfc.SimplifiedNewton, dfc.Newton):
+        projected, info = project(plane, y, kind(metric=metric, rtol=1e-14), None, args=(matrix, b))
+        assert successful(info)
+        np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
+
+
+@given(y=vectors(5, 3.0))
+def test_sphere_agrees_with_normalising(y):
+    assume(np.linalg.norm(y) > 0.3)
+    sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+    projected, info = project(sphere, y, dfc.Newton(), None)
+    assert successful(info)
+    np.testing.assert_allclose(projected, y / np.linalg.norm(y), rtol=0, atol=1e-14)
+
+
+@given(y=near, weights=vectors(3, 2.0))
+def test_newton_finds_the_nearest_point(y, weights):
+    """On a curve: the weighted correction is orthogonal to the tangent, and no point found by
+    walking along the curve is nearer."""
+    metric = np.exp(weights)
+    projected, _ = project(RIGID_BODY, y, dfc.Newton(metric=metric))
+    inertia = np.array([0.1, 0.2, 0.3])
+    tangent = np.cross(inertia * projected, inertia**2 * projected)
+    tangent /= np.linalg.norm(tangent)
+    assert abs(np.sum(metric * (projected - y) * tangent)) <= 1e-10
+    distance = np.sum(metric * (projected - y) ** 2)
+    for step in (-0.01, 0.01):
+        other, _ = project(RIGID_BODY, projected + step * tangent, dfc.Newton())
+        assert np.sum(metric * (other - y) ** 2) >= distance - 1e-12
+
+
+@given(y=near, weights=vectors(3, 2.0))
+def test_simplified_newton_moves_along_the_gradients_at_the_candidate(y, weights):
+    metric = np.exp(weights)
+    projected, _ = project(RIGID_BODY, y, dfc.SimplifiedNewton(metric=metric))
+    inertia = np.array([0.1, 0.2, 0.3])
+    gradients = np.stack([inertia * y, 2 * inertia**2 * y]) / metric
+    normal = np.cross(*gradients)
+    assert abs((projected - y) @ normal) <= 1e-13 * np.linalg.norm(normal)
+
+
+@each_projection
+@given(y=near)
+def test_infinite_weights_freeze_components(projection, y):
+    frozen = eqx.tree_at(
+        lambda p: p.metric, projection, jnp.array([1.0, jnp.inf, 1.0]), is_leaf=lambda x: x is None
+    )
+    energy = RIGID_BODY["energy"]
+    projected, info = project(energy, y, frozen, VALUES["energy"])
+    assert successful(info)
+    assert projected[1] == y[1]
+
+
+@each_projection
+@given(ys=vectors((7, 3), 0.05).map(lambda d: np.ones(3) + d))
+def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
+    batched, info = jax.vmap(lambda y: project(RIGID_BODY, y, projection))(ys)
+    for i, y in enumerate(ys):
+        alone, alone_info = project(RIGID_BODY, y, projection)
+        np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
+        assert abs(int(info.num_steps[i]) - int(alone_info.num_steps)) <= 1
+
+
+@each_projection
+@given(y=near)
+def test_any_pytree_is_the_same_as_one_array(projection, y):
+    def stack(y):
+        return jnp.concatenate([y["a"], y["b"][None]])
+
+    tree = {
+        name: dfc.FirstIntegral(lambda t, y, args, fn=entry.fn: fn(t, stack(y), args))
+        for name, entry in RIGID_BODY.items()
+    }
+    projected, _ = project(tree, {"a": y[:2], "b": y[2]}, projection)
+    expected, _ = project(RIGID_BODY, y, projection)
+    np.testing.assert_allclose(stack(projected), expected, rtol=0, atol=1e-14)
+
+
+@each_projection
+def test_inconsistent_constraints_fail(projection):
+    energy = dfc.FirstIntegral(rotational_energy)
+    _, info = project((energy, energy), OMEGA0, projection, (jnp.array(0.3), jnp.array(0.4)))
+    assert not successful(info)
+    _, info = project(dfc.Constraint(lambda t, y, args: jnp.sum(y**2) + 1), OMEGA0, projection, None)
+    assert not successful(info)
+
+
+@each_projection
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_nan_is_never_a_success(projection, bad):
+    _, info = project(RIGID_BODY, np.array([1.0, bad, 1.0]), projection)
+    assert not successful(info)
+
+
+@each_projection
+def test_a_critical_point_that_satisfies_the_constraint_stays(projection):
+    """All gradients vanish."""
+    values = {"energy": jnp.array(0.0), "momentum": jnp.array(0.0)}
+    projected, info = project(RIGID_BODY, np.zeros(3), projection, values)
+    assert successful(info)
+    assert np.all(projected == 0)
+
+
+@each_projection
+def test_many_constraints(projection):
+    """More than are unrolled: a chain of nine rigid bonds."""
+    chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - 1)
+    rng = np.random.default_rng(0)
+    q = np.stack([np.arange(10.0), np.zeros(10)], -1) + 0.02 * rng.normal(size=(10, 2))
+    projected, info = project(chain, q, projection, None)
+    assert successful(info)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(projected, axis=0), axis=-1), 1, rtol=0, atol=1e-14
+    )
+
+
+def test_single_precision():
+    y, info = project(
+        RIGID_BODY,
+        np.array([1.01, 0.99, 1.02], np.float32),
+        dfc.SimplifiedNewton(),
+        jax.tree.map(lambda x: x.astype(jnp.float32), VALUES),
+    )
+    assert y.dtype == jnp.float32
+    assert successful(info)
+    assert info.residual_after <= 4 * np.finfo(np.float32).eps
+
+
+def test_mixed_precision_leaves():
+    manifold = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y[0] ** 2) + jnp.sum(y[1] ** 2))
+    y = (np.array([1.0, 0.2]), np.array([0.5], np.float32))
+    projected, info = project(manifold, y, dfc.SimplifiedNewton(), jnp.array(1.3))
+    assert successful(info)
+    assert [x.dtype for x in projected] == [jnp.float64, jnp.float32]

@@ -1,0 +1,136 @@
+"""Wrong input is refused with an error that names the argument and the remedy."""
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from .problems import OMEGA0, RIGID_BODY, rigid_body, rotational_energy, solve
+
+
+@pytest.fixture(autouse=True)
+def no_type_checker():
+    """As users run it: the run-time type checker of the suite would answer first."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def wrap(manifold, **kwargs):
+    return dfc.ManifoldProjection(dfx.Tsit5(), manifold, **kwargs)
+
+
+def run(manifold, y0=OMEGA0, **kwargs):
+    return solve(rigid_body, wrap(manifold, **kwargs), y0)
+
+
+def test_bare_function():
+    with pytest.raises(TypeError, match=r"manifold.*FirstIntegral\(fn\)"):
+        wrap(rotational_energy)
+    with pytest.raises(TypeError, match=r"manifold\['energy'\]"):
+        wrap({"energy": rotational_energy})
+
+
+def test_not_callable():
+    with pytest.raises(TypeError, match=r"`fn` is 3\."):
+        dfc.FirstIntegral(3)
+    with pytest.raises(TypeError, match=r"Constraint\(lambda"):
+        dfc.Constraint("sphere")
+
+
+@pytest.mark.parametrize("empty", [(), [], {}, None])
+def test_empty_manifold(empty):
+    with pytest.raises(ValueError, match="nothing to conserve"):
+        wrap(empty)
+
+
+def test_integral_that_returns_nothing():
+    with pytest.raises(ValueError, match="no array"):
+        run(dfc.FirstIntegral(lambda t, y, args: ()))
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda t, y, args: jnp.round(y[0]).astype(int),
+        lambda t, y, args: y[0] > 0,
+        lambda t, y, args: y[0] + 1j,
+        lambda t, y, args: "energy",
+        lambda t, y, args: 3,
+    ],
+    ids=["integer", "boolean", "complex", "string", "python int"],
+)
+def test_integral_of_wrong_type(fn):
+    with pytest.raises(TypeError, match=r"`fn` of `manifold\[1\]` must return.*floating-point"):
+        run((RIGID_BODY["energy"], dfc.FirstIntegral(fn)))
+
+
+def test_more_constraints_than_unknowns():
+    with pytest.raises(ValueError, match="4 scalar constraints.*3 unknowns"):
+        run(dfc.FirstIntegral(lambda t, y, args: jnp.concatenate([y, y[:1]])))
+
+
+def test_metric_of_wrong_structure():
+    with pytest.raises(ValueError, match=r"`metric` has the structure"):
+        run(RIGID_BODY, projection=dfc.SimplifiedNewton(metric=(1.0, 1.0)))
+    with pytest.raises(ValueError, match=r"`metric` has a leaf of shape \(2,\)"):
+        run(RIGID_BODY, projection=dfc.SimplifiedNewton(metric=jnp.ones(2)))
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("kind", [dfc.SimplifiedNewton, dfc.Newton])
+def test_metric_that_is_not_positive(kind, weight):
+    with pytest.raises(ValueError, match="`metric` has a weight that is not positive"):
+        kind(metric=jnp.array([1.0, weight, 1.0]))
+
+
+def test_solver_that_is_none():
+    with pytest.raises(TypeError, match="not a diffrax solver"):
+        dfc.ManifoldProjection(rigid_body, RIGID_BODY)
+    with pytest.raises(TypeError, match=r"Pass an instance"):
+        dfc.ManifoldProjection(dfx.Tsit5, RIGID_BODY)
+
+
+def test_projection_that_is_none():
+    with pytest.raises(TypeError, match="which is not a projection"):
+        wrap(RIGID_BODY, projection=dfc.SimplifiedNewton)
+
+
+def test_value_of_wrong_structure():
+    with pytest.raises(ValueError, match="not that of `manifold`"):
+        dfc.project(RIGID_BODY, OMEGA0, value=(1.0, 2.0))
+
+
+@pytest.mark.parametrize("value", [(1.0, 2.0), jnp.ones(1), {"energy": 1.0}])
+def test_conserved_value_of_wrong_structure(value):
+    with pytest.raises(ValueError, match="conserved value of `manifold` has the structure"):
+        run(dfc.FirstIntegral(rotational_energy, value=value))
+
+
+def test_complex_state():
+    with pytest.raises(TypeError, match="real floating-point states"):
+        dfc.project(dfc.Constraint(lambda t, y, args: jnp.abs(y)), jnp.array(1j))
+
+
+def test_project_without_a_value():
+    with pytest.raises(ValueError, match=r"Pass `value="):
+        dfc.project(RIGID_BODY, OMEGA0)
+
+
+def test_nested_implicit_solver_without_tolerances():
+    with pytest.raises(ValueError, match="VeryChord"):
+        dfc.ManifoldProjection(dfx.HalfSolver(dfx.Kvaerno3()), RIGID_BODY)
+
+
+def test_drift_of_nothing():
+    sol = run(RIGID_BODY)
+    batch = dfx.Solution(
+        **{**vars(sol), "ts": jnp.zeros((2, 3)), "ys": jnp.zeros((2, 3, 3))}
+    )
+    with pytest.raises(ValueError, match="saved states"):
+        dfc.drift(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=dfx.SaveAt(dense=True)), RIGID_BODY)
+    with pytest.raises(ValueError, match=r"jax\.vmap"):
+        dfc.drift(batch, RIGID_BODY)
