@@ -208,7 +208,11 @@ def _relative_sizes(
     # The sizes of what cancels: of the derivative's terms, and of the value's to first order.
     speeds = [_term_sizes(rows, (jnp.ones_like(t), f)) for rows in jacobian]
     sizes = [_term_sizes(rows, (t, y)) for rows in jacobian]
-    residual = value if isinstance(entry, Constraint) else jtu.tree_map(jnp.zeros_like, value)
+    residual = value if isinstance(entry, Constraint) else [jnp.zeros_like(x) for x in value]
+    # An integral that is not defined at `y` is not conserved, though its derivative may vanish.
+    along_flow = [
+        jnp.where(jnp.isfinite(x), dx, jnp.nan) for x, dx in zip(value, along_flow, strict=True)
+    ]
     return _largest_ratio(along_flow, speeds), _largest_ratio(residual, sizes)
 
 

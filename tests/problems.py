@@ -76,9 +76,7 @@ def exponential_solution(t):
 
 
 def solve(vector_field, solver, y0, *, t0=0.0, t1=1.0, dt0=0.1, args=None, **kwargs):
-    return dfx.diffeqsolve(
-        dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs
-    )
+    return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs)
 
 
 def largest(tree):

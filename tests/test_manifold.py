@@ -43,7 +43,7 @@ def test_not_callable():
 
 @pytest.mark.parametrize("empty", [(), [], {}, None])
 def test_empty_manifold(empty):
-    with pytest.raises(ValueError, match="nothing to conserve"):
+    with pytest.raises(ValueError, match=r"nothing to conserve"):
         wrap(empty)
 
 
@@ -69,7 +69,7 @@ def test_integral_of_wrong_type(fn):
 
 
 def test_more_constraints_than_unknowns():
-    with pytest.raises(ValueError, match="4 scalar constraints.*3 unknowns"):
+    with pytest.raises(ValueError, match=r"4 scalar constraints.*3 unknowns"):
         run(dfc.FirstIntegral(lambda t, y, args: jnp.concatenate([y, y[:1]])))
 
 
@@ -106,7 +106,7 @@ def test_value_of_wrong_structure():
 
 @pytest.mark.parametrize("value", [(1.0, 2.0), jnp.ones(1), {"energy": 1.0}])
 def test_conserved_value_of_wrong_structure(value):
-    with pytest.raises(ValueError, match="conserved value of `manifold` has the structure"):
+    with pytest.raises(ValueError, match=r"conserved value of `manifold` has the structure"):
         run(dfc.FirstIntegral(rotational_energy, value=value))
 
 
@@ -127,9 +127,7 @@ def test_nested_implicit_solver_without_tolerances():
 
 def test_drift_of_nothing():
     sol = run(RIGID_BODY)
-    batch = dfx.Solution(
-        **{**vars(sol), "ts": jnp.zeros((2, 3)), "ys": jnp.zeros((2, 3, 3))}
-    )
+    batch = dfx.Solution(**{**vars(sol), "ts": jnp.zeros((2, 3)), "ys": jnp.zeros((2, 3, 3))})
     with pytest.raises(ValueError, match="saved states"):
         dfc.drift(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=dfx.SaveAt(dense=True)), RIGID_BODY)
     with pytest.raises(ValueError, match=r"jax\.vmap"):

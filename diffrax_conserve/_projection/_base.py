@@ -1,6 +1,7 @@
 """What every projection takes and returns, and when it may call itself successful."""
 
 import abc
+import functools as ft
 
 import equinox as eqx
 import jax.core
@@ -11,7 +12,8 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Y
-from ._jacobian import Residual, Vector
+from .._tree import tree_sub, working_dtype
+from ._jacobian import AbstractJacobian, Residual, Vector
 
 
 class ProjectionInfo(eqx.Module):
@@ -24,7 +26,8 @@ class ProjectionInfo(eqx.Module):
     - `num_steps`: how many iterations were made.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus
+        $|\\partial g/\\partial y| \\, |y - \\hat y|$.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     """
 
@@ -70,16 +73,35 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
 
 
 def tolerances(
-    magnitude: Vector, terms: Vector, rtol: float | Array | None, atol: float | Array | None
+    jacobian: AbstractJacobian,
+    y: Y,
+    candidate: Y,
+    weights: Y,
+    magnitude: Vector,
+    rtol: float | Array | None,
+    atol: float | Array | None,
 ) -> tuple[Vector, Vector]:
-    """The scale of each constraint, and the residual at which it counts as satisfied.
+    """The scale of each constraint at `y`, and the residual at which it counts as satisfied.
 
-    The scale is what roundoff is relative to: the conserved value and the terms that cancel in it.
+    The scale is what roundoff is relative to: the conserved value, the terms `y_k ∂g/∂y_k` that
+    cancel in the residual, and what the correction can contribute to it, `|∂g| |y - ŷ|` in the
+    norms of the metric.
     """
-    scale = jtu.tree_map(lambda a, b: a + b.astype(a.dtype), magnitude, terms)
+    correction = tree_sub(y, candidate)
+    squares = jtu.tree_map(
+        lambda c, w: jnp.where(w > 0, c / jnp.where(w > 0, w, 1), 0) * c, correction, weights
+    )
+    dtype = working_dtype(y)
+    distance = jnp.sqrt(
+        ft.reduce(jnp.add, [jnp.sum(x).astype(dtype) for x in jtu.tree_leaves(squares)])
+    )
+
+    def combine(value: Array, terms: Array, squared_norm: Array) -> Array:
+        return value + terms + jnp.sqrt(squared_norm) * distance
+
+    scale = jtu.tree_map(combine, magnitude, jacobian.scale(y), jacobian.squared_norms(weights))
 
     def tolerance(x: Array) -> Array:
-        # Evaluating a residual and rounding the state each cost about one unit of roundoff.
         relative = ROUNDOFF_MULTIPLE * jnp.finfo(x.dtype).eps if rtol is None else rtol
         absolute = 0 if atol is None else atol
         return jnp.asarray(relative, x.dtype) * x + jnp.asarray(absolute, x.dtype)
@@ -87,6 +109,7 @@ def tolerances(
     return scale, jtu.tree_map(tolerance, scale)
 
 
+# Rounding the state and evaluating the residual each cost about one unit of roundoff.
 ROUNDOFF_MULTIPLE = 4
 
 

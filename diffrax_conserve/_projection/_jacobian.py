@@ -45,6 +45,10 @@ class AbstractJacobian(eqx.Module):
         """`Σ_k |y_k ∂g_i/∂y_k|`, the size of the terms that cancel in `g_i`."""
 
     @abc.abstractmethod
+    def squared_norms(self, weights: Y) -> Vector:
+        """The diagonal of `G W Gᵀ`."""
+
+    @abc.abstractmethod
     def gram_solver(
         self,
         weights: Y,
@@ -93,6 +97,10 @@ class _Unrolled(AbstractJacobian):
         dtype = working_dtype(y)
         return tuple(tree_dot(jtu.tree_map(jnp.abs, r), magnitude, dtype) for r in self.rows)
 
+    def squared_norms(self, weights: Y) -> Vector:
+        dtype = working_dtype(weights)
+        return tuple(tree_dot(tree_mul(row, weights), row, dtype) for row in self.rows)
+
     def gram_solver(
         self,
         weights: Y,
@@ -137,6 +145,10 @@ class _Dense(AbstractJacobian):
             self.rows
         )
 
+    def squared_norms(self, weights: Y) -> Vector:
+        dtype = working_dtype(weights)
+        return jax.vmap(lambda row: tree_dot(tree_mul(row, weights), row, dtype))(self.rows)
+
     def gram_solver(
         self,
         weights: Y,
@@ -156,41 +168,38 @@ class _Dense(AbstractJacobian):
         products = jtu.tree_leaves(jtu.tree_map(product, self.rows, columns, weights))
         gram = ft.reduce(jnp.add, products)
         inverse = _reciprocal(jnp.diagonal(gram))
-        damping = damping + _least_damping(gram.shape[0], dtype)
-        factors = jax.scipy.linalg.lu_factor(
-            gram * inverse[:, None] + damping * jnp.eye(gram.shape[0], dtype=dtype)
-        )
-        return lambda b: jax.scipy.linalg.lu_solve(factors, b * inverse)
+        return _dense_solver(gram * inverse[:, None], inverse, damping)
 
 
-# Rows are scaled so that the diagonal of the Gram matrix is 1 (a row that vanishes stays zero, and
-# so does its multiplier), then a damping at the level of roundoff is added. Dependent constraints
-# leave a consistent singular system, whose solution the damping makes unique; what it adds along
-# the null vector n moves the state by `Gᵀ n = 0`. Anything larger would stall the iteration near
-# points where gradients are merely almost parallel.
+# Rows are scaled so that the diagonal of the Gram matrix is 1. The factors are those of Gaussian
+# elimination without pivoting: a Gram matrix is positive semi-definite, and `G W Hᵀ` of two nearby
+# Jacobians nearly so. A pivot at the level of roundoff marks a constraint whose gradient depends on
+# the earlier ones; its multiplier is zero, which changes nothing where the constraints are
+# consistent. (Damping instead would leave huge multipliers along the null vector, whose roundoff
+# moves the state.) Where gradients are merely almost parallel nothing is dropped: the direction in
+# which they differ is the one that is needed.
 
 
-def _least_damping(m: int, dtype: jnp.dtype) -> float:
-    return 4 * m * float(jnp.finfo(dtype).eps)
+def _least_pivot(m: int, dtype: jnp.dtype) -> float:
+    return 32 * m * float(jnp.finfo(dtype).eps)
 
 
-def _reciprocal(diagonal: Array) -> Array:
-    positive = diagonal > 0
-    return jnp.where(positive, 1 / jnp.where(positive, diagonal, 1), 0)
+def _reciprocal(x: Array) -> Array:
+    positive = x > 0
+    return jnp.where(positive, 1 / jnp.where(positive, x, 1), 0)
 
 
 def _unrolled_solver(
     gram: list[list[Array]], damping: Real[Array, ""] | float
 ) -> Callable[[Vector], Vector]:
-    """LU factors, without pivoting: a Gram matrix is positive semi-definite, and one of two nearby
-    Jacobians nearly so."""
     m = len(gram)
-    least = _least_damping(m, gram[0][0].dtype)
+    least = _least_pivot(m, gram[0][0].dtype)
     inverse = [_reciprocal(gram[i][i]) for i in range(m)]
     lu = [[gram[i][j] * inverse[i] for j in range(m)] for i in range(m)]
     pivots = []
     for k in range(m):
-        pivots.append(1 / jnp.maximum(lu[k][k] + (least + damping), least))
+        pivot = lu[k][k] + damping
+        pivots.append(jnp.where(pivot > least, 1 / jnp.where(pivot > least, pivot, 1), 0))
         for i in range(k + 1, m):
             lu[i][k] = lu[i][k] * pivots[k]
             for j in range(k + 1, m):
@@ -206,5 +215,32 @@ def _unrolled_solver(
                 x[i] = x[i] - lu[i][j] * x[j]
             x[i] = x[i] * pivots[i]
         return tuple(x)
+
+    return solve
+
+
+def _dense_solver(
+    scaled: Real[Array, "m m"], inverse: Real[Array, " m"], damping: Real[Array, ""] | float
+) -> Callable[[Vector], Vector]:
+    m = scaled.shape[0]
+    least = _least_pivot(m, scaled.dtype)
+    index = jnp.arange(m)
+
+    def eliminate(k: Array, factors: tuple[Array, Array]) -> tuple[Array, Array]:
+        lower, upper = factors
+        pivot = upper[k, k]
+        used = (index > k) & (pivot > least)
+        column = jnp.where(used, upper[:, k] / jnp.where(pivot > least, pivot, 1), 0)
+        upper = upper - column[:, None] * upper[k][None, :]
+        return lower.at[:, k].add(column), upper
+
+    identity = jnp.eye(m, dtype=scaled.dtype)
+    lower, upper = lax.fori_loop(0, m, eliminate, (identity, scaled + damping * identity))
+    kept = jnp.diagonal(upper) > least
+    upper = jnp.where(kept[:, None], upper, identity)
+
+    def solve(b: Vector) -> Vector:
+        x = jax.scipy.linalg.solve_triangular(lower, b * inverse, lower=True, unit_diagonal=True)
+        return jax.scipy.linalg.solve_triangular(upper, jnp.where(kept, x, 0))
 
     return solve

@@ -83,13 +83,11 @@ class Newton(AbstractProjection):
     ) -> tuple[Y, ProjectionInfo]:
         # The iterations are not differentiated: the optimality system is.
         fixed = _stop_gradient((residual, magnitude, candidate, weights))
-        start, multiplier, count = _reach(*fixed, projection=self)
-        y, nearest = _nearest(residual, candidate, weights, start, multiplier, self.max_steps)
+        start, count = _reach(*fixed, projection=self)
+        y, nearest = _nearest(residual, candidate, weights, start, self.max_steps)
 
-        before, at_candidate = linearise(residual, candidate)
         after, at_y = linearise(residual, y)
-        scale_before, _ = tolerances(magnitude, at_candidate.scale(candidate), self.rtol, self.atol)
-        scale, tolerance = tolerances(magnitude, at_y.scale(y), self.rtol, self.atol)
+        scale, tolerance = tolerances(at_y, y, candidate, weights, magnitude, self.rtol, self.atol)
         correction = tree_sub(y, candidate)
         info = ProjectionInfo(
             result=optx.RESULTS.where(
@@ -102,7 +100,7 @@ class Newton(AbstractProjection):
                 ),
             ),
             num_steps=count + nearest.stats["num_steps"],
-            residual_before=largest_relative(before, scale_before),
+            residual_before=largest_relative(residual(candidate), scale),
             residual_after=largest_relative(after, scale),
             correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(correction))),
         )
@@ -116,9 +114,9 @@ def _reach(
     weights: Y,
     *,
     projection: Newton,
-) -> tuple[Y, Vector, Array]:
-    """A damped Gauss-Newton iteration from the candidate to some point of the manifold, the
-    multipliers there that suit the candidate best, and the number of iterations."""
+) -> tuple[Y, Array]:
+    """A damped Gauss-Newton iteration from the candidate to some point of the manifold, and the
+    number of its steps."""
 
     def squared(g: Vector, scale: Vector) -> Real[Array, ""]:
         return jnp.square(jnp.linalg.norm(jnp.stack(_relative(g, scale)).astype(dtype)))
@@ -129,7 +127,7 @@ def _reach(
         y, _, count = carry
         g, jacobian = linearise(residual, y)
         scale, tolerance = tolerances(
-            magnitude, jacobian.scale(y), projection.rtol, projection.atol
+            jacobian, y, candidate, weights, magnitude, projection.rtol, projection.atol
         )
         merit = squared(g, scale)
         gram_solve = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
@@ -155,9 +153,7 @@ def _reach(
 
     start = (candidate, jnp.asarray(False), jnp.asarray(0))
     y, _, count = lax.while_loop(unfinished, iterate, start)
-    _, jacobian = linearise(residual, y)
-    multiplier = jacobian.gram_solver(weights)(jacobian.pushforward(tree_sub(y, candidate)))
-    return y, multiplier, count
+    return y, count
 
 
 def _stop_gradient(tree: PyTree[Any]) -> Any:
@@ -176,14 +172,27 @@ def _relative(g: Vector, scale: Vector) -> list[Array]:
 
 
 def _nearest(
-    residual: Residual, candidate: Y, weights: Y, start: Y, multiplier: Vector, max_steps: int
+    residual: Residual, candidate: Y, weights: Y, start: Y, max_steps: int
 ) -> tuple[Y, optx.Solution]:
-    """Newton's method on `y = ŷ + M⁻¹ G(y)ᵀ λ`, `g(y) = 0`."""
+    """Newton's method on `y = ŷ + M⁻¹ G(y)ᵀ λ`, `g(y) = 0`, from a point of the manifold and the
+    multipliers that suit the candidate best there."""
+    fixed = _stop_gradient((residual, candidate, weights))
+    _, jacobian = linearise(fixed[0], start)
+    multiplier = jacobian.gram_solver(fixed[2])(jacobian.pushforward(tree_sub(start, fixed[1])))
+    # Gradients of norm one, so that a linear solver sees the rank of the system.
+    norms = jtu.tree_map(
+        lambda x: jnp.sqrt(jnp.where(x > 0, x, 1)), jacobian.squared_norms(fixed[2])
+    )
+    multiplier = jtu.tree_map(jnp.multiply, multiplier, norms)
 
     def optimality(unknowns: tuple[Y, Vector], args) -> tuple[Y, Vector]:
         y, multiplier = unknowns
-        residual, candidate, weights = args
-        g, vjp = eqx.filter_vjp(residual, y)
+        residual, candidate, weights, norms = args
+
+        def unit(y: Y) -> Vector:
+            return jtu.tree_map(jnp.divide, residual(y), norms)
+
+        g, vjp = eqx.filter_vjp(unit, y)
         (direction,) = vjp(multiplier)
         return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
 
@@ -198,7 +207,7 @@ def _nearest(
         optimality,
         optx.Newton(rtol=tolerance, atol=tolerance, norm=_state_norm, linear_solver=linear_solver),
         (start, multiplier),
-        (residual, candidate, weights),
+        (residual, candidate, weights, norms),
         adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),
         max_steps=max_steps,
         throw=False,

@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_add, tree_dot, tree_mul, tree_sub, working_dtype
+from .._tree import tree_add, tree_all_finite, tree_dot, tree_mul, tree_sub, working_dtype
 from ._base import (
     AbstractProjection,
     ProjectionInfo,
@@ -25,6 +25,8 @@ from ._jacobian import AbstractJacobian, Residual, Vector, linearise
 # Iterations that are written out before the loop: enough for nearly every step of an integrator,
 # so that in a batch no lane waits for a loop that it does not need.
 INLINE_STEPS = 2
+
+_Iterate = tuple[Y, Vector, Vector, Int[Array, ""]]
 
 
 @final
@@ -88,9 +90,9 @@ class SimplifiedNewton(AbstractProjection):
         return y, info
 
 
-def _displaced(jacobian: AbstractJacobian, multiplier: Vector, candidate: Y, weights: Y) -> Y:
-    """`ŷ + M⁻¹ Gᵀ λ`."""
-    return tree_add(candidate, tree_mul(jacobian.pullback(multiplier), weights))
+def _displaced(jacobian: AbstractJacobian, multiplier: Vector, y: Y, weights: Y) -> Y:
+    """`y + M⁻¹ Gᵀ λ`."""
+    return tree_add(y, tree_mul(jacobian.pullback(multiplier), weights))
 
 
 @eqx.filter_custom_jvp
@@ -105,30 +107,37 @@ def _solve(
     max_steps: int,
 ) -> tuple[Y, Vector, ProjectionInfo]:
     before, jacobian = linearise(residual, candidate)
-    scale, tolerance = tolerances(magnitude, jacobian.scale(candidate), rtol, atol)
     gram_solve = jacobian.gram_solver(weights)
 
-    def iterate(carry: tuple[Vector, Vector, Int[Array, ""]]):
-        multiplier, g, count = carry
-        multiplier = jtu.tree_map(jnp.subtract, multiplier, gram_solve(g))
-        g = residual(_displaced(jacobian, multiplier, candidate, weights))
-        return multiplier, g, count + 1
+    def iterate(carry: _Iterate) -> _Iterate:
+        # The state is updated by increments, which shrink, rather than from the multipliers, which
+        # can be large and cancel: so its roundoff is relative to its own size in the end.
+        y, multiplier, g, count = carry
+        change = jtu.tree_map(jnp.negative, gram_solve(g))
+        y = _displaced(jacobian, change, y, weights)
+        return y, jtu.tree_map(jnp.add, multiplier, change), residual(y), count + 1
 
-    def unfinished(carry: tuple[Vector, Vector, Int[Array, ""]]) -> Array:
-        _, g, count = carry
-        return ~within(g, tolerance) & (count < max_steps) & _finite(g)
+    def scales(y: Y) -> tuple[Vector, Vector]:
+        return tolerances(jacobian, y, candidate, weights, magnitude, rtol, atol)
 
-    carry = (jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
+    def unfinished(carry: _Iterate) -> Array:
+        y, _, g, count = carry
+        _, tolerance = scales(y)
+        return ~within(g, tolerance) & (count < max_steps) & tree_all_finite(g)
+
+    carry = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
     for _ in range(min(INLINE_STEPS, max_steps)):
         carry = iterate(carry)
-    multiplier, after, count = lax.while_loop(unfinished, iterate, carry)
+    y, multiplier, after, count = lax.while_loop(unfinished, iterate, carry)
 
-    y = _displaced(jacobian, multiplier, candidate, weights)
+    scale, tolerance = scales(y)
     result = optx.RESULTS.where(
         within(after, tolerance),
         optx.RESULTS.successful,
         optx.RESULTS.where(
-            _finite(after), optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.nonfinite
+            tree_all_finite(after),
+            optx.RESULTS.nonlinear_max_steps_reached,
+            optx.RESULTS.nonfinite,
         ),
     )
     correction = tree_sub(y, candidate)
@@ -169,8 +178,3 @@ def _solve_jvp(primals, tangents, *, max_steps):
     t_y = _displaced(at_candidate, t_multiplier, t_y, weights)
     t_info = jtu.tree_map(lambda _: None, info)
     return (y, multiplier, info), (t_y, t_multiplier, t_info)
-
-
-def _finite(g: Vector) -> Array:
-    flags = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(g)]
-    return jnp.all(jnp.stack(flags))

@@ -1,7 +1,8 @@
 """What every system of the catalogue offers: equations, manifold, states, a reference."""
 
 import abc
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,11 +19,14 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractClassVar
 
+_System = TypeVar("_System", bound="AbstractSystem")
+
 
 def real(x: Any) -> Array:
     """`x` as an array of floating point numbers, in the default precision unless it has its own."""
     x = jnp.asarray(x)
-    return x if eqx.is_inexact_array(x) else x.astype(float)
+    # `astype` also makes the weak type of a Python number strong: other values compile nothing new.
+    return x.astype(x.dtype if eqx.is_inexact_array(x) else float)
 
 
 class AbstractSystem(eqx.Module):
@@ -80,7 +84,10 @@ class AbstractSystem(eqx.Module):
     @property
     @abc.abstractmethod
     def metric(self) -> Y | None:
-        """Weights, like `y`, for the projection; `None` where the Euclidean metric is right."""
+        """Weights, like `y`, in which a projection on the energy alone keeps linear integrals.
+
+        `None` where the system has no such metric or no need of it.
+        """
 
     @abc.abstractmethod
     def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
@@ -91,7 +98,11 @@ class AbstractSystem(eqx.Module):
         """The `args` for `diffrax.diffeqsolve`: parameters are fields, so there are none."""
 
     def reference(
-        self, ts: Real[ArrayLike, " times"], y0: Any = None, *, t0: RealScalarLike = 0.0
+        self,
+        ts: Real[ArrayLike, "..."] | Sequence[RealScalarLike],
+        y0: Any = None,
+        *,
+        t0: RealScalarLike = 0.0,
     ) -> Any:
         """The states at the times `ts`, as accurately as float64 allows.
 
@@ -128,7 +139,7 @@ class AbstractSystem(eqx.Module):
         y0 = jtu.tree_map(lambda x: jnp.asarray(x, jnp.float64), self.y0 if y0 is None else y0)
         return _solution(self, ts - t0, y0)
 
-    def like(self, y: Any) -> Self:
+    def like(self: _System, y: Any) -> _System:
         """This system with its parameters in the precision of `y`, so that `f` keeps it."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         return jtu.tree_map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self)

@@ -118,9 +118,7 @@ def _check_canonical(y: Any) -> None:
         )
 
 
-def _nambu(
-    h: ScalarFn, l: ScalarFn, t: RealScalarLike, y: Float[Array, "3"], args: Args
-) -> Float[Array, "3"]:
+def _nambu(h: ScalarFn, l: ScalarFn, t: RealScalarLike, y: Any, args: Args) -> Float[Array, "3"]:
     if not eqx.is_array(y) or y.shape != (3,):
         raise TypeError(
             "The state `y` of a `nambu_vector_field` must be an array of shape (3,), but it is "

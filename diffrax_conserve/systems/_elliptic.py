@@ -19,7 +19,7 @@ def complete_elliptic(m: Float[Array, "*s"]) -> Float[Array, "*s"]:
     a, b = jnp.ones_like(m), jnp.sqrt(1 - m)
     for _ in range(_AGM_STEPS):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
-    return jnp.pi / (2 * a)
+    return jnp.where(m == 1, jnp.inf, jnp.pi / (2 * a))
 
 
 def incomplete_elliptic(phi: Float[Array, "*s"], m: Float[Array, "*s"]) -> Float[Array, "*s"]:

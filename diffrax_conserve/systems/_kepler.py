@@ -1,6 +1,6 @@
 """Kepler's problem: one body about a fixed centre."""
 
-from typing import ClassVar, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -151,7 +151,7 @@ def _eccentric_anomaly(
     """
     m = mean_anomaly - 2 * jnp.pi * jnp.round(mean_anomaly / (2 * jnp.pi))
 
-    def newton(_: int, x: Float[Array, " times"]) -> Float[Array, " times"]:
+    def newton(_: Any, x: Float[Array, " times"]) -> Float[Array, " times"]:
         return x - (x - e * jnp.sin(x) - m) / (1 - e * jnp.cos(x))
 
     return jax.lax.fori_loop(0, 12, newton, m + 0.85 * e * jnp.sign(m))

@@ -55,7 +55,7 @@ class PointVortices(AbstractIntegratedSystem):
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
         dx, dy, r2 = _separations(y)
-        rates = self.like(y).strengths / (2 * jnp.pi * r2)
+        rates = self.like(y).strengths[None, :] / (2 * jnp.pi * r2)
         return jnp.stack([-jnp.sum(rates * dy, axis=1), jnp.sum(rates * dx, axis=1)], axis=1)
 
     def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
@@ -63,7 +63,7 @@ class PointVortices(AbstractIntegratedSystem):
         _, _, r2 = _separations(y)
         gamma = self.like(y).strengths
         # A vortex is given distance 1 from itself, hence no self-energy.
-        return -jnp.sum(gamma[:, None] * gamma * jnp.log(r2)) / (8 * jnp.pi)
+        return -jnp.sum(gamma[:, None] * gamma[None, :] * jnp.log(r2)) / (8 * jnp.pi)
 
     def linear_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, "2"]:
         del t, args

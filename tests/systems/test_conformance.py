@@ -1,0 +1,261 @@
+"""What every system of the catalogue must satisfy."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+import scipy.integrate
+from jax.flatten_util import ravel_pytree
+
+import diffrax_conserve as dfc
+from diffrax_conserve import systems
+from diffrax_conserve._check import check_invariance
+
+SYSTEMS = {name: systems.get(name) for name in systems.names()}
+every_system = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
+periodic = [s for s in SYSTEMS.values() if s.period() is not None]
+
+
+@eqx.filter_jit
+def draw(system, key):
+    return jax.vmap(lambda key: system.sample(key))(jr.split(key, 32))
+
+
+@functools.cache
+def samples(name):
+    return draw(SYSTEMS[name], jr.key(1))
+
+
+@functools.cache
+def compiled_vector_field(name):
+    """The vector field on flat arrays."""
+    system = SYSTEMS[name]
+    _, unravel = ravel_pytree(system.y0)
+
+    @jax.jit
+    def flat(y):
+        return ravel_pytree(system.vector_field(0.0, unravel(y), system.args))[0]
+
+    return flat
+
+
+def flat_states(ys):
+    return np.concatenate([np.reshape(x, (x.shape[0], -1)) for x in jtu.tree_leaves(ys)], axis=1)
+
+
+def values(manifold, y):
+    return {name: entry.fn(0.0, y, None) for name, entry in manifold.items()}
+
+
+@every_system
+def test_invariants_are_conserved_by_the_equations(system):
+    report = check_invariance(system.vector_field, system.manifold, samples(system.name))
+    assert report.ok, str(report)
+    assert max(entry.defect for entry in report.entries) < 1e-13
+
+
+@every_system
+def test_invariants_are_conserved_for_other_parameters(system):
+    noise = jr.uniform(jr.key(2), (100,), minval=0.7, maxval=1.3)
+    leaves, treedef = jtu.tree_flatten(system)
+    changed = [x * noise[i : i + x.size].reshape(x.shape) for i, x in enumerate(leaves)]
+    system = jtu.tree_unflatten(treedef, changed)
+    report = check_invariance(system.vector_field, system.manifold, draw(system, jr.key(3)))
+    assert report.ok, str(report)
+
+
+@every_system
+def test_the_manifold_is_functionally_independent(system):
+    def flat(y):
+        return ravel_pytree(values(system.manifold, y))[0]
+
+    @eqx.filter_jit
+    @jax.vmap
+    def jacobian(y):
+        rows = jax.jacrev(flat)(y)
+        rows = jnp.concatenate([x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(rows)], axis=1)
+        return rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
+
+    rows = jacobian(samples(system.name))
+    assert rows.shape[1] < rows.shape[2]
+    assert np.linalg.svd(rows, compute_uv=False).min() > 1e-4
+
+
+@every_system
+def test_initial_states_lie_on_the_constraints(system):
+    y0 = jtu.tree_map(lambda x: x[None], system.y0)
+    ys = jtu.tree_map(lambda *x: jnp.concatenate(x), y0, samples(system.name))
+    for entry in system.manifold.values():
+        if isinstance(entry, dfc.Constraint):
+            assert np.abs(jax.vmap(lambda y, fn=entry.fn: fn(0.0, y, None))(ys)).max() < 1e-14
+
+
+@every_system
+def test_samples_differ_and_are_like_y0(system):
+    ys = samples(system.name)
+    for x, x0 in zip(jtu.tree_leaves(ys), jtu.tree_leaves(system.y0), strict=True):
+        assert x.shape[1:] == x0.shape
+        assert x.dtype == x0.dtype == jnp.float64
+        assert np.isfinite(x).all()
+    assert jtu.tree_structure(ys) == jtu.tree_structure(system.y0)
+    assert len(np.unique(flat_states(ys), axis=0)) == 32
+
+
+@every_system
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_everything_keeps_the_precision_of_the_state(system, dtype):
+    y0 = jtu.tree_map(lambda x: x.astype(dtype), system.y0)
+    out = jax.eval_shape(lambda y: system.vector_field(0.0, y, None), y0)
+    assert jtu.tree_structure(out) == jtu.tree_structure(y0)
+    kept = jax.eval_shape(lambda y: values(system.manifold, y), y0)
+    assert {x.dtype for x in jtu.tree_leaves((out, kept))} == {jnp.dtype(dtype)}
+
+
+@every_system
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_no_implicit_promotion(system, dtype):
+    y0 = jtu.tree_map(lambda x: x.astype(dtype), system.y0)
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        jax.eval_shape(lambda y: system.vector_field(0.0, y, None), y0)
+        jax.eval_shape(lambda y: values(system.manifold, y), y0)
+        eqx.filter_eval_shape(system.sample, jr.key(0))
+
+
+@every_system
+def test_float32_agrees_with_float64(system):
+    y0 = jtu.tree_map(lambda x: x.astype(jnp.float32), system.y0)
+    f = system.vector_field
+    single, double = ravel_pytree(f(0.0, y0, None))[0], ravel_pytree(f(0.0, system.y0, None))[0]
+    assert np.abs(single - double).max() < 1e-5 * np.abs(double).max()
+
+
+@every_system
+def test_parameters_can_be_differentiated(system):
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(system):
+        f = system.vector_field(0.0, system.y0, system.args)
+        kept = values(system.manifold, system.y0)
+        return sum(jnp.sum(jnp.sin(x)) for x in jtu.tree_leaves((f, kept)))
+
+    for x in jtu.tree_leaves(gradient(system)):
+        assert np.isfinite(x).all()
+        assert np.all(x != 0)
+
+
+@every_system
+def test_the_parameters_inside_the_manifold_can_be_differentiated(system):
+    parameters = jtu.tree_leaves(eqx.filter(system, eqx.is_inexact_array))
+    for entry in system.manifold.values():
+        inside = jtu.tree_leaves(eqx.filter(entry, eqx.is_inexact_array))
+        assert len(inside) == len(parameters) > 0
+
+
+@every_system
+def test_the_reference_agrees_with_an_independent_solver(system):
+    f = compiled_vector_field(system.name)
+    ts = np.linspace(0, min(20 * system.dt, system.t1 / 2), 5)
+    y0, _ = ravel_pytree(system.y0)
+    scale = np.abs(y0).max()
+    other = scipy.integrate.solve_ivp(
+        lambda _, y: f(y), (0, ts[-1]), y0, method="DOP853", rtol=1e-13, atol=1e-15 * scale
+    )
+    difference = flat_states(system.reference(ts))[-1] - other.y[:, -1]
+    assert np.abs(difference).max() < 1e-10 * scale
+
+
+@every_system
+def test_the_reference_stays_on_the_manifold(system):
+    @jax.jit
+    @jax.vmap
+    def flat_values(y):
+        return ravel_pytree(values(system.manifold, y))[0]
+
+    typical = np.abs(flat_values(samples(system.name))).max(axis=0)
+    kept = flat_values(system.reference(np.linspace(0, min(50 * system.dt, system.t1), 5)))
+    # Constraints are zero, and a barycentric momentum, at the states that are sampled.
+    scale = np.where(typical < 1e-12, 1.0, typical)
+    assert (np.abs(kept - kept[0]) < 1e-11 * scale).all()
+
+
+@every_system
+def test_the_reference_starts_at_the_given_state_and_time(system):
+    y = jtu.tree_map(lambda x: x[0], samples(system.name))
+    ts = 3.0 + system.dt * np.array([0.0, 0.0, 1.0, 2.0, 2.0])
+    ys = flat_states(system.reference(ts, y, t0=3.0))
+    np.testing.assert_allclose(ys[:2], np.stack([ravel_pytree(y)[0]] * 2), rtol=1e-13, atol=1e-14)
+    np.testing.assert_array_equal(ys[3], ys[4])
+
+
+@pytest.mark.parametrize("system", periodic, ids=lambda system: system.name)
+def test_the_solution_returns_after_a_period(system):
+    y0 = jtu.tree_map(lambda x: x[0], samples(system.name))
+    for y in (system.y0, y0):
+        ys = flat_states(system.reference(np.arange(5.0) * system.period(y), y))
+        np.testing.assert_allclose(ys, np.stack([ravel_pytree(y)[0]] * 5), atol=1e-12)
+
+
+@every_system
+def test_trajectories_have_the_coordinates_that_the_axes_name(system):
+    ys = samples(system.name)
+    curves = system.trajectories(ys)
+    assert curves
+    for curve in curves.values():
+        assert curve.shape == (32, len(system.axes))
+    assert len(system.axes) in (2, 3)
+
+
+@every_system
+def test_the_metric_is_none_or_positive_and_like_the_state(system):
+    if system.metric is not None:
+        shapes = jtu.tree_map(jnp.shape, system.metric)
+        assert shapes == jtu.tree_map(jnp.shape, system.y0)
+        assert all(np.all(x > 0) for x in jtu.tree_leaves(system.metric))
+
+
+@every_system
+def test_the_main_job_takes_a_whole_number_of_steps(system):
+    steps = system.t1 / system.dt
+    assert abs(steps - round(steps)) < 1e-9
+    assert 10 <= steps <= 2000
+    assert system.title
+    assert system.citation.endswith(".")
+    assert type(system).__doc__
+    assert system.args is None
+
+
+@every_system
+def test_docstrings_say_what_a_reader_needs(system):
+    for heading in ("**Manifold**", "**Reference**", "**Samples**", "Source: "):
+        assert heading in type(system).__doc__
+
+
+def test_a_reference_needs_double_precision():
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="JAX_ENABLE_X64"):
+        systems.Kepler().reference([0.0, 1.0])
+
+
+def test_states_follow_the_default_precision():
+    with jax.enable_x64(False):
+        for name in systems.names():
+            system = systems.get(name)
+            sample = eqx.filter_eval_shape(system.sample, jr.key(0))
+            leaves = jtu.tree_leaves((system, system.y0, sample))
+            assert {x.dtype for x in leaves} == {jnp.dtype(jnp.float32)}
+
+
+@pytest.mark.parametrize("ts", [1.0, [], [[0.0, 1.0]]])
+def test_reference_times_must_be_a_list_of_times(ts):
+    with pytest.raises(ValueError, match="`ts` must be a one-dimensional array"):
+        systems.HarmonicOscillator().reference(jnp.asarray(ts))
+
+
+@pytest.mark.parametrize("ts", [[-1.0, 0.0], [1.0, 0.5]])
+def test_reference_times_must_not_decrease(ts):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="non-decreasing"):
+        systems.HarmonicOscillator().reference(jnp.asarray(ts))

@@ -1,0 +1,226 @@
+"""`check_invariance` accepts what is conserved, and finds what is not."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve import systems
+from diffrax_conserve._check import check_invariance
+
+
+def rigid_body_momentum_as_printed(t, w, args):
+    i1, i2, i3 = systems.RigidBody().inertia
+    return i1**2 * w[0] ** 2 + i2**2 * w[1] ** 2 + i3**2 * w[2] ** 3
+
+
+def double_pendulum_energy_without_bracket(t, y, args):
+    a, b, p, q = y
+    kinetic = p**2 + 2 * q**2 - 2 * p * q * jnp.cos(a - b) / (2 * (1 + jnp.sin(a - b) ** 2))
+    return kinetic - 2 * jnp.cos(a) - jnp.cos(b)
+
+
+def vortex_energy_with_the_separation_as_printed(t, y, args):
+    dy = y[:, None, 1] - y[None, :, 1]
+    r2 = (y[:, None, 0] - y[:, None, 0]) ** 2 + dy**2 + jnp.eye(3)
+    return -jnp.sum(jnp.log(r2)) / (8 * jnp.pi)
+
+
+def vortex_impulse_with_a_sum_from_zero(t, y, args):
+    # The sum from 0 to N has one term too many: here the vortex 0 is the vortex N once more.
+    return jnp.sum(y[:, 0]) + y[-1, 0]
+
+
+@pytest.mark.parametrize(
+    ("name", "misprint"),
+    [
+        ("rigid-body", rigid_body_momentum_as_printed),
+        ("double-pendulum", double_pendulum_energy_without_bracket),
+        ("point-vortices", vortex_energy_with_the_separation_as_printed),
+        ("point-vortices", vortex_impulse_with_a_sum_from_zero),
+    ],
+)
+def test_it_finds_each_misprint_of_the_paper(name, misprint):
+    system = systems.get(name)
+    manifold = {**system.manifold, "as printed": dfc.FirstIntegral(misprint)}
+    report = check_invariance(system.vector_field, manifold, system.sample)
+    assert not report.ok
+    for entry in report.entries:
+        assert entry.ok == (entry.name != "as printed")
+    assert max(entry.defect for entry in report.entries) > 1e-2
+
+
+def test_it_finds_a_sign_error_in_the_vector_field():
+    system = systems.ConservativeLorenz()
+
+    def wrong(t, y, args):
+        return system.vector_field(t, y, args) * jnp.array([1.0, -1.0, 1.0])
+
+    report = check_invariance(wrong, system.manifold, system.sample)
+    assert [(entry.name, entry.ok) for entry in report.entries] == [
+        ("Casimir", True),
+        ("energy", False),
+    ]
+
+
+def test_it_finds_a_small_error():
+    system = systems.Kepler()
+
+    def wrong(t, y, args):
+        dq, dp = system.vector_field(t, y, args)
+        return dq, (1 + 1e-10) * dp
+
+    assert not check_invariance(wrong, system.manifold, system.sample).ok
+
+
+def test_the_defect_is_relative_to_the_size_of_the_terms():
+    # dI/dt = y₁ y₂ (1 + c), of which the terms have the sizes |y₁ y₂| and |c y₁ y₂|.
+    def integral(t, y, args):
+        return (y[0] ** 2 + y[1] ** 2) / 2
+
+    def f(t, y, args):
+        return jnp.stack([y[1], args * y[0]])
+
+    ys = jr.normal(jr.key(0), (5, 2))
+    report = check_invariance(f, dfc.FirstIntegral(integral), ys, args=-0.5)
+    np.testing.assert_allclose(report.entries[0].defect, 0.5 / 1.5)
+    report = check_invariance(f, dfc.FirstIntegral(integral), ys, args=-1.0)
+    assert report.entries[0].defect < 1e-15
+
+
+def test_scaling_an_integral_changes_nothing():
+    system = systems.HenonHeiles()
+    for factor in (1e-150, 1e150):
+        scaled = dfc.FirstIntegral(lambda t, y, a, c=factor: c * system.energy(t, y, a))
+        assert check_invariance(system.vector_field, scaled, system.sample, num_states=8).ok
+
+
+def test_explicit_time_is_part_of_the_derivative():
+    def f(t, y, args):
+        return y
+
+    def integral(t, y, args):
+        return y * jnp.exp(-t)
+
+    ys = jnp.linspace(1.0, 2.0, 7)
+    assert check_invariance(f, dfc.FirstIntegral(integral), ys, t=jnp.linspace(0.0, 3.0, 7)).ok
+    report = check_invariance(f, dfc.FirstIntegral(lambda t, y, a: y), ys, t=1.0)
+    assert not report.ok
+
+
+def test_one_wrong_element_of_an_array_is_enough():
+    system = systems.RigidBody()
+
+    def both(t, y, args):
+        return {"right": system.energy(t, y, args), "wrong": jnp.stack([y[0], y[1]])}
+
+    assert not check_invariance(system.vector_field, dfc.FirstIntegral(both), system.sample).ok
+
+
+def test_a_state_given_as_a_batch_is_checked_and_named():
+    system = systems.RigidBody()
+    ys = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 1.0]])  # two steady rotations
+    wrong = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**4))
+    report = check_invariance(system.vector_field, wrong, ys)
+    assert report.num_states == 3
+    assert report.entries[0].state == 2
+    assert "NOT conserved, see state 2" in str(report)
+
+
+def test_nan_is_not_conserved():
+    system = systems.LotkaVolterra()
+    ys = jnp.array([[1.0, 2.0], [-1.0, 1.0]])
+    report = check_invariance(system.vector_field, system.manifold, ys)
+    assert not report.ok
+    assert report.entries[0].state == 1
+
+
+def test_constraints_are_checked_where_they_hold():
+    system = systems.CartesianPendulum()
+    right = check_invariance(system.vector_field, system.manifold, system.sample)
+    assert right.ok
+    assert {entry.kind for entry in right.entries} == {"constraint", "first integral"}
+
+    def without_tension(t, y, args):
+        return y[1], jnp.array([0.0, -1.0])
+
+    wrong = check_invariance(without_tension, system.manifold, system.sample)
+    assert {e.name: e.ok for e in wrong.entries} == {
+        "rod length": True,
+        "velocity constraint": False,
+        "energy": True,
+    }
+
+
+def test_states_off_the_constraints_are_refused():
+    system = systems.CartesianPendulum()
+    ys = (jnp.ones((4, 2)), jnp.ones((4, 2)))
+    with pytest.raises(ValueError, match=r"constraint `rod length` is not zero at state 0 .*proj"):
+        check_invariance(system.vector_field, system.manifold, ys)
+
+
+def test_single_precision_is_judged_by_its_own_roundoff():
+    system = systems.PointVortices()
+    ys = jax.vmap(system.sample)(jr.split(jr.key(0), 50)).astype(jnp.float32)
+    report = check_invariance(system.vector_field, system.manifold, ys)
+    assert report.ok
+    np.testing.assert_allclose(report.rtol, 1e4 * np.finfo(np.float32).eps)
+    assert all(1e-10 < entry.defect < 1e-5 for entry in report.entries)
+
+
+def test_the_report_reads_as_a_table():
+    system = systems.RigidBody()
+    text = str(check_invariance(system.vector_field, system.manifold, system.sample))
+    header, _, *rows = text.splitlines()
+    assert header.startswith("conserved: derivatives along the flow at 100 states")
+    assert [row.split("  ")[1] for row in rows] == ["energy", "squared angular momentum"]
+    assert all(row.endswith("conserved") for row in rows)
+    assert len({row.index("first integral") for row in rows}) == 1
+
+
+def test_a_sampler_and_a_vector_field_may_be_modules():
+    class Rotation(eqx.Module):
+        rate: jax.Array
+
+        def __call__(self, t, y, args):
+            return self.rate * jnp.stack([-y[1], y[0]])
+
+    class Sampler(eqx.Module):
+        scale: jax.Array
+
+        def __call__(self, key):
+            return self.scale * jr.normal(key, (2,))
+
+    norm = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    report = check_invariance(Rotation(jnp.array(2.0)), norm, Sampler(jnp.array(3.0)), num_states=7)
+    assert report.ok
+    assert report.num_states == 7
+
+
+@pytest.mark.parametrize(
+    "states", [jnp.array(1.0), jnp.zeros((0, 3)), (jnp.ones(3), jnp.ones(4)), jnp.ones(3, int), ()]
+)
+def test_states_that_are_no_batch_are_refused(states):
+    with pytest.raises(ValueError, match="`states` must be a sampler"):
+        check_invariance(lambda t, y, a: y, dfc.FirstIntegral(lambda t, y, a: y), states)
+
+
+@pytest.mark.parametrize("bad", [lambda t, y, a: y[:2], lambda t, y, a: (y, y)])
+def test_a_vector_field_unlike_the_state_is_refused(bad):
+    with pytest.raises(ValueError, match="must return a PyTree like `y`"):
+        check_invariance(bad, dfc.FirstIntegral(lambda t, y, a: y[0]), jnp.ones((4, 3)))
+
+
+def test_times_that_do_not_match_the_states_are_refused():
+    with pytest.raises(ValueError, match="`t` must be one time or one for each"):
+        check_invariance(
+            lambda t, y, a: y, dfc.FirstIntegral(lambda t, y, a: y), jnp.ones(4), t=jnp.ones(3)
+        )
+
+
+def test_a_bare_function_is_refused():
+    with pytest.raises(TypeError, match="FirstIntegral"):
+        check_invariance(lambda t, y, a: y, lambda t, y, a: y, jnp.ones(4))
