@@ -1,3 +1,7 @@
+from . import systems as systems
+from ._check import InvarianceEntry as InvarianceEntry
+from ._check import InvarianceReport as InvarianceReport
+from ._check import check_invariance as check_invariance
 from ._diagnostics import drift as drift
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral

@@ -31,6 +31,7 @@ MAY_IMPORT = {
     "_custom_types": set(),
     "_tree": _TYPES,
     "_manifold": _TREE,
+    "_check": _MANIFOLD,
     "_projection": _MANIFOLD,
     "_interpolation": _PROJECTION,
     "_network": _PROJECTION,
@@ -40,8 +41,8 @@ MAY_IMPORT = {
     "_serialisation": _CORE,
     "_plot": _TYPES,
     "systems": _CORE,
-    "testing": _CORE | {"systems"},
-    PACKAGE: _LEARNED | {"systems"},
+    "testing": _CORE | {"systems", "_check"},
+    PACKAGE: _LEARNED | {"systems", "_check"},
     "_reproduce": _LEARNED | {"_plot", "systems", PACKAGE},
     "__main__": _LEARNED | {"_plot", "_reproduce", "systems", PACKAGE},
 }

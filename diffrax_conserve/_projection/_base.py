@@ -114,8 +114,10 @@ ROUNDOFF_MULTIPLE = 4
 
 
 def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
-    """Whether every residual is within its tolerance. NaN never is."""
-    satisfied = jtu.tree_map(lambda g, tol: jnp.all(jnp.abs(g) <= tol), residual, tolerance)
+    """Whether every residual is within its tolerance, which NaN and infinity never are."""
+    satisfied = jtu.tree_map(
+        lambda g, tol: jnp.all((jnp.abs(g) <= tol) & (tol < jnp.inf)), residual, tolerance
+    )
     flags = jtu.tree_leaves(satisfied)
     out = flags[0]
     for flag in flags[1:]:

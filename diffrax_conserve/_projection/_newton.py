@@ -107,6 +107,23 @@ class Newton(AbstractProjection):
         return y, lax.stop_gradient(info)
 
 
+Newton.__init__.__doc__ = r"""**Arguments:**
+
+- `rtol`: how large a residual may remain, relative to the scale of its constraint, which is what
+    roundoff is relative to. Default: four units of roundoff of the dtype.
+- `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
+    less accurate than roundoff.
+- `max_steps`: the largest number of iterations; after that the projection has failed.
+- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
+    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
+    freezes its component. Default: Euclidean.
+
+**Raises:**
+
+`ValueError` if a weight is not positive.
+"""
+
+
 def _reach(
     residual: Residual,
     magnitude: Vector,
@@ -123,8 +140,8 @@ def _reach(
 
     dtype = working_dtype(candidate)
 
-    def iterate(carry: tuple[Y, Array, Array]) -> tuple[Y, Array, Array]:
-        y, _, count = carry
+    def iterate(carry: tuple[Array, Y, Array]) -> tuple[Array, Y, Array]:
+        _, y, count = carry
         g, jacobian = linearise(residual, y)
         scale, tolerance = tolerances(
             jacobian, y, candidate, weights, magnitude, projection.rtol, projection.atol
@@ -133,26 +150,26 @@ def _reach(
         gram_solve = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
         step = tree_mul(jacobian.pullback(gram_solve(g)), weights)
 
-        def worse(halving: tuple[Array, Y]) -> Array:
-            fraction, trial = halving
-            return (fraction > 1e-3) & ~(squared(residual(trial), scale) <= merit)
+        def attempt(fraction: Array) -> tuple[Array, Array, Y]:
+            trial = tree_sub(y, tree_scale(fraction, step))
+            worse = ~(squared(residual(trial), scale) <= merit)
+            return worse & (fraction > 1e-3), fraction, trial
 
-        def halve(halving: tuple[Array, Y]) -> tuple[Array, Y]:
-            fraction = halving[0] / 2
-            return fraction, tree_sub(y, tree_scale(fraction, step))
-
-        one = jnp.ones((), dtype)
-        _, trial = lax.while_loop(worse, halve, (one, tree_sub(y, step)))
+        # A loop in a batch evaluates its condition in two places, where it may be rounded in two
+        # ways, and then never ends: so conditions are evaluated once, and carried.
+        _, _, trial = lax.while_loop(
+            lambda carry: carry[0],
+            lambda carry: attempt(carry[1] / 2),
+            attempt(jnp.ones((), dtype)),
+        )
         done = within(g, tolerance)
         y = jtu.tree_map(lambda a, b: jnp.where(done, a, b), y, trial)
-        return y, done | ~jnp.isfinite(merit), count + jnp.where(done, 0, 1)
+        count = count + jnp.where(done, 0, 1)
+        unfinished = ~done & jnp.isfinite(merit) & (count < projection.max_steps)
+        return unfinished, y, count
 
-    def unfinished(carry: tuple[Y, Array, Array]) -> Array:
-        _, done, count = carry
-        return ~done & (count < projection.max_steps)
-
-    start = (candidate, jnp.asarray(False), jnp.asarray(0))
-    y, _, count = lax.while_loop(unfinished, iterate, start)
+    start = (jnp.asarray(projection.max_steps > 0), candidate, jnp.asarray(0))
+    _, y, count = lax.while_loop(lambda carry: carry[0], iterate, start)
     return y, count
 
 

@@ -90,6 +90,23 @@ class SimplifiedNewton(AbstractProjection):
         return y, info
 
 
+SimplifiedNewton.__init__.__doc__ = r"""**Arguments:**
+
+- `rtol`: how large a residual may remain, relative to the scale of its constraint, which is what
+    roundoff is relative to. Default: four units of roundoff of the dtype.
+- `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
+    less accurate than roundoff.
+- `max_steps`: the largest number of iterations; after that the projection has failed.
+- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
+    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
+    freezes its component. Default: Euclidean.
+
+**Raises:**
+
+`ValueError` if a weight is not positive.
+"""
+
+
 def _displaced(jacobian: AbstractJacobian, multiplier: Vector, y: Y, weights: Y) -> Y:
     """`y + M⁻¹ Gᵀ λ`."""
     return tree_add(y, tree_mul(jacobian.pullback(multiplier), weights))
@@ -109,6 +126,9 @@ def _solve(
     before, jacobian = linearise(residual, candidate)
     gram_solve = jacobian.gram_solver(weights)
 
+    def scales(y: Y) -> tuple[Vector, Vector]:
+        return tolerances(jacobian, y, candidate, weights, magnitude, rtol, atol)
+
     def iterate(carry: _Iterate) -> _Iterate:
         # The state is updated by increments, which shrink, rather than from the multipliers, which
         # can be large and cancel: so its roundoff is relative to its own size in the end.
@@ -117,18 +137,22 @@ def _solve(
         y = _displaced(jacobian, change, y, weights)
         return y, jtu.tree_map(jnp.add, multiplier, change), residual(y), count + 1
 
-    def scales(y: Y) -> tuple[Vector, Vector]:
-        return tolerances(jacobian, y, candidate, weights, magnitude, rtol, atol)
-
     def unfinished(carry: _Iterate) -> Array:
         y, _, g, count = carry
         _, tolerance = scales(y)
         return ~within(g, tolerance) & (count < max_steps) & tree_all_finite(g)
 
+    def flagged(carry: _Iterate) -> tuple[Array, _Iterate]:
+        # A loop in a batch evaluates its condition in two places, where it may be rounded in two
+        # ways, and then never ends: so the condition is evaluated once, and carried.
+        return unfinished(carry), carry
+
     carry = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
     for _ in range(min(INLINE_STEPS, max_steps)):
         carry = iterate(carry)
-    y, multiplier, after, count = lax.while_loop(unfinished, iterate, carry)
+    _, (y, multiplier, after, count) = lax.while_loop(
+        lambda carry: carry[0], lambda carry: flagged(iterate(carry[1])), flagged(carry)
+    )
 
     scale, tolerance = scales(y)
     result = optx.RESULTS.where(
