@@ -1,0 +1,79 @@
+"""The command line: `python -m diffrax_conserve list` and `... reproduce NAME`."""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+from . import _reproduce, systems
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit status: 0, or 1 if a solver failed.
+
+    Wrong input raises `SystemExit` with status 2, after a message on standard error.
+    """
+    parser = _parser()
+    options = parser.parse_args(argv)
+    if options.command == "list":
+        _list()
+        return 0
+    # Drift is measured in units of roundoff, and the references need float64.
+    jax.config.update("jax_enable_x64", True)
+    try:
+        system = systems.get(options.name)
+    except ValueError as error:
+        parser.error(str(error))
+    t1 = system.t1 if options.t1 is None else options.t1
+    dt = system.dt if options.dt is None else options.dt
+    out = Path("out", options.name) if options.out is None else options.out
+    try:
+        ok = _reproduce.reproduce(system, out, t1=t1, dt=dt)
+    except _reproduce.SetupError as error:
+        parser.error(str(error))
+    return 0 if ok else 1
+
+
+def _list() -> None:
+    width = max(map(len, systems.names()))
+    for name in systems.names():
+        print(f"{name:{width}}  {systems.get(name).title}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m diffrax_conserve",
+        description="Conservative solves of the systems in the catalogue.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands.add_parser("list", help="list the systems by name")
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="compare RK4 with projected RK4 on one system",
+        description="Integrates a system with RK4 and with projected RK4, prints a table of errors "
+        "and drifts, and writes figures and metrics.json.",
+    )
+    reproduce.add_argument("name", metavar="NAME", help="a system, as `list` names it")
+    reproduce.add_argument(
+        "--out", type=Path, metavar="DIR", help="where to write (default: out/NAME)"
+    )
+    reproduce.add_argument("--t1", type=_positive, metavar="T", help="final time; the first is 0")
+    reproduce.add_argument("--dt", type=_positive, metavar="H", help="length of a step")
+    return parser
+
+
+def _positive(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a positive number, but is {text!r}")
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

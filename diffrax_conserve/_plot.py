@@ -1,0 +1,199 @@
+"""The figures of `reproduce`, for print. The one place that imports matplotlib."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullFormatter
+
+# From M. Okabe and K. Ito's palette, told apart also by those who see fewer colours.
+_COLOURS = {"rk4": "#D55E00", "projected rk4": "#0072B2"}
+_OTHER_COLOURS = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_NAMES = {"rk4": "RK4", "projected rk4": "projected RK4"}
+
+_EPS = float(np.finfo(np.float64).eps)
+# Where an exact 0 is drawn on a logarithmic axis.
+_FLOOR = _EPS / 10
+# The last steps of each solver are marked on the whole reference: more would cover each other.
+_MARKED_MAX = 100
+
+_STYLE = {
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "legend.fontsize": 8,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "axes3d.grid": True,
+    "lines.linewidth": 1.0,
+    "lines.markeredgewidth": 0.8,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.columnspacing": 1.4,
+    "pdf.fonttype": 42,  # text stays text
+    "savefig.dpi": 300,
+}
+
+_Curves = dict[str, np.ndarray]  # by solver, or by part of the system
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes `figure` in the format that the suffix of `path` names."""
+    # Without the date the same solve writes the same file.
+    metadata = {"CreationDate": None} if path.suffix == ".pdf" else {}
+    with mpl.rc_context(_STYLE):
+        figure.savefig(path, metadata=metadata)
+
+
+def drift(times: _Curves, drifts: dict[str, _Curves], time_unit: str) -> Figure:
+    """One panel for each integral, one curve for each solver."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(max(3.5, 2.2 * len(drifts) + 0.4), 2.7), layout="constrained")
+        panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
+        for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
+            roundoff = ax.axhline(_EPS, color="black", linewidth=0.8, linestyle=":", zorder=3)
+            exact = any(np.any(values < _FLOOR) for values in curves.values())
+            if exact:
+                curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
+            _over_time(ax, times, curves, time_unit)
+            ax.set_title(integral)
+        panels[0].set_ylabel("relative drift")
+        handles, labels = panels[0].get_legend_handles_labels()
+        note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
+        _legend(figure, [*handles, roundoff], [*labels, note], 2 if len(drifts) < 3 else 3)
+        return figure
+
+
+def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> Figure:
+    """One curve for each solver."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(3.5, 2.7), layout="constrained")
+        ax = figure.subplots()
+        smallest = min(
+            np.min(values, where=values > 0, initial=np.inf) for values in errors.values()
+        )
+        floor = smallest if np.isfinite(smallest) else _FLOOR
+        curves = {name: np.maximum(values, floor) for name, values in errors.items()}
+        _over_time(ax, times, curves, time_unit)
+        ax.set_ylabel(_label("state error", unit))
+        _legend(figure, *ax.get_legend_handles_labels(), 4)
+        return figure
+
+
+def trajectory(
+    paths: dict[str, _Curves], reference: _Curves | None, axis_labels: tuple[str, ...]
+) -> Figure:
+    """One panel for each part of the system: the reference, and the last steps of each solver."""
+    with mpl.rc_context(_STYLE):
+        parts = list(next(iter(paths.values())))
+        # A single curve in space is shown as that, several by their first two coordinates.
+        solid = len(axis_labels) == 3 and len(parts) == 1
+        labels = axis_labels if solid else axis_labels[:2]
+        columns = min(len(parts), 3)
+        rows = -(-len(parts) // columns)
+        figure = Figure(figsize=(max(3.5, 2.3 * columns), 2.2 * rows + 0.6), layout="constrained")
+        if solid:
+            figure.set_size_inches(3.5, 3.5)
+        keywords = dict(projection="3d") if solid else {}
+        panels = figure.subplots(rows, columns, squeeze=False, subplot_kw=keywords)
+        for ax, part in zip(panels.flat, parts, strict=False):
+            path = None if reference is None else reference[part]
+            _draw_paths(ax, {name: curves[part] for name, curves in paths.items()}, path, labels)
+            if len(parts) > 1:
+                ax.set_title(part)
+        for ax in panels.flat[len(parts) :]:
+            ax.set_axis_off()
+        _legend(figure, *panels[0, 0].get_legend_handles_labels(), 4)
+        return figure
+
+
+# ---- Within one panel ----
+
+
+def _over_time(ax: Any, times: _Curves, curves: _Curves, time_unit: str) -> None:
+    for i, (name, values) in enumerate(curves.items()):
+        # Roundoff jumps from step to step: under thinner lines the others can still be seen.
+        width = 1.2 if len(values) <= 200 else 0.7
+        ax.plot(
+            times[name],
+            values,
+            label=_NAMES.get(name, name),
+            color=_colour(name, curves),
+            linewidth=width,
+            zorder=2 + 0.1 * i,
+        )
+    ax.set_yscale("log")
+    lowest, highest = (np.log10(ax.get_ylim()[i]) for i in (0, 1))
+    ax.set_ylim(10 ** np.floor(lowest), 10 ** np.ceil(highest))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.set_xlabel(_label("$t$", time_unit))
+
+
+def _draw_paths(
+    ax: Any, paths: _Curves, reference: np.ndarray | None, axis_labels: tuple[str, ...]
+) -> None:
+    dimension = len(axis_labels)
+    if reference is not None:
+        long = len(next(iter(paths.values()))) > _MARKED_MAX + 1
+        style = dict(color="#BDBDBD", linewidth=0.5 if long else 1.5, zorder=1)
+        ax.plot(*reference.T[:dimension], label="reference", **style)
+    for i, (name, path) in enumerate(paths.items()):
+        # Large rings round small dots: one solver cannot hide another.
+        last = path[-_MARKED_MAX - 1 :]
+        ring = dict(markersize=4.5, markerfacecolor="none") if i == 0 else dict(markersize=2.2)
+        text = _NAMES.get(name, name)
+        ax.plot(
+            *last.T[:dimension],
+            linestyle="none",
+            marker="o",
+            label=text if len(last) == len(path) else f"{text}, last {len(last) - 1} steps",
+            color=_colour(name, paths),
+            zorder=2 + 0.1 * i,
+            **ring,
+        )
+    for axis, text in zip("xyz", axis_labels, strict=False):
+        getattr(ax, f"set_{axis}label")(text)
+    if dimension == 3:
+        _tidy_space(ax)
+        return
+    if _are_alike(axis_labels):
+        ax.set_aspect("equal", adjustable="datalim")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(5))
+
+
+def _tidy_space(ax: Any) -> None:
+    ax.set_box_aspect((1, 1, 0.8), zoom=0.82)  # leaves room for the labels
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.pane.set_facecolor("white")
+        axis.set_major_locator(MaxNLocator(4))
+    ax.tick_params(pad=0)
+
+
+def _are_alike(axis_labels: tuple[str, ...]) -> bool:
+    """Whether the coordinates measure the same, so that their scales should be equal."""
+    first, second = (text.split()[0].rstrip("₁₂₃") for text in axis_labels)
+    return first == second or (first, second) == ("x", "y")
+
+
+def _label(quantity: str, unit: str) -> str:
+    return f"{quantity} [{unit}]" if unit else quantity
+
+
+def _legend(figure: Figure, handles: list[Any], labels: list[str], columns: int) -> None:
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+
+
+def _colour(name: str, names: dict[str, Any]) -> str:
+    others = [n for n in names if n not in _COLOURS]
+    return _COLOURS.get(name) or _OTHER_COLOURS[others.index(name) % len(_OTHER_COLOURS)]

@@ -1,0 +1,156 @@
+"""The drift of projected solves, at every kind of saved time."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body, solve
+
+SYSTEMS = ["rigid-body", "kepler", "point-vortices", "conservative-lorenz", "double-pendulum"]
+SOLVERS = {"rk4": dfc.RK4(), "tsit5": dfx.Tsit5(), "dopri8": dfx.Dopri8(), "euler": dfx.Euler()}
+STEP = {"rigid-body": 0.02, "kepler": 0.02, "double-pendulum": 0.02}
+LIMIT = {jnp.float64: 4e-15, jnp.float32: 1e-6}
+
+
+@eqx.filter_jit
+def drift(solver, system, y0, step, saveat, num_steps=200):
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field),
+        dfc.ManifoldProjection(solver, system.manifold),
+        jnp.zeros((), step.dtype),
+        num_steps * step,
+        step,
+        y0,
+        saveat=saveat,
+        max_steps=num_steps + 2,
+    )
+    return dfc.drift(sol, system.manifold), sol.ys
+
+
+def single(tree, dtype):
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+@pytest.mark.parametrize("dtype", list(LIMIT), ids=["float64", "float32"])
+@pytest.mark.parametrize("solver", list(SOLVERS.values()), ids=SOLVERS)
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
+    system = dfc.systems.get(name)
+    step = jnp.asarray(STEP.get(name, 0.05), dtype)
+    y0 = single(system.y0, dtype)
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    worst, ys = drift(solver, single(system, dtype), y0, step, saveat)
+    assert largest(worst) <= LIMIT[dtype]
+    assert all(y.dtype == dtype for y in jax.tree.leaves(ys))
+    moved = jax.tree.map(lambda y, start: jnp.abs(y[200] - start), ys, y0)
+    assert largest(moved) > 1e-2  # a solution that stands still conserves everything
+
+
+@pytest.mark.parametrize("name", ["kepler", "rigid-body"])
+@pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()], ids=["rk4", "tsit5"])
+def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
+    """Where the solution without projection does not."""
+    system = dfc.systems.get(name)
+    ts = jnp.linspace(0, 4, 173)
+
+    def run(solver, saveat):
+        return solve(system.vector_field, solver, system.y0, t1=4.0, dt0=0.02, saveat=saveat)
+
+    projected = dfc.ManifoldProjection(solver, system.manifold)
+    saved = run(projected, dfx.SaveAt(ts=ts))
+    assert largest(dfc.drift(saved, system.manifold)) <= 4e-15
+    dense = run(projected, dfx.SaveAt(dense=True))
+    ys = jax.vmap(dense.evaluate)(ts)
+    for a, b in zip(jax.tree.leaves(ys), jax.tree.leaves(saved.ys), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
+    plain = run(solver, dfx.SaveAt(ts=ts))
+    assert largest(dfc.drift(plain, system.manifold)) > 1e-12
+
+
+def test_dense_output_agrees_with_the_vector_field():
+    """The time derivative of the interpolant, which an event's root finder uses."""
+    projected = dfc.ManifoldProjection(dfx.Dopri8(), RIGID_BODY)
+    sol = solve(rigid_body, projected, OMEGA0, saveat=dfx.SaveAt(dense=True), dt0=0.01)
+    for t in (0.013, 0.5, 0.71234):
+        np.testing.assert_allclose(
+            sol.derivative(t), rigid_body(t, sol.evaluate(t), None), rtol=0, atol=1e-7
+        )
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_drift_does_not_grow_over_a_million_steps(name):
+    system = dfc.systems.get(name)
+    saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 2e4, 20))
+    sol = solve(
+        system.vector_field,
+        dfc.ManifoldProjection(dfc.RK4(), system.manifold),
+        system.y0,
+        t1=2e4,
+        dt0=0.02,
+        saveat=saveat,
+        max_steps=None,
+        adjoint=dfx.ForwardMode(),
+    )
+    assert sol.stats["num_steps"] >= 1_000_000
+    assert largest(dfc.drift(sol, system.manifold)) <= 4e-15
+
+
+def test_a_thousand_lanes_are_a_thousand_solves():
+    """Each lane converges on its own: some need the loop, most do not."""
+    system = dfc.systems.get("rigid-body")
+    y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 1000))
+
+    def run(y0):
+        solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
+        return solve(system.vector_field, solver, y0, t1=2.0, dt0=0.1).ys[-1]
+
+    batch = jax.jit(jax.vmap(run))(y0s)
+    alone = jax.jit(lambda y0s: jax.lax.map(run, y0s))(y0s)
+    np.testing.assert_allclose(batch, alone, rtol=0, atol=1e-12)
+
+
+def test_adaptive_steps():
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+    sol = solve(
+        rigid_body,
+        solver,
+        OMEGA0,
+        t1=20.0,
+        saveat=dfx.SaveAt(t0=True, steps=True),
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+    )
+    assert largest(dfc.drift(sol, RIGID_BODY)) <= 4e-15
+
+
+def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
+    def vector_field(t, y, args):
+        return {"q": y["v"]["p"] / args["m"], "v": {"p": -args["k"][0] * y["q"]}}
+
+    def integrals(t, y, args):
+        energy = y["v"]["p"] ** 2 / args["m"] / 2 + args["k"][0] * y["q"] ** 2 / 2
+        return {"each": energy[:2], "last": (energy[2],)}
+
+    y0 = {"q": jnp.array([1.0, 2.0, 3.0]), "v": {"p": jnp.array([0.5, 0.0, 1.0])}}
+    args = {"m": jnp.array([1.0, 2.0, 3.0]), "k": (2.0, "unused")}
+    manifold = [dfc.FirstIntegral(integrals)]
+    sol = solve(
+        vector_field,
+        dfc.ManifoldProjection(dfc.RK4(), manifold),
+        y0,
+        args=args,
+        t1=5.0,
+        saveat=dfx.SaveAt(ts=jnp.linspace(0, 5, 11)),
+    )
+    worst = dfc.drift(sol, manifold, args)
+    assert worst[0]["each"].shape == (11, 2)
+    assert largest(worst) <= 4e-15
+    frequency = np.sqrt(2.0 / np.array([1.0, 2.0, 3.0]))
+    exact = y0["q"] * np.cos(frequency * 5) + y0["v"]["p"] / args["m"] / frequency * np.sin(
+        frequency * 5
+    )
+    np.testing.assert_allclose(sol.ys["q"][-1], exact, atol=2e-4)

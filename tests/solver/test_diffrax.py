@@ -1,0 +1,279 @@
+"""What diffrax offers around a solve works around a projected one."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body, solve
+
+CIRCLE = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+
+
+def rotation(t, y, args):
+    return jnp.stack([y[1], -y[0]])
+
+
+def on_rigid_body(ys):
+    sol = eqx.tree_at(
+        lambda s: (s.ts, s.ys),
+        solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=dfx.SaveAt(t0=True, t1=True)),
+        (jnp.zeros(len(ys) + 1), jnp.concatenate([OMEGA0[None], ys])),
+    )
+    return largest(dfc.drift(sol, RIGID_BODY)) <= 4e-15
+
+
+@pytest.mark.parametrize(
+    "solver", [dfx.Kvaerno5(), dfx.KenCarp4(), dfx.ImplicitEuler()], ids=lambda s: type(s).__name__
+)
+def test_implicit_solvers_take_the_tolerances_of_the_controller(solver):
+    term = dfx.ODETerm(rigid_body)
+    if isinstance(solver, dfx.KenCarp4):
+        term = dfx.MultiTerm(term, dfx.ODETerm(lambda t, y, args: 0 * y))
+    sol = dfx.diffeqsolve(
+        term,
+        dfc.ManifoldProjection(solver, RIGID_BODY),
+        0.0,
+        0.5,
+        0.01,
+        OMEGA0,
+        stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0, 0.5, 9)),
+    )
+    assert on_rigid_body(sol.ys)
+
+
+def test_half_solver_on_either_side():
+    controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+    reference = solve(
+        rigid_body,
+        dfx.Dopri8(),
+        OMEGA0,
+        stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
+    ).ys[-1]
+    for solver in (
+        dfx.HalfSolver(dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY)),
+        dfc.ManifoldProjection(dfx.HalfSolver(dfc.RK4()), RIGID_BODY),
+    ):
+        sol = solve(rigid_body, solver, OMEGA0, stepsize_controller=controller)
+        assert on_rigid_body(sol.ys)
+        np.testing.assert_allclose(sol.ys[-1], reference, atol=1e-4)
+
+
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfc.RK4()], ids=["tsit5", "rk4"])
+def test_adjoints_agree(solver):
+    """Reverse and forward mode, through the loops of each adjoint."""
+    projected = dfc.ManifoldProjection(solver, RIGID_BODY)
+
+    def final(y0, adjoint):
+        return solve(rigid_body, projected, y0, t1=0.5, max_steps=16, adjoint=adjoint).ys[-1]
+
+    direction = jnp.array([0.3, -1.0, 0.5])
+    h = 1e-5
+    plus, minus = (final(OMEGA0 + s * direction, dfx.RecursiveCheckpointAdjoint()) for s in (h, -h))
+    expected = (plus - minus) / (2 * h)
+    for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
+        jacobian = jax.jacrev(lambda y0: final(y0, adjoint))(OMEGA0)  # noqa: B023
+        np.testing.assert_allclose(jacobian @ direction, expected, atol=1e-8)
+    for adjoint in (dfx.ForwardMode(), dfx.DirectAdjoint()):
+        _, tangent = jax.jvp(lambda y0: final(y0, adjoint), (OMEGA0,), (direction,))  # noqa: B023
+        np.testing.assert_allclose(tangent, expected, atol=1e-8)
+
+
+def test_backsolve_adjoint_explains_and_works_with_the_inner_solver():
+    projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+
+    def final(y0, adjoint):
+        return jnp.sum(solve(rigid_body, projected, y0, t1=0.3, dt0=0.01, adjoint=adjoint).ys ** 3)
+
+    with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=inner\)"):
+        jax.grad(final)(OMEGA0, dfx.BacksolveAdjoint())
+    got = jax.grad(final)(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
+    assert bool(jnp.all(jnp.isfinite(got)))
+
+
+def test_gradient_with_respect_to_what_fn_closes_over():
+    def loss(k):
+        energy = dfc.FirstIntegral(lambda t, y, args: (y[1] ** 2 + k * y[0] ** 2) / 2)
+        sol = solve(
+            lambda t, y, args: jnp.stack([y[1], -k * y[0]]),
+            dfc.ManifoldProjection(dfc.RK4(), energy),
+            jnp.array([1.0, 0.0]),
+            t1=3.0,
+            dt0=0.3,
+            saveat=dfx.SaveAt(ts=jnp.array([1.0, 2.5])),
+        )
+        return jnp.sum(sol.ys[:, 0])
+
+    h = 1e-5
+    np.testing.assert_allclose(
+        jax.grad(loss)(2.0), (loss(2 + h) - loss(2 - h)) / (2 * h), rtol=1e-7
+    )
+
+
+def test_gradient_with_respect_to_the_conserved_value_and_the_end_time():
+    def loss(value, t1):
+        integral = dfc.FirstIntegral(CIRCLE.fn, value=value)
+        solver = dfc.ManifoldProjection(dfc.RK4(), integral)
+        return solve(rotation, solver, jnp.array([1.0, 0.0]), t1=t1, dt0=0.05).ys[-1, 0]
+
+    # The solution is `sqrt(value) cos t`, up to the error of the integrator.
+    dv, dt = jax.grad(loss, argnums=(0, 1))(1.0, 2.0)
+    np.testing.assert_allclose(dv, np.cos(2.0) / 2, atol=1e-6)
+    np.testing.assert_allclose(dt, -np.sin(2.0), atol=1e-6)
+
+
+def test_event_lands_on_the_manifold_at_the_right_time_with_a_right_gradient():
+    event = dfx.Event(lambda t, y, args, **kwargs: y[0], optx.Newton(1e-12, 1e-12))
+
+    def crossing(y0):
+        solver = dfc.ManifoldProjection(dfx.Tsit5(), CIRCLE)
+        sol = solve(rotation, solver, y0, t1=30.0, dt0=0.02, event=event)
+        return sol.ts[0], sol.ys[0]
+
+    (t, y), jacobian = crossing(jnp.array([1.0, 0.0])), jax.jacrev(lambda y: crossing(y)[0])
+    np.testing.assert_allclose(t, np.pi / 2, atol=1e-9)
+    assert abs(float(jnp.sum(y**2)) - 1) <= 4e-15
+    # The time from (x, v) to x = 0 is pi/2 + atan(v/x).
+    np.testing.assert_allclose(jacobian(jnp.array([1.0, 0.0])), [0.0, 1.0], atol=1e-6)
+
+
+TIMED = dfc.FirstIntegral(lambda t, y, args: y - jnp.sin(t))
+
+
+@pytest.mark.parametrize("t1", [3.0, -3.0])
+def test_time_dependent_integral_in_either_direction(t1):
+    """diffrax shows a solver negated times when it solves backwards."""
+    ts = jnp.linspace(0, t1, 7)
+    sol = solve(
+        lambda t, y, args: jnp.cos(t),
+        dfc.ManifoldProjection(dfx.Euler(), TIMED),
+        jnp.array(1.0),
+        t1=t1,
+        dt0=0.1 * np.sign(t1),
+        saveat=dfx.SaveAt(ts=ts),
+    )
+    np.testing.assert_allclose(sol.ys, 1 + jnp.sin(ts), rtol=0, atol=1e-15)
+
+
+def test_a_continued_solve_keeps_the_first_conserved_value():
+    shift = 1e-3  # pushed off the manifold in between
+
+    def run(y0, t0, t1, state=None):
+        return solve(
+            rotation,
+            dfc.ManifoldProjection(dfx.Tsit5(), CIRCLE),
+            y0,
+            t0=t0,
+            t1=t1,
+            solver_state=state,
+            saveat=dfx.SaveAt(t1=True, solver_state=True),
+        )
+
+    first = run(jnp.array([1.0, 0.0]), 0.0, 1.0)
+    second = run(first.ys[-1] + shift, 1.0, 2.0, first.solver_state)
+    assert abs(float(jnp.sum(second.ys[-1] ** 2)) - 1) <= 4e-15
+
+
+def unreachable(t, y, args):
+    """Conserved along the flow up to t = 0.5, then out of reach."""
+    return jnp.sum(y**2) + jnp.where(t > 0.5, 2.0, 0.0)
+
+
+def test_failure_with_fixed_steps_is_reported():
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(unreachable))
+    with pytest.raises(eqx.EquinoxRuntimeError):
+        solve(rotation, solver, jnp.array([1.0, 0.0]))
+    sol = solve(rotation, solver, jnp.array([1.0, 0.0]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+    assert "nonlinear solver" in dfx.RESULTS[sol.result] or "Nonfinite" in dfx.RESULTS[sol.result]
+
+
+def test_failure_with_adaptive_steps_is_retried_with_smaller_ones():
+    """Three iterations are too few for a long step with the first-order method."""
+    sol = solve(
+        rigid_body,
+        dfc.ManifoldProjection(
+            dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=dfc.SimplifiedNewton(max_steps=4)
+        ),
+        OMEGA0,
+        t1=0.2,
+        dt0=0.2,
+        stepsize_controller=dfx.PIDController(rtol=1e9, atol=1e9),  # accepts any error estimate
+    )
+    assert sol.stats["num_rejected_steps"] > 0
+    assert on_rigid_body(sol.ys)
+
+
+def test_nan_from_the_vector_field_is_no_success():
+    solver = dfc.ManifoldProjection(dfc.RK4(), CIRCLE)
+    sol = solve(
+        lambda t, y, args: jnp.sqrt(0.5 - t) * y, solver, jnp.array([1.0, 0.0]), throw=False
+    )
+    assert sol.result != dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda f: f,
+        jax.jit,
+        jax.checkpoint,
+        lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[0],
+        lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=1)[0],
+    ],
+    ids=["plain", "jit", "checkpoint", "vmap", "scan"],
+)
+def test_transformations(transform):
+    def final(y0):
+        return solve(rigid_body, dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY), y0, t1=0.3).ys[-1]
+
+    expected = final(OMEGA0)
+    np.testing.assert_allclose(transform(final)(OMEGA0), expected, rtol=0, atol=1e-14)
+    gradient = jax.grad(lambda y0: jnp.sum(transform(final)(y0) ** 3))(OMEGA0)
+    plain = jax.grad(lambda y0: jnp.sum(final(y0) ** 3))(OMEGA0)
+    np.testing.assert_allclose(gradient, plain, rtol=0, atol=1e-12)
+
+
+def test_strict_promotion_rank_promotion_and_nan_debugging():
+    with (
+        jax.numpy_dtype_promotion("strict"),
+        jax.numpy_rank_promotion("raise"),
+        jax.debug_nans(True),
+    ):
+
+        def final(y0):
+            solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+            return jnp.sum(
+                solve(
+                    rigid_body, solver, y0, t1=0.3, saveat=dfx.SaveAt(ts=jnp.linspace(0, 0.3, 3))
+                ).ys
+            )
+
+        assert bool(jnp.all(jnp.isfinite(jax.grad(final)(OMEGA0))))
+
+
+def test_nothing_is_compiled_twice():
+    count = 0
+
+    def energy(t, y, args):
+        nonlocal count
+        count += 1
+        return jnp.sum(y**2)
+
+    solver = dfc.ManifoldProjection(dfc.RK4(), dfc.FirstIntegral(energy))
+
+    def run(y0):
+        sol = solve(rotation, solver, y0, saveat=dfx.SaveAt(dense=True))
+        return sol.evaluate(0.123)
+
+    run(jnp.array([1.0, 0.0]))
+    traced = count
+    assert traced > 0
+    run(jnp.array([0.3, 0.4]))
+    assert count == traced

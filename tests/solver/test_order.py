@@ -1,0 +1,131 @@
+"""Projection keeps the order of the solver, and the published figures are reproduced."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import (
+    EXPONENTIAL,
+    EXPONENTIAL0,
+    KEPLER,
+    KEPLER0,
+    exponential,
+    exponential_solution,
+    kepler,
+)
+
+
+@eqx.filter_jit
+def final(vector_field, solver, y0, t1, steps):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(vector_field),
+        solver,
+        0.0,
+        t1,
+        None,
+        y0,
+        stepsize_controller=dfx.StepTo(steps),
+        max_steps=steps.size,
+    ).ys
+
+
+def exponential_error(solver, t1, num_steps):
+    ys = final(exponential, solver, EXPONENTIAL0, t1, jnp.linspace(0, t1, num_steps + 1))
+    return float(jnp.linalg.norm(ys[-1] - exponential_solution(t1)))
+
+
+@pytest.mark.parametrize(("num_steps", "error"), [(50, 5.62e-5), (100, 3.56e-6), (200, 2.24e-7)])
+def test_published_error_of_rk4(num_steps, error):
+    """`u' = -e^v, v' = e^u` to t = 5, projected on `e^u + e^v`."""
+    solver = dfc.ManifoldProjection(dfc.RK4(), EXPONENTIAL)
+    assert float(f"{exponential_error(solver, 5.0, num_steps):.2e}") == pytest.approx(error)
+
+
+@pytest.mark.parametrize(
+    ("manifold", "error"),
+    [(None, 1.46), (KEPLER[0], 3.48e-2), (KEPLER, 8.69e-3)],
+    ids=["plain", "energy", "energy and momentum"],
+)
+def test_published_error_of_kepler(manifold, error):
+    """RK4 with h = 0.2 to t = 20, where the exact position is known."""
+    solver = dfc.RK4() if manifold is None else dfc.ManifoldProjection(dfc.RK4(), manifold)
+    q, _ = final(kepler, solver, KEPLER0, 20.0, jnp.linspace(0, 20, 101))
+    got = np.linalg.norm(q[-1] - np.array([-0.77007558, 0.78834482]))
+    assert float(f"{got:.2e}") == pytest.approx(error)
+
+
+ORDERS = [
+    (dfx.Euler(), 1, 400),
+    (dfx.Heun(), 2, 100),
+    (dfc.RK4(), 4, 20),
+    (dfx.Tsit5(), 5, 40),
+    (dfx.Dopri5(), 5, 20),
+    (dfx.Dopri8(), 8, 6),
+]
+
+
+@pytest.fixture(scope="module")
+def toda():
+    """The Toda lattice, and its state at t = 2 by 2,000 steps of Dopri8."""
+    system = dfc.systems.get("toda-lattice")
+    ys = final(system.vector_field, dfx.Dopri8(), system.y0, 2.0, jnp.linspace(0, 2, 2001))
+    return system, jax.tree.map(lambda y: y[-1], ys)
+
+
+@pytest.mark.parametrize(
+    ("solver", "order", "num_steps"), ORDERS, ids=[type(s).__name__ for s, *_ in ORDERS]
+)
+def test_slope(toda, solver, order, num_steps):
+    """On a log-log scale, by least squares over four step sizes. (The leading error coefficients of
+    Tsit5 and Dopri5 are so small that a higher order shows at these steps.)"""
+    system, reference = toda
+    projected = dfc.ManifoldProjection(solver, system.manifold["energy"])
+    counts = np.array([num_steps, 1.5 * num_steps, 2 * num_steps, 3 * num_steps]).astype(int)
+    errors = []
+    for n in counts:
+        ys = final(system.vector_field, projected, system.y0, 2.0, jnp.linspace(0, 2, n + 1))
+        difference = jax.tree.map(lambda y, r: jnp.max(jnp.abs(y[-1] - r)), ys, reference)
+        errors.append(max(map(float, jax.tree.leaves(difference))))
+    slope = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert order - 0.25 <= slope <= order + 0.9
+
+
+def test_rk4_is_the_classical_method():
+    """On `y' = A y` a step is the Taylor polynomial of degree four."""
+    rng = np.random.default_rng(0)
+    a, y = rng.normal(size=(3, 3)), rng.normal(size=3)
+    h, expected, term = 0.3, y.copy(), y.copy()
+    for k in range(1, 5):
+        term = h / k * a @ term
+        expected = expected + term
+    got = final(lambda t, y, args: a @ y, dfc.RK4(), jnp.asarray(y), h, jnp.array([0, h]))
+    np.testing.assert_allclose(got[-1], expected, rtol=1e-14)
+
+
+def test_rk4_samples_time_where_it_must():
+    """Simpson's rule on `y' = f(t)`, exact for cubics."""
+    got = final(
+        lambda t, y, args: 4 * t**3 - 3 * t**2, dfc.RK4(), jnp.array(0.0), 2.0, jnp.array([0, 2.0])
+    )
+    np.testing.assert_allclose(got[-1], 16.0 - 8.0, rtol=1e-14)
+
+
+def test_dense_output_of_rk4_is_of_fourth_order():
+    def error(num_steps):
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(exponential),
+            dfc.RK4(),
+            0.0,
+            1.0,
+            1.0 / num_steps,
+            EXPONENTIAL0,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0, 1, 37)),
+        )
+        return float(jnp.max(jnp.abs(sol.ys - jax.vmap(exponential_solution)(sol.ts))))
+
+    assert np.log2(error(20) / error(40)) == pytest.approx(4, abs=0.4)
