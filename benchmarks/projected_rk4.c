@@ -9,14 +9,15 @@
    constraints, no report, no error if an iteration does not converge, scales at the candidate only. */
 
 #include <float.h>
+#include <limits.h>
 #include <math.h>
-#include <string.h>
 
 typedef double real __attribute__((vector_size(LANES * sizeof(double))));
+typedef long bits __attribute__((vector_size(LANES * sizeof(long)))); /* what a comparison gives */
 
 #define SUM(i, n, term) ({ real total_ = {0}; for (int i = 0; i < (n); ++i) total_ += (term); total_; })
 
-static inline real absolute(real x) { return x < 0 ? -x : x; }
+static inline real absolute(real x) { return (real)((bits)x & LONG_MAX); } /* drops the sign bit */
 
 #ifdef RIGID_BODY
 
@@ -128,10 +129,11 @@ static inline void solve(real A[M][M], real *x) {
 }
 
 static inline int satisfied(const real *g, const real *tolerance) {
-    int ok = 1;
-    for (int c = 0; c < M; ++c)
-        for (int l = 0; l < LANES; ++l) ok &= fabs(g[c][l]) <= tolerance[c][l];
-    return ok;
+    bits large = {0};
+    for (int c = 0; c < M; ++c) large |= absolute(g[c]) > tolerance[c];
+    long any = 0;
+    for (int l = 0; l < LANES; ++l) any |= large[l];
+    return any == 0;
 }
 
 static inline void project(real *y, const real *value) {

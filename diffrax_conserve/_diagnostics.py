@@ -4,9 +4,17 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array
 
-from ._custom_types import Args, Manifold, Values
-from ._manifold import check_manifold, conserved_values, evaluate, targets
+from ._custom_types import Args, Manifold, Values, Y
+from ._manifold import (
+    FirstIntegral,
+    check_manifold,
+    conserved_values,
+    evaluate,
+    named_entries,
+    scales,
+)
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -37,7 +45,8 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     **Raises:**
 
-    `ValueError` if the solution holds no saved states, or is a batch.
+    `ValueError` if the solution holds no saved states, only one with nothing to compare it with, or
+    is a batch.
 
     !!! example
 
@@ -71,36 +80,30 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             f"`drift` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch write "
             "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
         )
-    ts, ys = sol.ts, sol.ys
-    t0, y0 = ts[0], jtu.tree_map(lambda y: y[0], ys)
-    values = conserved_values(manifold, t0, y0, args)
-    target = targets(manifold, values, evaluate(manifold, t0, y0, args))
-    jacobian = jax.jacrev(lambda y: evaluate(manifold, t0, y, args))(y0)
-
-    def scale(value, rows):
-        terms = jtu.tree_map(lambda y, row: _contract_abs(row, y), y0, rows)
-        return jnp.abs(value) + sum(jtu.tree_leaves(terms))
-
-    outer = jtu.tree_structure(target)
-    scales = [
-        scale(value, rows)
-        for value, rows in zip(jtu.tree_leaves(target), outer.flatten_up_to(jacobian), strict=True)
+    unknown = [
+        name
+        for name, entry in named_entries(manifold)
+        if isinstance(entry, FirstIntegral) and entry.value is None
     ]
+    if sol.ts.size == 1 and unknown:
+        raise ValueError(
+            f"`sol` holds one saved state, so the drift of `{unknown[0]}` from an earlier one is "
+            "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
+            "`FirstIntegral(fn, value=...)`."
+        )
+    t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
+    values = conserved_values(manifold, t0, y0, args)
+    scale = scales(manifold, values, t0, y0, args)
 
-    def relative(t, y):
+    def relative(t: Array, y: Y) -> Values:
         padded = ~jnp.isfinite(t)
         y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
-        t = jnp.where(padded, t0, t)
-        leaves = jtu.tree_leaves(evaluate(manifold, t, y, args))
-        out = [
-            jnp.where(padded, 0, (x - jnp.asarray(v, x.dtype)) / jnp.where(s > 0, s, 1))
-            for x, v, s in zip(leaves, jtu.tree_leaves(target), scales, strict=True)
-        ]
-        return jtu.tree_unflatten(outer, out)
+        now = evaluate(manifold, jnp.where(padded, t0, t), y, args)
+        return jtu.tree_map(
+            lambda x, v, s: jnp.where(padded, 0, (x - v) / jnp.where(s > 0, s, 1)),
+            now,
+            values,
+            scale,
+        )
 
-    return jax.vmap(relative)(ts, ys)
-
-
-def _contract_abs(row, y):
-    axes = tuple(range(row.ndim - y.ndim, row.ndim))
-    return jnp.sum(jnp.abs(row) * jnp.abs(y), axis=axes)
+    return jax.vmap(relative)(sol.ts, sol.ys)

@@ -1,12 +1,15 @@
 """What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
 
 import abc
+import functools as ft
 import math
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 
@@ -17,8 +20,8 @@ class AbstractConserved(eqx.Module):
     fn: eqx.AbstractVar[ConstraintFn]
 
     @abc.abstractmethod
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values | None:
-        """What `fn` is kept at in a solve that starts at `(t, y, args)`; `None` means zero."""
+    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        """What `fn` is kept at in a solve that starts at `(t, y, args)`."""
 
 
 @final
@@ -86,8 +89,8 @@ class Constraint(AbstractConserved):
     def __check_init__(self):
         _check_callable(self)
 
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> None:
-        del t, y, args
+    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
 
 
 Constraint.__init__.__doc__ = r"""**Arguments:**
@@ -113,7 +116,7 @@ def is_entry(x: Any) -> bool:
 
 def check_manifold(manifold: Manifold) -> None:
     """Raises unless `manifold` is a non-empty PyTree of `FirstIntegral`s and `Constraint`s."""
-    entries = _named_entries(manifold)
+    entries = named_entries(manifold)
     for name, entry in entries:
         if not is_entry(entry):
             remedy = (
@@ -133,7 +136,7 @@ def check_manifold(manifold: Manifold) -> None:
         )
 
 
-def _named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
+def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(f"manifold{jtu.keystr(path)}", entry) for path, entry in flat]
 
@@ -146,7 +149,7 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
 
 
 def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`manifold` with each entry replaced by its conserved value (`None` for a constraint)."""
+    """`manifold` with each entry replaced by its conserved value, zero for a constraint."""
     return jtu.tree_map(
         lambda entry: jtu.tree_map(jnp.asarray, entry.conserved_value(t, y, args)),
         manifold,
@@ -154,24 +157,25 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
     )
 
 
-def targets(manifold: Manifold, values: Values, outputs: Values) -> Values:
-    """What `evaluate` must equal: the conserved values, and zero for each constraint."""
-    return jtu.tree_map(
-        lambda entry, value, output: (
-            jtu.tree_map(jnp.zeros_like, output) if isinstance(entry, Constraint) else value
-        ),
-        manifold,
-        values,
-        outputs,
-        is_leaf=is_entry,
-    )
+def scales(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """What roundoff in `evaluate` is relative to, `|value| + Σ_k |y_k ∂I/∂y_k|`."""
+    jacobian = jax.jacrev(lambda y: evaluate(manifold, t, y, args))(y)
+
+    def scale(value: Array, rows: Y) -> Array:
+        def contract(row: Array, leaf: Array) -> Array:
+            axes = tuple(range(value.ndim, row.ndim))
+            return jnp.sum(jnp.abs(row) * jnp.abs(leaf), axis=axes).astype(value.dtype)
+
+        return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(contract, rows, y)), jnp.abs(value))
+
+    return jtu.tree_map(scale, values, jacobian)
 
 
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless the functions of the manifold return real floating-point arrays, at least one
     scalar in all and at most as many as the state has unknowns."""
     count = 0
-    for name, entry in _named_entries(manifold):
+    for name, entry in named_entries(manifold):
         for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
             _check_output(name, leaf)
             count += math.prod(jnp.shape(leaf))
@@ -187,7 +191,7 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
 
 def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless the conserved values are shaped as what the first integrals return."""
-    entries = _named_entries(manifold)
+    entries = named_entries(manifold)
     treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
     try:
         flat = treedef.flatten_up_to(values)

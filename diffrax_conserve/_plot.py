@@ -61,15 +61,13 @@ def drift(times: _Curves, drifts: dict[str, _Curves], time_unit: str) -> Figure:
         panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
         for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
             roundoff = ax.axhline(_EPS, color="black", linewidth=0.8, linestyle=":", zorder=3)
-            exact = any(np.any(values < _FLOOR) for values in curves.values())
-            if exact:
-                curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
+            curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
             _over_time(ax, times, curves, time_unit)
             ax.set_title(integral)
         panels[0].set_ylabel("relative drift")
-        handles, labels = panels[0].get_legend_handles_labels()
+        _legend(figure, *panels[0].get_legend_handles_labels())
         note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
-        _legend(figure, [*handles, roundoff], [*labels, note], 2 if len(drifts) < 3 else 3)
+        figure.legend([roundoff], [note], loc="outside lower center")
         return figure
 
 
@@ -85,7 +83,7 @@ def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> F
         curves = {name: np.maximum(values, floor) for name, values in errors.items()}
         _over_time(ax, times, curves, time_unit)
         ax.set_ylabel(_label("state error", unit))
-        _legend(figure, *ax.get_legend_handles_labels(), 4)
+        _legend(figure, *ax.get_legend_handles_labels())
         return figure
 
 
@@ -100,7 +98,7 @@ def trajectory(
         labels = axis_labels if solid else axis_labels[:2]
         columns = min(len(parts), 3)
         rows = -(-len(parts) // columns)
-        figure = Figure(figsize=(max(3.5, 2.3 * columns), 2.2 * rows + 0.6), layout="constrained")
+        figure = Figure(figsize=(max(3.5, 2.3 * columns), 2.5 * rows + 0.5), layout="constrained")
         if solid:
             figure.set_size_inches(3.5, 3.5)
         keywords = dict(projection="3d") if solid else {}
@@ -112,7 +110,10 @@ def trajectory(
                 ax.set_title(part)
         for ax in panels.flat[len(parts) :]:
             ax.set_axis_off()
-        _legend(figure, *panels[0, 0].get_legend_handles_labels(), 4)
+        _legend(figure, *panels[0, 0].get_legend_handles_labels())
+        if any(_is_long(curves) for curves in paths.values()):
+            note = f"The last {_MARKED_MAX} steps are marked."
+            figure.legend([], [], title=note, title_fontsize=8, loc="outside lower center")
         return figure
 
 
@@ -135,7 +136,7 @@ def _over_time(ax: Any, times: _Curves, curves: _Curves, time_unit: str) -> None
     lowest, highest = (np.log10(ax.get_ylim()[i]) for i in (0, 1))
     ax.set_ylim(10 ** np.floor(lowest), 10 ** np.ceil(highest))
     ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.xaxis.set_major_locator(MaxNLocator(5 if len(ax.figure.axes) == 1 else 4))
     ax.set_xlabel(_label("$t$", time_unit))
 
 
@@ -144,19 +145,17 @@ def _draw_paths(
 ) -> None:
     dimension = len(axis_labels)
     if reference is not None:
-        long = len(next(iter(paths.values()))) > _MARKED_MAX + 1
-        style = dict(color="#BDBDBD", linewidth=0.5 if long else 1.5, zorder=1)
+        style = dict(color="#BDBDBD", linewidth=0.5 if _is_long(paths) else 1.5, zorder=1)
         ax.plot(*reference.T[:dimension], label="reference", **style)
     for i, (name, path) in enumerate(paths.items()):
         # Large rings round small dots: one solver cannot hide another.
-        last = path[-_MARKED_MAX - 1 :]
+        last = path[-_MARKED_MAX - 1 :].T[:dimension]
         ring = dict(markersize=4.5, markerfacecolor="none") if i == 0 else dict(markersize=2.2)
-        text = _NAMES.get(name, name)
         ax.plot(
-            *last.T[:dimension],
+            *last,
             linestyle="none",
             marker="o",
-            label=text if len(last) == len(path) else f"{text}, last {len(last) - 1} steps",
+            label=_NAMES.get(name, name),
             color=_colour(name, paths),
             zorder=2 + 0.1 * i,
             **ring,
@@ -167,9 +166,22 @@ def _draw_paths(
         _tidy_space(ax)
         return
     if _are_alike(axis_labels):
-        ax.set_aspect("equal", adjustable="datalim")
+        _make_square(ax)
     for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+
+
+def _make_square(ax: Any) -> None:
+    """Equal scales and ranges, which unlike `adjustable="datalim"` the layout knows beforehand."""
+    (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+    half = max(x1 - x0, y1 - y0) / 2
+    ax.set_xlim((x0 + x1) / 2 - half, (x0 + x1) / 2 + half)
+    ax.set_ylim((y0 + y1) / 2 - half, (y0 + y1) / 2 + half)
+    ax.set_aspect("equal")
+
+
+def _is_long(paths: _Curves) -> bool:
+    return len(next(iter(paths.values()))) > _MARKED_MAX + 1
 
 
 def _tidy_space(ax: Any) -> None:
@@ -190,8 +202,8 @@ def _label(quantity: str, unit: str) -> str:
     return f"{quantity} [{unit}]" if unit else quantity
 
 
-def _legend(figure: Figure, handles: list[Any], labels: list[str], columns: int) -> None:
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+def _legend(figure: Figure, handles: list[Any], labels: list[str]) -> None:
+    figure.legend(handles, labels, loc="outside upper center", ncols=3)
 
 
 def _colour(name: str, names: dict[str, Any]) -> str:

@@ -330,6 +330,8 @@ def _table(system: AbstractSystem, metrics: dict[str, Any], t1: float, dt: float
     failures = [f"{name} FAILED {r['failure']}" for name, r in rows.items() if "failure" in r]
     if "failure" in metrics:
         failures.append(metrics["failure"])
+    if failures:
+        failures.append("")
     heading = f"{system.title}: 0 <= t <= {t1:g}, steps of {dt:g}"
     return "\n".join([heading, "", *text, "", *failures, FOOTER])
 

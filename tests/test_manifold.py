@@ -1,6 +1,7 @@
 """Wrong input is refused with an error that names the argument and the remedy."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
@@ -123,6 +124,26 @@ def test_project_without_a_value():
 def test_nested_implicit_solver_without_tolerances():
     with pytest.raises(ValueError, match="VeryChord"):
         dfc.ManifoldProjection(dfx.HalfSolver(dfx.Kvaerno3()), RIGID_BODY)
+
+
+def test_initial_state_off_a_constraint():
+    sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+    with pytest.raises(
+        eqx.EquinoxRuntimeError, match=r"`manifold\['unit'\]` by about 1e-1 .*project"
+    ):
+        run({"unit": sphere})
+    y0, _ = dfc.project(sphere, OMEGA0)
+    assert run({"unit": sphere}, y0).result == dfx.RESULTS.successful
+    # What a finite difference perturbs by is accepted, and projected by the first step.
+    assert abs(float(jnp.sum(run(sphere, y0 + 1e-6).ys[-1] ** 2)) - 1) <= 4e-15
+
+
+def test_drift_of_one_saved_state():
+    sol = run(RIGID_BODY)
+    with pytest.raises(ValueError, match=r"SaveAt\(t0=True, t1=True\)"):
+        dfc.drift(sol, RIGID_BODY)
+    value = dfc.FirstIntegral(rotational_energy, value=jnp.array(0.15))
+    assert float(dfc.drift(sol, value)[0]) == pytest.approx(0.15 / (0.15 + 0.6), rel=1e-3)
 
 
 def test_drift_of_nothing():

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
+    Constraint,
     FirstIntegral,
     check_manifold,
     check_outputs,
@@ -15,7 +16,6 @@ from .._manifold import (
     conserved_values,
     evaluate,
     is_entry,
-    targets,
 )
 from .._tree import working_dtype
 from ._base import AbstractProjection, ProjectionInfo
@@ -42,9 +42,9 @@ def project(
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `y`: the candidate, any PyTree of real floating-point arrays.
     - `t`, `args`: passed to the functions of the manifold.
-    - `value`: what each `FirstIntegral` is to be kept at: a PyTree like `manifold`, with the
-        conserved value in the place of each `FirstIntegral` and `None` in the place of each
-        `Constraint`. Not needed where each `FirstIntegral` has a `value` of its own.
+    - `value`: the conserved values: a PyTree like `manifold`, with what `fn` is to be kept at in
+        the place of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed
+        where each `FirstIntegral` has a `value` of its own.
     - `projection`: how to get there. Default: `Newton()`, the nearest point.
 
     **Returns:**
@@ -82,9 +82,18 @@ def project(
                     "`value=integral.fn(t, y_start, args)`, or write "
                     "`FirstIntegral(fn, value=...)`."
                 )
-        value = conserved_values(manifold, t, y, args)
-    check_values(manifold, value, t, y, args)
-    return apply(projection, manifold, value, t, y, args)
+    values = conserved_values(manifold, t, y, args)
+    if value is not None:
+        check_values(manifold, value, t, y, args)
+        values = jtu.tree_map(
+            lambda entry, given, own: own if isinstance(entry, Constraint) else given,
+            manifold,
+            value,
+            values,
+            is_leaf=is_entry,
+        )
+    check_values(manifold, values, t, y, args)
+    return apply(projection, manifold, values, t, y, args)
 
 
 def apply(
@@ -98,8 +107,6 @@ def apply(
     """`project` without its checks."""
     dtype = working_dtype(candidate)
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
-    shaped = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), outputs)
-    target = targets(manifold, values, shaped)
     unrolled = sum(x.size for x in jtu.tree_leaves(outputs)) <= UNROLLED_MAX
 
     def vector(tree: PyTree[Array]) -> Vector:
@@ -110,11 +117,11 @@ def apply(
 
     def residual(y: Y) -> Vector:
         out = evaluate(manifold, t, y, args)
-        return vector(jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, target))
+        return vector(jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values))
 
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
     residual = eqx.filter_closure_convert(residual, candidate)
-    magnitude = vector(jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), shaped, target))
+    magnitude = vector(jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values))
     return projection.solve(residual, magnitude, candidate, _inverse(projection.metric, candidate))
 
 

@@ -1,0 +1,272 @@
+"""The command line: what it prints and writes, and how it refuses what it cannot do."""
+
+import json
+import os
+import subprocess
+import sys
+
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve import _reproduce
+from diffrax_conserve.__main__ import main
+
+FIGURES = ("trajectory", "drift", "state_error")
+
+
+def reproduce(tmp_path, *arguments, out="out"):
+    """The exit status and the metrics."""
+    folder = tmp_path / out
+    status = main(["reproduce", *arguments, "--out", str(folder)])
+    return status, json.loads((folder / "metrics.json").read_text())
+
+
+def refused(capsys, *arguments):
+    """What is said on standard error about arguments that are refused."""
+    with pytest.raises(SystemExit) as exit:
+        main(list(arguments))
+    assert exit.value.code == 2
+    return capsys.readouterr().err
+
+
+# ---- What it computes, against numpy ----
+
+
+def rk4(f, y, h, steps, after=lambda y, y0: y):
+    ys = [y]
+    for _ in range(steps):
+        k1 = f(y)
+        k2 = f(y + h / 2 * k1)
+        k3 = f(y + h / 2 * k2)
+        k4 = f(y + h * k3)
+        y = after(y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), ys[0])
+        ys.append(y)
+    return np.array(ys)
+
+
+def rotation(t):
+    """The exact flow of the harmonic oscillator of unit frequency."""
+    return np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
+
+
+def test_metrics_of_the_harmonic_oscillator(tmp_path):
+    t1, h, steps = 3.0, 0.25, 12
+    status, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", str(t1), "--dt", str(h))
+    y0 = np.array(dfc.systems.get("harmonic-oscillator").y0)
+
+    def f(y):
+        return np.array([y[1], -y[0]])
+
+    # Projecting on a circle is scaling.
+    runs = {
+        "rk4": rk4(f, y0, h, steps),
+        "projected rk4": rk4(
+            f, y0, h, steps, lambda y, y0: y * np.linalg.norm(y0) / np.linalg.norm(y)
+        ),
+    }
+    assert status == 0
+    assert metrics["system"] == "harmonic-oscillator"
+    assert list(metrics["solvers"]) == list(runs)
+    for name, ys in runs.items():
+        row = metrics["solvers"][name]
+        errors = [np.linalg.norm(y - rotation(k * h) @ y0) for k, y in enumerate(ys)]
+        # The scale of an integral that is quadratic, without cancellation, is 3 |I|.
+        drift = np.max(np.abs(np.sum(ys**2, axis=1) / np.sum(y0**2) - 1)) / 3
+        np.testing.assert_allclose(row["state_error"], errors[-1], rtol=1e-9)
+        np.testing.assert_allclose(row["largest_state_error"], max(errors), rtol=1e-9)
+        np.testing.assert_allclose(row["drift"]["energy"], drift, rtol=1e-9, atol=4e-16)
+        assert row["steps"] == steps
+        assert row["seconds"] > 0
+
+
+def test_metrics_of_keplers_problem(tmp_path):
+    t1, h, steps = 3.0, 0.2, 15
+    _, metrics = reproduce(tmp_path, "kepler", "--t1", str(t1), "--dt", str(h))
+    system = dfc.systems.Kepler()
+    y0 = np.concatenate(system.y0)
+
+    def f(y):
+        return np.concatenate([y[2:], -y[:2] / np.sum(y[:2] ** 2) ** 1.5])
+
+    ys = rk4(f, y0, h, steps)
+    exact = np.concatenate([x[0] for x in system.reference(jnp.array([t1]))])
+    l = ys[:, 0] * ys[:, 3] - ys[:, 1] * ys[:, 2]
+    # At the perihelion (q, p) = ((a, 0), (0, b)), where L = a b: the scale is 3 |L|.
+    drift = np.max(np.abs(l / l[0] - 1)) / 3
+    row = metrics["solvers"]["rk4"]
+    np.testing.assert_allclose(row["state_error"], np.linalg.norm(ys[-1] - exact), rtol=1e-9)
+    np.testing.assert_allclose(row["drift"]["angular momentum"], drift, rtol=1e-9)
+    projected = metrics["solvers"]["projected rk4"]
+    assert max(projected["drift"].values()) < 4e-15
+    assert projected["state_error"] < row["state_error"]
+
+
+def test_the_largest_drift_is_over_every_step_however_few_are_plotted(tmp_path, monkeypatch):
+    arguments = ("kepler", "--t1", "7", "--dt", "0.1")
+    _, all_plotted = reproduce(tmp_path, *arguments, out="a")
+    monkeypatch.setattr(_reproduce, "_PLOTTED_MAX", 3)
+    _, few_plotted = reproduce(tmp_path, *arguments, out="b")
+    for name, row in few_plotted["solvers"].items():
+        assert row["drift"] == all_plotted["solvers"][name]["drift"]
+        assert row["state_error"] == pytest.approx(
+            all_plotted["solvers"][name]["state_error"], rel=1e-9
+        )
+
+
+def test_a_last_step_that_is_shorter(tmp_path):
+    _, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1.1", "--dt", "0.25")
+    assert metrics["solvers"]["rk4"]["steps"] == 5
+    assert metrics["solvers"]["projected rk4"]["state_error"] < 1e-4
+
+
+# ---- What it writes and prints ----
+
+
+def test_files_and_nothing_else(tmp_path, capsys):
+    reproduce(tmp_path, "rigid-body", "--t1", "0.2")
+    files = list((tmp_path / "out").iterdir())
+    figures = {f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf")}
+    assert {f.name for f in files} == {*figures, "metrics.json"}
+    assert all(f.stat().st_size > 100 for f in files)
+    printed = capsys.readouterr().out
+    for text in ("projected rk4", "drift of squared angular momentum", "steps", "compile"):
+        assert text in printed
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+
+    def half(temporary):
+        temporary.write_text("ne")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _reproduce._write(path, half)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_folder_of_the_system_is_the_default(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["reproduce", "harmonic-oscillator", "--t1", "0.5"]) == 0
+    assert (tmp_path / "out" / "harmonic-oscillator" / "metrics.json").exists()
+
+
+def test_list_names_every_system(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(dfc.systems.names())
+
+
+# The systems that the rest of the catalogue resembles; the rest is slow only by its number.
+QUICK = dfc.systems.names()[:7]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in dfc.systems.names()],
+)
+def test_every_system(name, tmp_path):
+    system = dfc.systems.get(name)
+    status, metrics = reproduce(tmp_path, name, "--t1", str(3 * system.dt))
+    assert status == 0
+    for row in metrics["solvers"].values():
+        assert row["steps"] == 3
+        assert row["drift"].keys() == system.manifold.keys()
+        assert np.isfinite(row["state_error"])
+    assert max(metrics["solvers"]["projected rk4"]["drift"].values()) < 4e-15
+
+
+# ---- What it refuses ----
+
+
+def test_an_unknown_system_is_told_the_close_matches(capsys):
+    message = refused(capsys, "reproduce", "keppler")
+    assert "'kepler'" in message
+    assert "rigid-body" in message  # and what else there is
+
+
+@pytest.mark.parametrize("option", ["--t1", "--dt"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "ten"])
+def test_times_that_are_not_positive_numbers(capsys, option, value):
+    message = refused(capsys, "reproduce", "kepler", f"{option}={value}")
+    assert option in message
+    assert "positive" in message
+
+
+def test_a_step_longer_than_the_solve(capsys, tmp_path):
+    arguments = ("--t1", "1", "--dt", "2", "--out", str(tmp_path / "out"))
+    message = refused(capsys, "reproduce", "kepler", *arguments)
+    assert "dt" in message
+    assert "at most dt = 1" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_more_steps_than_memory_holds(capsys, tmp_path):
+    message = refused(capsys, "reproduce", "kepler", "--dt", "1e-9", "--out", str(tmp_path))
+    assert "larger dt" in message
+
+
+def test_a_folder_that_cannot_be_written(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    message = refused(capsys, "reproduce", "kepler", "--out", str(tmp_path / "file" / "out"))
+    assert "--out" in message
+
+
+def test_without_matplotlib(tmp_path):
+    """`list` works, and `reproduce` says what to install before it computes anything."""
+    (tmp_path / "matplotlib.py").write_text("raise ImportError('No module named matplotlib')")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+
+    def run(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "diffrax_conserve", *arguments],
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+        )
+
+    assert run("list").returncode == 0
+    done = run("reproduce", "kepler")
+    assert done.returncode == 2
+    assert "pip install diffrax-conserve[plots]" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# ---- What it says about a solver that fails ----
+
+
+def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys):
+    """Steps this long have no point on the manifold near their candidates."""
+    status, metrics = reproduce(tmp_path, "kepler", "--t1", "60", "--dt", "6")
+    rows = metrics["solvers"]
+    failed = [name for name, row in rows.items() if "failure" in row]
+    assert status == 1
+    assert failed == ["projected rk4"]
+    assert rows["projected rk4"]["state_error"] is None
+    assert np.isfinite(rows["rk4"]["state_error"])
+    assert "projected rk4 FAILED after t = " in capsys.readouterr().out
+    assert all((tmp_path / "out" / f"{name}.png").exists() for name in FIGURES)
+
+
+def test_a_solver_that_cannot_start(tmp_path, capsys, monkeypatch):
+    def solvers(system):
+        return {"rk4": dfc.RK4(), "leapfrog": dfx.SemiImplicitEuler()}
+
+    monkeypatch.setattr(_reproduce, "solvers", solvers)
+    status, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1")
+    assert status == 1
+    assert "failure" in metrics["solvers"]["leapfrog"]
+    assert metrics["solvers"]["rk4"]["state_error"] > 0
+    assert "leapfrog FAILED at the start" in capsys.readouterr().out
+
+
+def test_a_state_that_blows_up(tmp_path):
+    status, metrics = reproduce(tmp_path, "henon-heiles", "--t1", "400", "--dt", "4")
+    assert status == 1
+    assert "not finite" in metrics["solvers"]["rk4"]["failure"]
