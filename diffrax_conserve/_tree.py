@@ -52,11 +52,6 @@ def working_dtype(y: Y) -> jnp.dtype:
         return jnp.result_type(*jtu.tree_leaves(y))
 
 
-def roundoff(*trees: PyTree[Array]) -> float:
-    """The unit roundoff (machine epsilon) of the coarsest dtype among the leaves."""
-    return max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves(trees))
-
-
 def tree_size(a: PyTree[Array]) -> int:
     """The number of scalars in `a`."""
     return sum(jnp.size(x) for x in jtu.tree_leaves(a))

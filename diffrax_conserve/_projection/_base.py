@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_sub, working_dtype
+from .._tree import tree_all_finite, tree_dot, tree_sub, working_dtype
 from ._jacobian import AbstractJacobian, Residual, Vector
 
 
@@ -125,7 +125,30 @@ def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
     return out
 
 
-def largest_relative(residual: Vector, scale: Vector) -> Float[Array, ""]:
+def report(
+    success: Bool[Array, ""],
+    num_steps: Int[Array, ""],
+    candidate: Y,
+    y: Y,
+    before: Vector,
+    after: Vector,
+    scale: Vector,
+) -> ProjectionInfo:
+    """The `ProjectionInfo` of a projection from `candidate` to `y`."""
+    failure = optx.RESULTS.where(
+        tree_all_finite(after), optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.nonfinite
+    )
+    correction = tree_sub(y, candidate)
+    return ProjectionInfo(
+        result=optx.RESULTS.where(success, optx.RESULTS.successful, failure),
+        num_steps=num_steps,
+        residual_before=_largest_relative(before, scale),
+        residual_after=_largest_relative(after, scale),
+        correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(y))),
+    )
+
+
+def _largest_relative(residual: Vector, scale: Vector) -> Float[Array, ""]:
     """The largest residual relative to its scale."""
 
     def relative(g: Array, s: Array) -> Array:

@@ -11,12 +11,12 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree, Real
 
 from .._custom_types import Y
-from .._tree import tree_add, tree_dot, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
+from .._tree import tree_add, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
 from ._base import (
     AbstractProjection,
     ProjectionInfo,
-    largest_relative,
     positive_weights,
+    report,
     tolerances,
     within,
 )
@@ -88,23 +88,10 @@ class Newton(AbstractProjection):
 
         after, at_y = linearise(residual, y)
         scale, tolerance = tolerances(at_y, y, candidate, weights, magnitude, self.rtol, self.atol)
-        correction = tree_sub(y, candidate)
-        info = ProjectionInfo(
-            result=optx.RESULTS.where(
-                within(after, tolerance) & (nearest.result == optx.RESULTS.successful),
-                optx.RESULTS.successful,
-                optx.RESULTS.where(
-                    jnp.isfinite(largest_relative(after, scale)),
-                    optx.RESULTS.nonlinear_max_steps_reached,
-                    optx.RESULTS.nonfinite,
-                ),
-            ),
-            num_steps=count + nearest.stats["num_steps"],
-            residual_before=largest_relative(residual(candidate), scale),
-            residual_after=largest_relative(after, scale),
-            correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(correction))),
-        )
-        return y, lax.stop_gradient(info)
+        success = within(after, tolerance) & (nearest.result == optx.RESULTS.successful)
+        num_steps = count + nearest.stats["num_steps"]
+        info = report(success, num_steps, candidate, y, residual(candidate), after, scale)
+        return y, _stop_gradient(info)
 
 
 Newton.__init__.__doc__ = r"""**Arguments:**

@@ -7,16 +7,15 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_add, tree_all_finite, tree_dot, tree_mul, tree_sub, working_dtype
+from .._tree import tree_add, tree_all_finite, tree_mul
 from ._base import (
     AbstractProjection,
     ProjectionInfo,
-    largest_relative,
     positive_weights,
+    report,
     tolerances,
     within,
 )
@@ -137,42 +136,22 @@ def _solve(
         y = _displaced(jacobian, change, y, weights)
         return y, jtu.tree_map(jnp.add, multiplier, change), residual(y), count + 1
 
-    def unfinished(carry: _Iterate) -> Array:
-        y, _, g, count = carry
-        _, tolerance = scales(y)
-        return ~within(g, tolerance) & (count < max_steps) & tree_all_finite(g)
-
-    def flagged(carry: _Iterate) -> tuple[Array, _Iterate]:
+    def judged(carry: _Iterate) -> tuple[Array, Array, _Iterate]:
         # A loop in a batch evaluates its condition in two places, where it may be rounded in two
         # ways, and then never ends: so the condition is evaluated once, and carried.
-        return unfinished(carry), carry
+        y, _, g, count = carry
+        _, tolerance = scales(y)
+        success = within(g, tolerance)
+        return ~success & (count < max_steps) & tree_all_finite(g), success, carry
 
     carry = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
     for _ in range(min(INLINE_STEPS, max_steps)):
         carry = iterate(carry)
-    _, (y, multiplier, after, count) = lax.while_loop(
-        lambda carry: carry[0], lambda carry: flagged(iterate(carry[1])), flagged(carry)
+    _, success, (y, multiplier, after, count) = lax.while_loop(
+        lambda carry: carry[0], lambda carry: judged(iterate(carry[-1])), judged(carry)
     )
-
-    scale, tolerance = scales(y)
-    result = optx.RESULTS.where(
-        within(after, tolerance),
-        optx.RESULTS.successful,
-        optx.RESULTS.where(
-            tree_all_finite(after),
-            optx.RESULTS.nonlinear_max_steps_reached,
-            optx.RESULTS.nonfinite,
-        ),
-    )
-    correction = tree_sub(y, candidate)
-    info = ProjectionInfo(
-        result=result,
-        num_steps=count,
-        residual_before=largest_relative(before, scale),
-        residual_after=largest_relative(after, scale),
-        correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(correction))),
-    )
-    return y, multiplier, info
+    scale, _ = scales(y)
+    return y, multiplier, report(success, count, candidate, y, before, after, scale)
 
 
 @_solve.def_jvp
