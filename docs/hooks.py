@@ -1,8 +1,15 @@
-"""Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
+"""Two things that the pages cannot do themselves.
+
+The table of solvers in `solvers.md` is the one that the tests run.
+
+Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
 
 The usual way is an inventory downloaded at each build. Ours is a table, so that the build needs no
 network; a name that is not in it fails the strict build, as a misspelt name of our own does.
 """
+
+import runpy
+from pathlib import Path
 
 DIFFRAX = "https://docs.kidger.site/diffrax/api"
 EQUINOX = "https://docs.kidger.site/equinox/api"
@@ -53,3 +60,14 @@ def on_config(config):
             autorefs.register_url(name, f"{page}#{name}")
     for name, page in MENTIONED.items():
         autorefs.register_url(name, page)
+
+
+CONFORMANCE = Path(__file__).parent.parent / "tests" / "solver" / "conformance_table.py"
+
+
+def on_page_markdown(markdown, **kwargs):
+    del kwargs
+    rows = runpy.run_path(str(CONFORMANCE))["TABLE"].items()
+    table = ["| solver | tested as | inside `ManifoldProjection` |", "|---|---|---|"]
+    table += [f"| `{solver}` | {kind} | supported |" for solver, kind in rows]
+    return markdown.replace("<!-- conformance table -->", "\n".join(table))

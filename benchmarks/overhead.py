@@ -1,0 +1,415 @@
+"""What a projection costs: ns per step and trajectory, against plain solvers, a hand-written loop with
+`optimistix.root_find`, and hand-written C.
+
+Every timed answer is checked: projected ones for their drift, C's against ours. Within a table the
+contestants take turns, and each counts with its best round, so that a noisy machine slows all of
+them alike. How to run and read it: `benchmarks/README.md`.
+"""
+
+import argparse
+import ctypes
+import datetime
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optimistix as optx
+
+import diffrax_conserve as dfc
+
+jax.config.update("jax_enable_x64", True)
+
+HERE = Path(__file__).parent
+MAX_DRIFT = 4e-15  # of whatever is projected by this package or by C
+MAX_DRIFT_BY_HAND = 1e-12  # a root finder stops at the tolerances that a user would write
+MAX_DIFFERENCE = 1e-10  # between C's states and ours
+LANES = 8  # of float64 in the vectors of the C program: one AVX-512 register
+C_FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp-simd")
+
+
+class Problem(NamedTuple):
+    """A system of the catalogue, the step, and how to tell the C program which one it is."""
+
+    system: Any
+    dt: float
+    define: str
+
+
+PROBLEMS = {
+    "rigid-body": Problem(dfc.systems.RigidBody(), 0.05, "-DRIGID_BODY"),
+    "three-vortices": Problem(dfc.systems.PointVortices(), 0.1, "-DVORTICES=3"),
+}
+
+
+class Settings(NamedTuple):
+    """How much is measured. Contestants take as many steps as fit into `seconds`."""
+
+    batches: tuple[int, ...]
+    rounds: int
+    seconds: float
+    horizon: float  # t1 of the adaptive solves
+    check_steps: int  # after which C and we are compared
+
+
+FULL = Settings(
+    batches=(1, 1_000, 100_000), rounds=5, seconds=0.5, horizon=100.0, check_steps=100
+)
+SMOKE = Settings(batches=(1, 8), rounds=2, seconds=0.01, horizon=2.0, check_steps=10)
+
+
+class Contestant(NamedTuple):
+    """`run(steps) -> (states, steps made)`, compiled, and what its answers are held to."""
+
+    run: Callable[[int], tuple[np.ndarray, int]]
+    max_drift: float
+    compile_seconds: float | None = None
+
+
+# ---- The initial states, and how well they are kept ----
+
+
+def initial_states(problem: Problem, batch: int) -> np.ndarray:
+    """`y0` alone, or perturbed by 5 %, so that lanes need about as many iterations as `y0`."""
+    y0 = problem.system.y0
+    factors = 1 + 0.05 * jr.normal(jr.key(0), (batch, *y0.shape))
+    return np.asarray(y0 * factors if batch > 1 else y0[None])
+
+
+def conserved(problem: Problem, y: jax.Array) -> jax.Array:
+    manifold = problem.system.manifold
+    return jfu.ravel_pytree({name: entry.fn(0.0, y, None) for name, entry in manifold.items()})[0]
+
+
+def largest_drift(problem: Problem, start: np.ndarray, end: np.ndarray) -> float:
+    """The largest change of an integral, relative to its value and the terms that it sums."""
+
+    def relative(a, b):
+        value = conserved(problem, a)
+        gradient = jax.jacfwd(lambda y: conserved(problem, y))(a)
+        scale = jnp.abs(value) + jnp.abs(gradient).reshape(value.size, -1) @ jnp.abs(a).ravel()
+        return jnp.max(jnp.abs(conserved(problem, b) - value) / scale)
+
+    return float(jnp.max(jax.jit(jax.vmap(relative))(start, end)))
+
+
+# ---- The contestants ----
+
+
+def solve(problem: Problem, solver: dfx.AbstractSolver, t1, y0, *, adaptive: bool):
+    controller = dfx.PIDController(rtol=1e-8, atol=1e-8) if adaptive else dfx.ConstantStepSize()
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(problem.system.vector_field),
+        solver,
+        t0=0.0,
+        t1=t1,
+        dt0=None if adaptive else problem.dt,
+        y0=y0,
+        saveat=dfx.SaveAt(t1=True),
+        stepsize_controller=controller,
+        adjoint=dfx.ForwardMode(),
+        max_steps=None,
+        throw=False,
+    )
+    ok = solution.result == dfx.RESULTS.successful
+    return jnp.where(ok, solution.ys[0], jnp.nan), solution.stats["num_accepted_steps"]
+
+
+def root_find_by_hand(problem: Problem, solver: dfx.AbstractSolver, t1, y0, *, adaptive: bool):
+    """What a diffrax user does without this package: step, then find the multipliers."""
+    del adaptive
+    term = dfx.ODETerm(problem.system.vector_field)
+    target = conserved(problem, y0)
+    newton = optx.Newton(rtol=1e-12, atol=1e-14)
+
+    def body(step, carry):
+        y, state = carry
+        t = step * problem.dt
+        y, _, _, state, _ = solver.step(term, t, t + problem.dt, y, None, state, made_jump=False)
+        gradients = jax.jacrev(lambda y: conserved(problem, y))(y)
+
+        def displaced(multipliers):
+            return y + jnp.tensordot(multipliers, gradients, axes=1)
+
+        solution = optx.root_find(
+            lambda multipliers, _: conserved(problem, displaced(multipliers)) - target,
+            newton,
+            jnp.zeros_like(target),
+            max_steps=20,
+            throw=False,
+        )
+        return displaced(solution.value), state
+
+    steps = jnp.round(t1 / problem.dt).astype(int)
+    start = y0, solver.init(term, 0.0, problem.dt, y0, None)
+    return jax.lax.fori_loop(0, steps, body, start)[0], steps
+
+
+def compiled(
+    method: Callable[..., Any],
+    problem: Problem,
+    solver: dfx.AbstractSolver,
+    start: np.ndarray,
+    max_drift: float = math.inf,
+    *,
+    adaptive: bool = False,
+) -> Contestant:
+    """`method` for the batch `start`; alone it is compiled without a batch axis."""
+
+    def one(t1, y0):
+        return method(problem, solver, t1, y0, adaptive=adaptive)
+
+    alone = len(start) == 1
+    y0 = jnp.asarray(start[0] if alone else start)
+    begin = time.perf_counter()
+    function = jax.jit(one if alone else jax.vmap(one, (None, 0))).lower(1.0, y0).compile()
+    seconds = time.perf_counter() - begin
+
+    def run(steps: int) -> tuple[np.ndarray, int]:
+        # Half a step short, so that a rounded sum of steps can add none; diffrax ends at t1.
+        states, made = jax.block_until_ready(function(steps * problem.dt, y0))
+        return np.asarray(states).reshape(start.shape), int(jnp.sum(made)) // jnp.size(made)
+
+    return Contestant(run, max_drift, seconds)
+
+
+def hand_written_c(problem: Problem, start: np.ndarray) -> dict[str, Contestant]:
+    """Compiled on the spot; nothing where there is no compiler."""
+    compiler = shutil.which(os.environ.get("CC", "cc"))
+    if compiler is None:
+        return {}
+    lanes = 1 if len(start) == 1 else LANES
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "projected_rk4.so"
+        source = HERE / "projected_rk4.c"
+        command = [compiler, *C_FLAGS, "-Wno-psabi", "-shared", "-fPIC", problem.define]
+        command += [f"-DLANES={lanes}", str(source), "-o", str(library), "-lm"]
+        begin = time.perf_counter()
+        subprocess.run(command, check=True)
+        seconds = time.perf_counter() - begin
+        integrate = ctypes.CDLL(str(library)).integrate
+    pointer = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
+    integrate.argtypes = [pointer, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_int]
+    integrate.restype = None
+
+    def contestant(projected: bool) -> Contestant:
+        def run(steps: int) -> tuple[np.ndarray, int]:
+            states = start.copy()
+            integrate(states, len(start), steps, problem.dt, projected)
+            return states, steps
+
+        return Contestant(run, MAX_DRIFT if projected else math.inf, seconds)
+
+    return {"plain, C": contestant(False), "projected, C": contestant(True)}
+
+
+def fixed_step_contestants(
+    problem: Problem, solver: dfx.AbstractSolver, start: np.ndarray
+) -> dict[str, Contestant]:
+    projected = dfc.ManifoldProjection(solver, problem.system.manifold)
+    by_hand = compiled(root_find_by_hand, problem, solver, start, MAX_DRIFT_BY_HAND)
+    contestants = {
+        "plain": compiled(solve, problem, solver, start),
+        "projected": compiled(solve, problem, projected, start, MAX_DRIFT),
+        "root_find by hand": by_hand,
+    }
+    if isinstance(solver, dfc.RK4):
+        contestants |= hand_written_c(problem, start)
+    return contestants
+
+
+def adaptive_contestants(
+    problem: Problem, solver: dfx.AbstractSolver, start: np.ndarray
+) -> dict[str, Contestant]:
+    projected = dfc.ManifoldProjection(solver, problem.system.manifold)
+    return {
+        "plain": compiled(solve, problem, solver, start, adaptive=True),
+        "projected": compiled(solve, problem, projected, start, MAX_DRIFT, adaptive=True),
+    }
+
+
+# ---- Checking and timing ----
+
+
+def check_states(contestants: dict[str, Contestant], steps: int) -> None:
+    """Raises unless the C program computes what we compute."""
+    for name in ("plain", "projected"):
+        if f"{name}, C" in contestants:
+            ours, _ = contestants[name].run(steps)
+            theirs, _ = contestants[f"{name}, C"].run(steps)
+            difference = np.max(np.abs(ours - theirs))
+            if not difference <= MAX_DIFFERENCE:
+                raise AssertionError(f"{name}: C and we differ by {difference:.1e}")
+
+
+def timed(contestant: Contestant, steps: int) -> tuple[float, np.ndarray, int]:
+    begin = time.perf_counter()
+    states, made = contestant.run(steps)
+    return time.perf_counter() - begin, states, made
+
+
+def steps_within(contestant: Contestant, seconds: float) -> int:
+    """How many steps fit into `seconds`."""
+    steps = 1
+    while True:
+        duration = min(timed(contestant, steps)[0] for _ in range(2))
+        if duration > seconds / 4:
+            return max(1, round(steps * seconds / duration))
+        steps *= 4
+
+
+def measure(
+    problem: Problem,
+    contestants: dict[str, Contestant],
+    start: np.ndarray,
+    settings: Settings,
+    horizon: float | None = None,
+) -> dict[str, dict[str, Any]]:
+    """One row per contestant: its best round, with the drift of the states that were timed."""
+    steps = {
+        name: steps_within(c, settings.seconds) if horizon is None else round(horizon / problem.dt)
+        for name, c in contestants.items()
+    }
+    best = {name: (math.inf, start, 1) for name in contestants}
+    for _ in range(settings.rounds):
+        for name, contestant in contestants.items():
+            best[name] = min(best[name], timed(contestant, steps[name]), key=lambda run: run[0])
+    rows = {}
+    for name, (seconds, states, made) in best.items():
+        drift = largest_drift(problem, start, states)
+        if not (drift <= contestants[name].max_drift and np.all(np.isfinite(states))):
+            raise AssertionError(f"{name}: the drift after {made} steps is {drift:.1e}")
+        rows[name] = dict(
+            ns=seconds / made / len(start) * 1e9,
+            seconds=seconds,
+            steps=made,
+            drift=drift,
+            compile_seconds=contestants[name].compile_seconds,
+        )
+    return rows
+
+
+RATIOS = {
+    "projected / plain": ("projected", "plain"),
+    "projected / C": ("projected", "projected, C"),
+    "root_find by hand / projected": ("root_find by hand", "projected"),
+}
+
+
+def table(name: str, problem: Problem, method: str, batch: int, settings: Settings) -> dict:
+    start = initial_states(problem, batch)
+    solver = dfc.RK4() if method == "RK4" else dfx.Tsit5()
+    if method.endswith("adaptive"):
+        contestants = adaptive_contestants(problem, solver, start)
+        rows = measure(problem, contestants, start, settings, settings.horizon)
+    else:
+        contestants = fixed_step_contestants(problem, solver, start)
+        check_states(contestants, settings.check_steps)
+        rows = measure(problem, contestants, start, settings)
+    ratios = {
+        label: rows[a]["ns"] / rows[b]["ns"]
+        for label, (a, b) in RATIOS.items()
+        if a in rows and b in rows
+    }
+    return dict(system=name, method=method, batch=batch, dt=problem.dt, rows=rows, ratios=ratios)
+
+
+# ---- Reporting ----
+
+
+def machine() -> dict[str, Any]:
+    packages = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "diffrax-conserve")
+    return dict(
+        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        cpu=_cpu_model(),
+        cores=os.cpu_count(),
+        device=jax.devices()[0].platform,
+        python=platform.python_version(),
+        versions={name: importlib.metadata.version(name) for name in packages},
+        compiler=_compiler(),
+    )
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((x.split(":")[1].strip() for x in lines if "model name" in x), platform.machine())
+
+
+def _compiler() -> str:
+    compiler = shutil.which(os.environ.get("CC", "cc"))
+    if compiler is None:
+        return "not available: no figures for C"
+    return subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout.split(
+        "\n"
+    )[0]
+
+
+def print_table(result: dict[str, Any]) -> None:
+    print(f"\n{result['system']}, {result['method']}, batch of {result['batch']:,}")
+    columns = f"  {'':18} {'ns/step':>11} {'run (s)':>9} {'steps':>9} {'drift':>9} {'compile (s)':>12}"
+    print(columns)
+    for name, row in result["rows"].items():
+        print(
+            f"  {name:18} {row['ns']:11,.1f} {row['seconds']:9.4f} {row['steps']:9,d} "
+            f"{row['drift']:9.1e} {row['compile_seconds']:12.2f}"
+        )
+    print("  " + "; ".join(f"{label} {ratio:.2f}" for label, ratio in result["ratios"].items()))
+
+
+def arguments(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes, the same code paths")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="tables whose 'SYSTEM METHOD BATCH' holds TEXT"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="JSON (default: benchmarks/results/overhead.json; none for --smoke)"
+    )
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
+    options = arguments(argv)
+    settings = SMOKE if options.smoke else FULL
+    about = machine()
+    print("\n".join(f"{key}: {value}" for key, value in about.items()))
+    print("ns/step: per step and trajectory, float64; best of", settings.rounds, "rounds")
+    jax.jit(lambda x: x + 1).lower(1.0).compile()  # the first compilation also loads the compiler
+    results = []
+    for name, problem in PROBLEMS.items():
+        for method in ("RK4", "Tsit5", "Tsit5 adaptive"):
+            for batch in settings.batches:
+                if options.only in f"{name} {method} {batch}":
+                    results.append(table(name, problem, method, batch, settings))
+                    print_table(results[-1])
+                    sys.stdout.flush()
+    out = options.out or (None if options.smoke else HERE / "results" / "overhead.json")
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(dict(machine=about, tables=results), indent=1) + "\n")
+        print(f"\nwrote {out}")
+    return results
+
+
+if __name__ == "__main__":
+    main()

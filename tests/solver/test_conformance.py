@@ -1,0 +1,159 @@
+"""Every public solver of diffrax, wrapped."""
+
+import inspect
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body
+from .conformance_table import (
+    ADDITIVE,
+    EXPLICIT,
+    IMEX,
+    IMPLICIT,
+    ITO,
+    LANGEVIN,
+    MULTISTEP,
+    SPLIT,
+    STRATONOVICH,
+    TABLE,
+    WRAPPER,
+)
+
+
+def public_solvers():
+    return {
+        name: kind
+        for name, kind in vars(dfx).items()
+        if inspect.isclass(kind)
+        and issubclass(kind, dfx.AbstractSolver)
+        and not name.startswith("Abstract")
+    }
+
+
+def test_the_table_is_complete():
+    assert set(TABLE) == set(public_solvers())
+
+
+SPHERE = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+AXIS = jnp.array([0.0, 0.6, 0.8])
+
+
+def brownian(shape=()):
+    return dfx.VirtualBrownianTree(
+        0.0, 1.0, 1e-3, shape, jr.key(0), levy_area=dfx.SpaceTimeTimeLevyArea
+    )
+
+
+def sde(drift, diffusion):
+    return dfx.MultiTerm(dfx.ODETerm(drift), dfx.ControlTerm(diffusion, brownian()))
+
+
+def spin(t, y, args):
+    return jnp.cross(jnp.array([0.0, 0.0, 1.0]), y)
+
+
+def shake(t, y, args):
+    return 0.3 * jnp.cross(AXIS, y)
+
+
+def spin_ito(t, y, args):
+    """With the drift that keeps the sphere in the sense of Itô."""
+    return spin(t, y, args) + 0.045 * jnp.cross(AXIS, jnp.cross(AXIS, y))
+
+
+def problem(kind):
+    """Terms, initial state and manifold."""
+    if kind in (EXPLICIT, IMPLICIT, MULTISTEP, WRAPPER):
+        return dfx.ODETerm(rigid_body), OMEGA0, RIGID_BODY
+    if kind == IMEX:
+        half = dfx.ODETerm(lambda t, y, args: rigid_body(t, y, args) / 2)
+        return dfx.MultiTerm(half, half), OMEGA0, RIGID_BODY
+    if kind == SPLIT:
+        terms = (dfx.ODETerm(lambda t, p, args: p), dfx.ODETerm(lambda t, q, args: -jnp.sin(q)))
+        energy = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
+        return terms, (jnp.array(1.0), jnp.array(0.5)), energy
+    if kind == ITO:
+        return sde(spin_ito, shake), AXIS[::-1], SPHERE
+    if kind == STRATONOVICH:
+        return sde(spin, shake), AXIS[::-1], SPHERE
+    if kind == ADDITIVE:
+        # Equal noise in both components.
+        terms = sde(
+            lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
+        )
+        difference = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
+        return terms, jnp.array([0.5, 1.0]), difference
+    if kind == LANGEVIN:
+        # A thermal bead on a circle: the position is constrained.
+        y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+        gamma, u = jnp.ones(2), jnp.ones(2)
+        terms = dfx.MultiTerm(
+            dfx.UnderdampedLangevinDriftTerm(gamma, u, lambda x, args: x),
+            dfx.UnderdampedLangevinDiffusionTerm(gamma, u, brownian((2,))),
+        )
+        return terms, y0, dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
+    raise AssertionError(kind)
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_every_solver_stays_on_the_manifold(name):
+    kind = TABLE[name]
+    terms, y0, manifold = problem(kind)
+    inner = dfx.HalfSolver(dfx.Heun()) if kind == WRAPPER else public_solvers()[name]()
+    if kind in (IMPLICIT, IMEX):
+        controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+    else:
+        controller = dfx.ConstantStepSize()
+    sol = dfx.diffeqsolve(
+        terms,
+        dfc.ManifoldProjection(inner, manifold),
+        0.0,
+        1.0,
+        0.01,
+        y0,
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 23)),
+        stepsize_controller=controller,
+    )
+    assert sol.result == dfx.RESULTS.successful
+    assert largest(dfc.drift(sol, manifold)) <= 4e-15
+    moved = jax.tree.map(lambda y, start: jnp.abs(y[-1] - start), sol.ys, y0)
+    assert largest(moved) > 1e-2
+
+
+@pytest.mark.parametrize("name", [n for n, kind in TABLE.items() if kind in (EXPLICIT, MULTISTEP)])
+def test_projection_makes_the_error_no_worse_than_thrice(name):
+    """It is the wrapped method that is projected, not another."""
+    inner = public_solvers()[name]()
+
+    @eqx.filter_jit
+    def error(solver):
+        def final(solver, step):
+            return dfx.diffeqsolve(
+                dfx.ODETerm(rigid_body), solver, 0.0, 1.0, step, OMEGA0, max_steps=2000
+            ).ys[-1]
+
+        return jnp.max(jnp.abs(final(solver, 0.02) - final(dfx.Dopri8(), 0.001)))
+
+    assert error(dfc.ManifoldProjection(inner, RIGID_BODY)) <= 3 * error(inner) + 1e-14
+
+
+def test_ito_and_stratonovich_paths_agree():
+    """Projection leaves the interpretation of the noise alone: on one Brownian path, projected
+    Euler-Maruyama with the Itô drift and projected Heun without it end at the same place."""
+
+    def final(solver, drift):
+        solver = dfc.ManifoldProjection(solver, SPHERE)
+        terms, y0 = sde(drift, shake), AXIS[::-1]
+        return dfx.diffeqsolve(terms, solver, 0.0, 1.0, 2.0**-10, y0).ys[-1]
+
+    ito, stratonovich = final(dfx.Euler(), spin_ito), final(dfx.Heun(), spin)
+    uncorrected = final(dfx.Heun(), spin_ito)
+    assert jnp.max(jnp.abs(ito - stratonovich)) < 5e-3
+    assert jnp.max(jnp.abs(uncorrected - stratonovich)) > 1e-2
