@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 # From M. Okabe and K. Ito's palette, told apart also by those who see fewer colours.
@@ -13,13 +14,15 @@ _COLOURS = {"rk4": "#D55E00", "projected rk4": "#0072B2"}
 _OTHER_COLOURS = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _NAMES = {"rk4": "RK4", "projected rk4": "projected RK4"}
 
+_ROUNDOFF: dict[str, Any] = dict(color="black", linewidth=0.8, linestyle=":", zorder=3)
+
 _EPS = float(np.finfo(np.float64).eps)
 # Where an exact 0 is drawn on a logarithmic axis.
 _FLOOR = _EPS / 10
 # The last steps of each solver are marked on the whole reference: more would cover each other.
 _MARKED_MAX = 100
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.labelsize": 9,
     "axes.titlesize": 9,
@@ -60,14 +63,14 @@ def drift(times: _Curves, drifts: dict[str, _Curves], time_unit: str) -> Figure:
         figure = Figure(figsize=(max(3.5, 2.2 * len(drifts) + 0.4), 2.7), layout="constrained")
         panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
         for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
-            roundoff = ax.axhline(_EPS, color="black", linewidth=0.8, linestyle=":", zorder=3)
+            ax.axhline(_EPS, **_ROUNDOFF)
             curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
             _over_time(ax, times, curves, time_unit)
             ax.set_title(integral)
         panels[0].set_ylabel("relative drift")
         _legend(figure, *panels[0].get_legend_handles_labels())
         note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
-        figure.legend([roundoff], [note], loc="outside lower center")
+        figure.legend([Line2D([], [], **_ROUNDOFF)], [note], loc="outside lower center")
         return figure
 
 
@@ -76,6 +79,7 @@ def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> F
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(3.5, 2.7), layout="constrained")
         ax = figure.subplots()
+        # An error of exactly 0 is drawn at the smallest other.
         smallest = min(
             np.min(values, where=values > 0, initial=np.inf) for values in errors.values()
         )

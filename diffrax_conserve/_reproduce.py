@@ -169,7 +169,7 @@ def _run(system: AbstractSystem, solver: dfx.AbstractSolver, t1: float, dt: floa
 def _timed_run(system: AbstractSystem, solver: dfx.AbstractSolver, t1: float, dt: float) -> Run:
     arguments = (system, solver, jnp.asarray(t1), jnp.asarray(dt), math.ceil(t1 / dt) + 1)
     started = time.perf_counter()
-    compiled = _solve.lower(*arguments).compile()
+    compiled = _solve.lower(*arguments).compile()  # pyright: ignore[reportFunctionMemberAccess]
     compile_seconds = time.perf_counter() - started
     jax.block_until_ready(compiled(*arguments).ys)
     started = time.perf_counter()

@@ -181,7 +181,7 @@ class _Dense(AbstractJacobian):
 
 
 def _least_pivot(m: int, dtype: jnp.dtype) -> float:
-    return 32 * m * float(jnp.finfo(dtype).eps)
+    return 4 * m * float(jnp.finfo(dtype).eps)
 
 
 def _reciprocal(x: Array) -> Array:

@@ -97,7 +97,8 @@ class Newton(AbstractProjection):
 Newton.__init__.__doc__ = r"""**Arguments:**
 
 - `rtol`: how large a residual may remain, relative to the scale of its constraint, which is what
-    roundoff is relative to. Default: four units of roundoff of the dtype.
+    roundoff is relative to. Default: 16 units of roundoff of the dtype.
+    Nearly every projection ends well below it.
 - `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
     less accurate than roundoff.
 - `max_steps`: the largest number of iterations; after that the projection has failed.

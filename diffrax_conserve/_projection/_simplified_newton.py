@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Int, PyTree
 
-from .._custom_types import Y
-from .._tree import tree_add, tree_all_finite, tree_mul
+from .._custom_types import BoolScalarLike, Y
+from .._tree import tree_add, tree_all_finite, tree_mul, tree_scale
 from ._base import (
     AbstractProjection,
     ProjectionInfo,
+    largest_relative,
     positive_weights,
     report,
     tolerances,
@@ -92,7 +93,8 @@ class SimplifiedNewton(AbstractProjection):
 SimplifiedNewton.__init__.__doc__ = r"""**Arguments:**
 
 - `rtol`: how large a residual may remain, relative to the scale of its constraint, which is what
-    roundoff is relative to. Default: four units of roundoff of the dtype.
+    roundoff is relative to. Default: 16 units of roundoff of the dtype.
+    Nearly every projection ends well below it.
 - `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
     less accurate than roundoff.
 - `max_steps`: the largest number of iterations; after that the projection has failed.
@@ -136,19 +138,27 @@ def _solve(
         y = _displaced(jacobian, change, y, weights)
         return y, jtu.tree_map(jnp.add, multiplier, change), residual(y), count + 1
 
-    def judged(carry: _Iterate) -> tuple[Array, Array, _Iterate]:
-        # A loop in a batch evaluates its condition in two places, where it may be rounded in two
-        # ways, and then never ends: so the condition is evaluated once, and carried.
+    # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
+    # and then never ends: so the condition is evaluated once, and carried.
+    def judged(carry: _Iterate, stalled: BoolScalarLike) -> tuple[Array, Array, _Iterate]:
         y, _, g, count = carry
         _, tolerance = scales(y)
         success = within(g, tolerance)
-        return ~success & (count < max_steps) & tree_all_finite(g), success, carry
+        done = success & (within(g, tree_scale(0.25, tolerance)) | stalled)
+        return ~done & (count < max_steps) & tree_all_finite(g), success, carry
+
+    def body(state: tuple[Array, Array, _Iterate]) -> tuple[Array, Array, _Iterate]:
+        _, _, carry = state
+        new = iterate(carry)
+        scale, _ = scales(new[0])
+        stalled = largest_relative(new[2], scale) > 0.5 * largest_relative(carry[2], scale)
+        return judged(new, stalled)
 
     carry = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
     for _ in range(min(INLINE_STEPS, max_steps)):
         carry = iterate(carry)
     _, success, (y, multiplier, after, count) = lax.while_loop(
-        lambda carry: carry[0], lambda carry: judged(iterate(carry[-1])), judged(carry)
+        lambda state: state[0], body, judged(carry, stalled=False)
     )
     scale, _ = scales(y)
     return y, multiplier, report(success, count, candidate, y, before, after, scale)

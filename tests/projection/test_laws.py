@@ -70,7 +70,7 @@ def successful(info):
 def test_success_means_that_the_residual_is_at_roundoff(projection, y):
     projected, info = project(RIGID_BODY, y, projection)
     assert successful(info)
-    assert info.residual_after <= 4 * EPS
+    assert info.residual_after <= 16 * EPS
     # Independently, and relative to the conserved value alone:
     w = np.asarray(projected, np.longdouble)
     inertia = np.array([0.1, 0.2, 0.3])
@@ -241,7 +241,7 @@ def test_single_precision():
     )
     assert y.dtype == jnp.float32
     assert successful(info)
-    assert info.residual_after <= 4 * np.finfo(np.float32).eps
+    assert info.residual_after <= 16 * np.finfo(np.float32).eps
 
 
 def test_mixed_precision_leaves():

@@ -5,11 +5,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body, solve
+from ..problems import KEPLER, OMEGA0, RIGID_BODY, kepler, largest, rigid_body, solve
 
 SYSTEMS = ["rigid-body", "kepler", "point-vortices", "conservative-lorenz", "double-pendulum"]
 SOLVERS = {"rk4": dfc.RK4(), "tsit5": dfx.Tsit5(), "dopri8": dfx.Dopri8(), "euler": dfx.Euler()}
@@ -154,3 +155,48 @@ def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
         frequency * 5
     )
     np.testing.assert_allclose(sol.ys["q"][-1], exact, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "projection", [dfc.SimplifiedNewton(), dfc.Newton()], ids=["simplified", "newton"]
+)
+@pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Dopri8()], ids=["rk4", "dopri8"])
+def test_a_manifold_with_parallel_gradients_everywhere(solver, projection):
+    """On a circular Kepler orbit the energy is the least that the angular momentum allows."""
+    y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+    solver = dfc.ManifoldProjection(solver, KEPLER, projection=projection)
+    sol = solve(
+        kepler, solver, y0, t1=20.0, dt0=0.05, saveat=dfx.SaveAt(ts=jnp.linspace(0, 20, 41))
+    )
+    assert largest(dfc.drift(sol, KEPLER)) <= 4e-15
+    exact = jnp.stack([jnp.cos(sol.ts), jnp.sin(sol.ts)], axis=-1)
+    np.testing.assert_allclose(sol.ys[0], exact, rtol=0, atol=1e-4)
+
+
+def test_at_and_near_a_steady_rotation():
+    """About the middle axis, which is unstable: there all gradients are parallel."""
+    for y0 in ([0.0, 1.5, 0.0], [1e-6, 1.5, 1e-5], [1e-3, 1.5, 0.0]):
+        for projection in (dfc.SimplifiedNewton(), dfc.Newton()):
+            solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY, projection=projection)
+            saveat = dfx.SaveAt(t0=True, steps=True)
+            sol = solve(rigid_body, solver, jnp.array(y0), t1=10.0, dt0=0.01, saveat=saveat)
+            assert largest(dfc.drift(sol, RIGID_BODY)) <= 4e-15
+
+
+def test_lanes_at_the_edge_of_roundoff_end():
+    """The condition of a loop, if it is evaluated twice, can round to both sides: these lanes of
+    damped Newton then never ended."""
+    y = jnp.array(
+        [
+            [0.99952252, 1.05, 0.96807988],
+            [0.97147934, 1.0, 0.96797569],
+            [0.96050583, 1.03526333, 1.03431697],
+            [0.96081344, 1.04361267, 0.96227781],
+            [1.02015507, 0.96404424, 1.00744554],
+            [1.01, 1.0, 0.96601538],
+            [1.001, 0.99999, 0.96288143],
+        ]
+    )
+    value = {name: entry.fn(0, OMEGA0, None) for name, entry in RIGID_BODY.items()}
+    _, info = jax.jit(jax.vmap(lambda y: dfc.project(RIGID_BODY, y, value=value)))(y)
+    assert jnp.all(info.result == optx.RESULTS.successful)
