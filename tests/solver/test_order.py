@@ -65,7 +65,7 @@ ORDERS = [
     (dfc.RK4(), 4, 20),
     (dfx.Tsit5(), 5, 40),
     (dfx.Dopri5(), 5, 20),
-    (dfx.Dopri8(), 8, 6),
+    (dfx.Dopri8(), 8, 12),
 ]
 
 
