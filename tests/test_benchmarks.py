@@ -1,0 +1,56 @@
+"""The benchmark runs, checks what it times, and refuses a wrong answer."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PATH = Path(__file__).parent.parent / "benchmarks" / "overhead.py"
+
+
+@pytest.fixture(scope="module")
+def overhead():
+    spec = importlib.util.spec_from_file_location("overhead", PATH)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_smoke_run_measures_verified_answers(overhead, tmp_path, capsys):
+    out = tmp_path / "overhead.json"
+    tables = overhead.main(["--smoke", "--only", "rigid-body RK4 8", "--out", str(out)])
+    assert len(tables) == 1
+    rows = tables[0]["rows"]
+    assert {"plain", "projected", "root_find by hand"} <= rows.keys()
+    assert all(row["ns"] > 0 and row["compile_seconds"] > 0 for row in rows.values())
+    assert rows["projected"]["drift"] <= overhead.MAX_DRIFT < rows["plain"]["drift"]
+    assert json.loads(out.read_text())["tables"] == json.loads(json.dumps(tables))
+    assert "rigid-body, RK4, batch of 8" in capsys.readouterr().out
+
+
+def test_an_answer_that_drifts_is_refused(overhead):
+    problem = overhead.PROBLEMS["rigid-body"]
+    start = overhead.initial_states(problem, 1)
+    wrong = overhead.Contestant(lambda steps: (1.001 * start, steps), overhead.MAX_DRIFT)
+    with pytest.raises(AssertionError, match="drift"):
+        overhead.measure(problem, {"projected": wrong}, start, overhead.SMOKE, horizon=0.1)
+
+
+def test_an_answer_that_is_not_a_number_is_refused(overhead):
+    problem = overhead.PROBLEMS["rigid-body"]
+    start = overhead.initial_states(problem, 1)
+    wrong = overhead.Contestant(lambda steps: (np.nan * start, steps), np.inf)
+    with pytest.raises(AssertionError, match="drift"):
+        overhead.measure(problem, {"plain": wrong}, start, overhead.SMOKE, horizon=0.1)
+
+
+def test_another_answer_from_c_is_refused(overhead):
+    start = overhead.initial_states(overhead.PROBLEMS["rigid-body"], 1)
+    ours = overhead.Contestant(lambda steps: (start, steps), np.inf)
+    theirs = overhead.Contestant(lambda steps: (start + 1e-9, steps), np.inf)
+    with pytest.raises(AssertionError, match="C and we differ"):
+        overhead.check_states({"plain": ours, "plain, C": theirs}, 1)
