@@ -48,8 +48,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     The projected method has the order of the wrapped one. A wrapped solver that reuses its last
     stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the one at the
     candidate. To evaluate it again at the projected state costs one evaluation more a step, and did
-    not pay: on five systems at tolerance 1e-8 the errors were the same to within 20 %, and at 1e-5 to
-    within a factor of 2.3, some larger and some smaller (`benchmarks/first_same_as_last.py`).
+    not pay: on five systems the errors were the same to within 20 % at tolerance 1e-8, and to
+    within a factor of 2.3 at 1e-5, some larger, some smaller (`benchmarks/first_same_as_last.py`).
 
     An initial state that violates a `Constraint` is refused at run time; see
     [`diffrax_conserve.project`][].
