@@ -5,12 +5,30 @@ from ._check import check_invariance as check_invariance
 from ._diagnostics import drift as drift
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
+from ._network import PINN as PINN
+from ._network import ConservativeLayer as ConservativeLayer
+from ._network import DeepONet as DeepONet
 from ._projection import AbstractProjection as AbstractProjection
 from ._projection import Newton as Newton
 from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
 from ._projection import project as project
 from ._solver import RK4 as RK4
+from ._solver import DeepONetSolver as DeepONetSolver
 from ._solver import ManifoldProjection as ManifoldProjection
+from ._solver import PINNSolver as PINNSolver
+from ._training import FitLog as FitLog
+from ._training import Recipe as Recipe
+from ._training import bounded as bounded
+from ._training import constant_weight as constant_weight
+from ._training import every_iteration as every_iteration
+from ._training import fit as fit
+from ._training import grid_times as grid_times
+from ._training import linear_weight as linear_weight
+from ._training import mean_square as mean_square
+from ._training import paper as paper
+from ._training import ramped_weight as ramped_weight
+from ._training import staged_iterations as staged_iterations
+from ._training import uniform_times as uniform_times
 
 __version__ = "0.1.0"

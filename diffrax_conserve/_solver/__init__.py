@@ -1,2 +1,4 @@
+from ._deeponet import DeepONetSolver as DeepONetSolver
 from ._manifold_projection import ManifoldProjection as ManifoldProjection
+from ._pinn import PINNSolver as PINNSolver
 from ._rk4 import RK4 as RK4

@@ -1,0 +1,149 @@
+"""A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
+
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._custom_types import RealScalarLike, Y
+from .._tree import working_dtype
+from ._flat import as_state, flatten, unflatten
+from ._layer import ConservativeLayer
+from ._mlp import MLP, Activation, check_sizes
+
+
+@final
+class DeepONet(eqx.Module):
+    r"""A network for the flow map of an autonomous system, $(u_0, h) \mapsto u(h)$.
+
+    $$u(h) = u_0 + \frac{h}{\Delta} S G(u_0)(h), \qquad
+    G_j(u_0)(h) = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0) \, \tau_{jl}(h),$$
+
+    with a branch network $b$ and a trunk network $\tau$, both fully connected, and steps $h$ up to
+    $\Delta$ = `max_step`; $u(0) = u_0$ whatever the weights. Longer times are made of several
+    steps. With a `layer`, the output is moved to the manifold of the values at $u_0$.
+
+    Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        keys = jax.random.split(jax.random.key(0), 100)
+        states = jax.vmap(system.sample)(keys)
+        deeponet = dfc.DeepONet(states, 0.25, key=jax.random.key(1))
+        deeponet(system.y0, 0.1)
+        ```
+
+    ??? cite "Reference"
+
+        L. Lu, P. Jin, G. Pang, Z. Zhang and G. E. Karniadakis, Nature Machine Intelligence 3
+        (2021); S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023) for the flow map.
+    """
+
+    branch: MLP
+    trunk: MLP
+    layer: ConservativeLayer | None
+    max_step: float = eqx.field(static=True)
+    shift: Float[Array, " n"]
+    scale: Float[Array, " n"]
+    normalise: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        states: Y,
+        max_step: RealScalarLike,
+        *,
+        key: PRNGKeyArray,
+        width: int = 40,
+        depth: int = 4,
+        latent: int = 20,
+        activation: str | Activation = "tanh",
+        normalise: bool = True,
+        layer: ConservativeLayer | None = None,
+    ):
+        check_sizes(width=width, depth=depth, latent=latent)
+        if not max_step > 0:
+            raise ValueError(f"`max_step` must be positive, but is {max_step}.")
+        vectors = _vectors(states)
+        dtype, n = vectors.dtype, vectors.shape[1]
+        branch_key, trunk_key = jr.split(key)
+        self.branch = MLP(n, n * latent, width, depth, activation, dtype, key=branch_key)
+        self.trunk = MLP(1, n * latent, width, depth, activation, dtype, key=trunk_key)
+        self.layer = layer
+        self.max_step = float(max_step)
+        self.normalise = normalise
+        if normalise:
+            deviation = jnp.std(vectors, axis=0)
+            self.shift = jnp.mean(vectors, axis=0)
+            self.scale = jnp.where(deviation > 0, deviation, 1)
+        else:
+            self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
+
+    def __call__(self, y0: Y, h: RealScalarLike) -> Y:
+        """The state a time `h` after the state `y0`."""
+        candidate = self.candidate(y0, h)
+        if self.layer is None:
+            return candidate
+        y0 = jtu.tree_map(jnp.asarray, y0)
+        return self.layer(candidate, self.layer.values(0.0, y0), h, self.radius())
+
+    def candidate(self, y0: Y, h: RealScalarLike) -> Y:
+        """The same before the conservative layer."""
+        start = flatten(y0).astype(self.scale.dtype)
+        if start.shape != self.scale.shape:
+            raise ValueError(
+                f"This `DeepONet` is for states of {self.scale.size} numbers, but was given one of "
+                f"{start.size}."
+            )
+        h = jnp.asarray(h).astype(self.scale.dtype)
+        fraction = h / self.max_step
+        inputs = (start - self.shift) / self.scale
+        b = self.branch(inputs).reshape(self.scale.size, -1)
+        tau = self.trunk((2 * fraction - 1 if self.normalise else h)[None])
+        products = jnp.sum(b * tau.reshape(b.shape), axis=1) / b.shape[1] ** 0.5
+        return unflatten(start + fraction * self.scale * products, y0)
+
+    def radius(self) -> Float[Array, ""]:
+        """How far the conservative layer may move a state in one iteration."""
+        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
+
+
+DeepONet.__init__.__doc__ = r"""**Arguments:**
+
+- `states`: initial states as they will occur, stacked along a leading axis: any PyTree of real
+    arrays. Their structure is that of the states to come, their mean and their standard deviation
+    normalise the inputs.
+- `max_step`: the longest step $\Delta$.
+- `key`: a random key, for the initial weights.
+- `width`, `depth`: units in each hidden layer, and hidden layers, of both networks.
+- `latent`: the number $L$ of products in each component.
+- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function (which
+    [`diffrax_conserve.save`][] cannot write).
+- `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
+    `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
+- `layer`: a [`diffrax_conserve.ConservativeLayer`][].
+
+**Raises:**
+
+`ValueError` or `TypeError` if a size, the step or the states are not what they must be.
+"""
+
+
+def _vectors(states: Y) -> Float[Array, "samples n"]:
+    states = as_state(states)
+    lengths = {jnp.shape(x)[:1] for x in jtu.tree_leaves(states)}
+    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
+        raise ValueError(
+            "`states` must be at least one state, stacked along a leading axis, but its leaves have "
+            f"shapes {[jnp.shape(x) for x in jtu.tree_leaves(states)]}. For a single state write "
+            "`jax.tree.map(lambda x: x[None], y0)`."
+        )
+    return jax.vmap(flatten)(states).astype(working_dtype(states))

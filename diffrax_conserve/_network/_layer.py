@@ -1,0 +1,213 @@
+"""The conservative layer: a few iterations towards the manifold, as the last layer of a network."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, Int
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import check_manifold, conserved_values, evaluate
+from .._projection._jacobian import UNROLLED_MAX, Residual, Vector, linearise
+from .._tree import tree_add, tree_dot, tree_scale, tree_sub, working_dtype
+from ._mlp import check_sizes
+
+
+@final
+class ConservativeLayer(eqx.Module):
+    r"""Moves the output of a network towards the manifold, by `steps` iterations.
+
+    For the output $\hat y$, with the constraint Jacobian $G$ and the residual $g$, the result is
+    $y = \hat y + G(\hat y)^\top \lambda$, where the multipliers start at zero and are improved by
+
+    $$\lambda \leftarrow \lambda - (G(y) G(\hat y)^\top + \mu I)^{-1} g(y).$$
+
+    That is Newton's method in $\lambda$, with rows scaled to norm one and a damping
+    $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale; an iteration
+    never moves a state further than `radius`, since near a point where $G$ vanishes it would go
+    arbitrarily far.
+
+    The layer is part of the network: a derivative of the network, with respect to time as well as
+    to its weights, is one through the layer. It follows from the implicit function theorem for
+    $g(y) = \text{what is left of it}$, so that nothing is unrolled.
+
+    The iterations are few: the output is near the manifold, and on it to roundoff only where the
+    network itself is close. To be exactly on it, wrap the solver in
+    [`diffrax_conserve.ManifoldProjection`][].
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+        import jax.numpy as jnp
+
+        energy = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        layer = dfc.ConservativeLayer(energy, steps=5)
+        pinn = dfc.PINN(jnp.array([1.0, 0.0]), 0.0, 3.0, layer=layer, key=jax.random.key(0))
+        pinn(2.0)
+        ```
+
+    ??? cite "Reference"
+
+        E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1, which freezes $G(y)$ at
+        $\hat y$ too and does not damp; that needs an output which is close already.
+    """
+
+    manifold: Manifold
+    args: Args
+    steps: int = eqx.field(static=True)
+
+    def __init__(self, manifold: Manifold, *, steps: int = 3, args: Args = None):
+        self.manifold = manifold
+        self.steps = steps
+        self.args = args
+
+    def __check_init__(self):
+        check_manifold(self.manifold)
+        check_sizes(steps=self.steps)
+
+    def values(self, t0: RealScalarLike, y0: Y) -> Values:
+        """The conserved values of the solution through `y0`."""
+        return conserved_values(self.manifold, t0, y0, self.args)
+
+    def __call__(
+        self,
+        candidate: Y,
+        values: Values,
+        t: RealScalarLike,
+        radius: Float[Array, ""],
+        schedule: tuple[Int[Array, ""], Float[Array, ""]] | None = None,
+    ) -> Y:
+        """The state after all iterations; or `(1 - s) P_{p-1} y + s P_p y` for `schedule = (p, s)`,
+        where `P_k y` is the state after `k` iterations.
+
+        The numbers `p` and `s` may be traced, so that a training with any schedule compiles once.
+        Iterations beyond the `p`-th are not computed.
+        """
+        dtype = working_dtype(candidate)
+
+        def residual(y: Y) -> Vector:
+            out = evaluate(self.manifold, t, y, self.args)
+            return _vector(jtu.tree_map(lambda a, b: a - b.astype(a.dtype), out, values), dtype)
+
+        # Whatever the functions close over becomes part of `residual`'s PyTree.
+        residual = eqx.filter_closure_convert(residual, candidate)
+        magnitude = _vector(jtu.tree_map(jnp.abs, values), dtype)
+        if schedule is None:
+            schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
+        p, s = schedule
+        fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
+        multipliers = _multipliers(residual, candidate, fixed, steps=self.steps)
+        return _displaced(residual, candidate, multipliers)
+
+
+ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
+
+- `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+- `steps`: the number $P$ of iterations.
+- `args`: passed to the functions of the manifold.
+
+**Raises:**
+
+`TypeError` or `ValueError` if `manifold` or `steps` is not what it must be.
+"""
+
+# The magnitude of the conserved values, the radius, p and s.
+_Fixed = tuple[Vector, Array, Array, Array]
+
+
+def _displaced(residual: Residual, candidate: Y, multipliers: Vector) -> Y:
+    """`ŷ + G(ŷ)ᵀ λ`, by one reverse pass for all constraints."""
+    _, vjp = eqx.filter_vjp(residual, candidate)
+    (direction,) = vjp(multipliers)
+    return tree_add(candidate, direction)
+
+
+@eqx.filter_custom_jvp
+def _multipliers(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) -> Vector:
+    """`(1 - s) λ_{p-1} + s λ_p`."""
+    magnitude, radius, p, s = fixed
+    before, at_candidate = linearise(residual, candidate)
+    weights = jtu.tree_map(jnp.ones_like, candidate)
+    dtype = working_dtype(candidate)
+
+    def improve(multipliers: Vector) -> Vector:
+        y = tree_add(candidate, at_candidate.pullback(multipliers))
+        g, at_y = linearise(residual, y)
+        scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
+        damping = jnp.minimum(1e-2, _relative_square(g, scale)).astype(dtype)
+        change = at_y.gram_solver(weights, at_candidate, damping)(g)
+        step = at_candidate.pullback(change)
+        shortening = lax.rsqrt(1 + tree_dot(step, step, dtype) / jnp.square(radius))
+        return tree_sub(multipliers, tree_scale(shortening, change))
+
+    def iterate(carry: tuple[Vector, Vector], i: Array) -> tuple[tuple[Vector, Vector], None]:
+        return lax.cond(i < p, lambda c: (c[1], improve(c[1])), lambda c: c, carry), None
+
+    zeros = jtu.tree_map(jnp.zeros_like, before)
+    (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
+    return jtu.tree_map(lambda a, b: a + s * (b - a), previous, last)
+
+
+@_multipliers.def_jvp
+def _multipliers_jvp(primals, tangents, *, steps):
+    """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = what is left of it`.
+
+    With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
+    `λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`. Where the first iteration is not complete (`p = 0`, or `p = 1` with
+    `s < 1`) the multipliers are `s` times those of a complete one, and so is their tangent.
+
+    The linear solve is differentiated implicitly too: a second derivative, which every loss with a
+    time derivative needs, then costs products with `G`, not derivatives of its rows.
+    """
+    residual, candidate, fixed = primals
+    t_residual, t_candidate, _ = tangents
+    multipliers = _multipliers(residual, candidate, fixed, steps=steps)
+
+    def displaced(residual: Residual, candidate: Y) -> tuple[Y, Vector]:
+        y = _displaced(residual, candidate, multipliers)
+        return y, residual(y)
+
+    (y, _), (_, t_g) = eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
+    _, at_candidate = linearise(*_stop_gradient((residual, candidate)))
+    _, at_y = linearise(*_stop_gradient((residual, y)))
+    weights = jtu.tree_map(jnp.ones_like, candidate)
+
+    def product(multipliers: Vector) -> Vector:
+        _, vjp = eqx.filter_vjp(residual, candidate)
+        (direction,) = vjp(multipliers)
+        return jax.jvp(residual, (y,), (direction,))[1]
+
+    t_multipliers = lax.custom_linear_solve(
+        product,
+        t_g,
+        solve=lambda _, b: at_y.gram_solver(weights, at_candidate)(b),
+        transpose_solve=lambda _, b: at_candidate.gram_solver(weights, at_y)(b),
+    )
+    _, _, p, s = fixed
+    share = jnp.where(p == 0, 0, jnp.where(p == 1, s, 1))
+    return multipliers, jtu.tree_map(lambda x: -share * x, t_multipliers)
+
+
+def _stop_gradient(tree: Any) -> Any:
+    return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def _relative_square(g: Vector, scale: Vector) -> Array:
+    def square(a: Array, b: Array) -> Array:
+        positive = b > 0
+        return jnp.sum(jnp.square(jnp.where(positive, a / jnp.where(positive, b, 1), a)))
+
+    return sum(jtu.tree_leaves(jtu.tree_map(square, g, scale)))  # pyright: ignore
+
+
+def _vector(tree: Any, dtype: jnp.dtype) -> Vector:
+    """The constraints as the linear solves want them: few as scalars, many as one array."""
+    leaves = [x.astype(dtype) for x in jtu.tree_leaves(tree)]
+    if sum(x.size for x in leaves) > UNROLLED_MAX:
+        return jnp.concatenate([x.reshape(-1) for x in leaves])
+    return tuple(x.reshape(-1)[i] if x.ndim else x for x in leaves for i in range(x.size))

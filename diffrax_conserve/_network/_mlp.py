@@ -1,0 +1,83 @@
+"""Fully connected networks."""
+
+from collections.abc import Callable
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Activation = Callable[[Array], Array]
+
+# By name, so that a file can say which one a network uses.
+ACTIVATIONS: dict[str, Activation] = {
+    "tanh": jnp.tanh,
+    "sin": jnp.sin,
+    "gelu": jax.nn.gelu,
+    "silu": jax.nn.silu,
+    "softplus": jax.nn.softplus,
+    "sigmoid": jax.nn.sigmoid,
+}
+
+
+def find_activation(activation: str | Activation) -> Activation:
+    """The function itself, or the one that has this name."""
+    if callable(activation):
+        return activation
+    if activation not in ACTIVATIONS:
+        raise ValueError(
+            f"`activation` is {activation!r}, which is neither a function nor one of the names "
+            f"{', '.join(map(repr, ACTIVATIONS))}."
+        )
+    return ACTIVATIONS[activation]
+
+
+def activation_name(activation: Activation) -> str | None:
+    """The name of a known activation function, else `None`."""
+    names = [name for name, known in ACTIVATIONS.items() if known is activation]
+    return names[0] if names else None
+
+
+@final
+class MLP(eqx.Module):
+    """`depth` hidden layers of `width` units between `in_size` inputs and `out_size` outputs."""
+
+    weights: tuple[Float[Array, "..."], ...]
+    biases: tuple[Float[Array, "..."], ...]
+    activation: Activation = eqx.field(static=True)
+
+    def __init__(
+        self,
+        in_size: int,
+        out_size: int,
+        width: int,
+        depth: int,
+        activation: str | Activation,
+        dtype: jnp.dtype,
+        *,
+        key: PRNGKeyArray,
+    ):
+        sizes = [in_size, *([width] * depth), out_size]
+        keys = jr.split(key, len(sizes) - 1)
+        # Glorot and Bengio's initialisation, the usual one for tanh.
+        initialise = jax.nn.initializers.glorot_normal()
+        shapes = zip(sizes[:-1], sizes[1:], strict=True)
+        self.weights = tuple(initialise(k, s, dtype) for k, s in zip(keys, shapes, strict=True))
+        self.biases = tuple(jnp.zeros(size, dtype) for size in sizes[1:])
+        self.activation = find_activation(activation)
+
+    def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
+        *hidden, last = zip(self.weights, self.biases, strict=True)
+        for weight, bias in hidden:
+            x = self.activation(x @ weight + bias)
+        weight, bias = last
+        return x @ weight + bias
+
+
+def check_sizes(**sizes: int) -> None:
+    """Raises unless every size is a positive integer."""
+    for name, size in sizes.items():
+        if not isinstance(size, int) or size < 1:
+            raise ValueError(f"`{name}` must be a positive integer, but is {size!r}.")

@@ -1,0 +1,74 @@
+"""Dense output for solvers that can be evaluated anywhere within a step."""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, final
+
+import diffrax as dfx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._custom_types import RealScalarLike, Y
+from .._tree import tree_sub
+
+
+@final
+class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
+    """The polynomial through the states at the Chebyshev points of a step, as a Chebyshev series.
+
+    A series, not the barycentric formula: it has no division by zero at the points, so its time
+    derivative exists everywhere, as the root finder of an event needs it.
+    """
+
+    t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    coefficients: PyTree[Array]  # each leaf with a leading axis
+
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> PyTree[Array]:
+        if t1 is not None:
+            return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
+        length = self.t1 - self.t0
+        # A step of length zero, as at the padding of a solution, has one state.
+        nonzero = length != 0
+        x = jnp.where(nonzero, 2 * (t0 - self.t0) / jnp.where(nonzero, length, 1) - 1, -1)
+        return jtu.tree_map(lambda c: _clenshaw(c, x.astype(c.dtype)), self.coefficients)
+
+
+def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array]:
+    """The coefficients for `states`, a function of the fraction of the step."""
+    fractions, matrix = _nodes(count)
+    values = jax.vmap(states)(jnp.asarray(fractions, dtype))
+    return jtu.tree_map(
+        lambda v: jnp.tensordot(
+            jnp.asarray(matrix, v.dtype), v, axes=1, precision=lax.Precision.HIGHEST
+        ),
+        values,
+    )
+
+
+@ft.cache
+def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The Chebyshev points of the second kind on [0, 1], and the matrix that maps values there to
+    the coefficients of the interpolating Chebyshev series."""
+    n = count - 1
+    index = np.arange(count)
+    fractions = np.sin(np.pi * index / (2 * n)) ** 2  # (1 - cos(pi k / n)) / 2
+    # T_j at -cos(pi k / n); the sums of a type-I discrete cosine transform have halved ends.
+    cosines = np.cos(np.pi * np.outer(index, n - index) / n)
+    halves = np.where((index == 0) | (index == n), 0.5, 1.0)
+    return fractions, 2 / n * halves[:, None] * cosines * halves[None, :]
+
+
+def _clenshaw(coefficients: Array, x: Array) -> Array:
+    """`Σ_j c_j T_j(x)`."""
+    zero = jnp.zeros_like(coefficients[0])
+    b1, b2 = zero, zero
+    for c in coefficients[:0:-1]:
+        b1, b2 = c + 2 * x * b1 - b2, b1
+    return coefficients[0] + x * b1 - b2

@@ -1,0 +1,13 @@
+from ._fit import FitLog as FitLog
+from ._fit import fit as fit
+from ._loss import bounded as bounded
+from ._loss import mean_square as mean_square
+from ._recipe import Recipe as Recipe
+from ._recipe import paper as paper
+from ._sampling import grid_times as grid_times
+from ._sampling import uniform_times as uniform_times
+from ._schedule import constant_weight as constant_weight
+from ._schedule import every_iteration as every_iteration
+from ._schedule import linear_weight as linear_weight
+from ._schedule import ramped_weight as ramped_weight
+from ._schedule import staged_iterations as staged_iterations
