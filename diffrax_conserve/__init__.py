@@ -13,6 +13,11 @@ from ._projection import Newton as Newton
 from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
 from ._projection import project as project
+from ._serialisation import load as load
+from ._serialisation import load_pretrained as load_pretrained
+from ._serialisation import pretrained_path as pretrained_path
+from ._serialisation import read_info as read_info
+from ._serialisation import save as save
 from ._solver import RK4 as RK4
 from ._solver import DeepONetSolver as DeepONetSolver
 from ._solver import ManifoldProjection as ManifoldProjection

@@ -31,7 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     dt = system.dt if options.dt is None else options.dt
     out = Path("out", options.name) if options.out is None else options.out
     try:
-        ok = _reproduce.reproduce(system, out, t1=t1, dt=dt)
+        ok = _reproduce.reproduce(
+            system, out, t1=t1, dt=dt, anew=options.train, seed=options.seed, epochs=options.epochs
+        )
     except _reproduce.SetupError as error:
         parser.error(str(error))
     return 0 if ok else 1
@@ -52,9 +54,10 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("list", help="list the systems by name")
     reproduce = commands.add_parser(
         "reproduce",
-        help="compare RK4 with projected RK4 on one system",
-        description="Integrates a system with RK4 and with projected RK4, prints a table of errors "
-        "and drifts, and writes figures and metrics.json.",
+        help="compare solvers on one system: RK4 and learned ones, with and without projection",
+        description="Integrates a system with RK4 and with projected RK4, and the paper's five "
+        "systems with learned solvers too; prints a table of errors and drifts, and writes figures "
+        "and metrics.json.",
     )
     reproduce.add_argument("name", metavar="NAME", help="a system, as `list` names it")
     reproduce.add_argument(
@@ -62,7 +65,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     reproduce.add_argument("--t1", type=_positive, metavar="T", help="final time; the first is 0")
     reproduce.add_argument("--dt", type=_positive, metavar="H", help="length of a step")
+    reproduce.add_argument(
+        "--train", action="store_true", help="train the networks anew, for some minutes"
+    )
+    reproduce.add_argument("--seed", type=int, default=0, metavar="N", help="seed of --train")
+    reproduce.add_argument(
+        "--epochs", type=_count, default=5000, metavar="N", help="epochs of --train"
+    )
     return parser
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a positive whole number, but is {text!r}")
+    return int(text)
 
 
 def _positive(text: str) -> float:

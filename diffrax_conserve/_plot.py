@@ -10,8 +10,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 # From M. Okabe and K. Ito's palette, told apart also by those who see fewer colours.
-_COLOURS = {"rk4": "#D55E00", "projected rk4": "#0072B2"}
-_OTHER_COLOURS = ("#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_COLOURS = {
+    "rk4": "#D55E00",
+    "projected rk4": "#0072B2",
+    "standard": "#CC79A7",
+    "conservative": "#009E73",
+    "standard projected": "#E69F00",
+}
+_OTHER_COLOURS = ("#56B4E9", "#999999", "#F0E442")
 _NAMES = {"rk4": "RK4", "projected rk4": "projected RK4"}
 
 _ROUNDOFF: dict[str, Any] = dict(color="black", linewidth=0.8, linestyle=":", zorder=3)
@@ -87,6 +93,22 @@ def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> F
         curves = {name: np.maximum(values, floor) for name, values in errors.items()}
         _over_time(ax, times, curves, time_unit)
         ax.set_ylabel(_label("state error", unit))
+        _legend(figure, *ax.get_legend_handles_labels())
+        return figure
+
+
+def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """The training loss against the epoch, one curve for each network."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(3.5, 2.7), layout="constrained")
+        ax = figure.subplots()
+        for name, (epochs, losses) in curves.items():
+            ax.plot(epochs, losses, label=_NAMES.get(name, name), color=_colour(name, curves))
+        ax.set_yscale("log")
+        ax.yaxis.set_minor_formatter(NullFormatter())
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+        ax.set_xlabel("epoch")
+        ax.set_ylabel("training loss")
         _legend(figure, *ax.get_legend_handles_labels())
         return figure
 

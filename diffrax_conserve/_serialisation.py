@@ -1,0 +1,371 @@
+"""Networks in files: a line that names the format, a JSON header, and the arrays. No pickle.
+
+    diffrax-conserve network <version of the format> <SHA-256 of all that follows>
+    {"kind": "DeepONet", "config": {...}, "arrays": [{"shape": ..., "dtype": ...}, ...], ...}
+    <the arrays, little-endian, one after the other, compressed by zlib>
+"""
+
+import hashlib
+import json
+import math
+import os
+import zlib
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+
+from . import systems
+from ._files import replace_file
+from ._manifold import is_entry
+from ._network import PINN, ConservativeLayer, DeepONet, activation_name
+from .systems import AbstractSystem
+
+_MAGIC = b"diffrax-conserve network"
+_VERSION = 1
+_SUFFIX = ".network"
+
+_PathLike = str | os.PathLike[str]
+
+
+def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None = None) -> None:
+    """Writes a network with its configuration into one file.
+
+    The file is replaced as a whole: whoever reads it sees the old one or the new one.
+
+    **Arguments:**
+
+    - `path`: where to write.
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. Of a conservative layer
+        whose manifold is that of a system of the catalogue, the system is written; other manifolds are
+        functions, which no file can hold: give the layer again to [`diffrax_conserve.load`][].
+    - `info`: what else to note, such as the system, the sampling domain, the recipe and the measured
+        errors: anything that JSON can express. [`diffrax_conserve.read_info`][] reads it.
+
+    **Raises:**
+
+    `TypeError` or `ValueError` if `model` is another kind of network, has an activation function
+    without a name, a state of custom PyTree nodes, or `info` is not expressible in JSON.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+        import jax.numpy as jnp
+
+        pinn = dfc.PINN(jnp.array([1.0, 0.0]), 0.0, 3.0, key=jax.random.key(0))
+        dfc.save("pinn.network", pinn, info={"made by": "an example"})
+        assert dfc.load("pinn.network")(2.0)[0] == pinn(2.0)[0]
+        ```
+    """
+    header = {**_describe(model), "versions": _versions(), "info": info or {}}
+    arrays = [np.asarray(x) for x in _arrays(model)]
+    header["arrays"] = [{"shape": list(x.shape), "dtype": x.dtype.name} for x in arrays]
+    try:
+        text = json.dumps(header, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`info` must hold only what JSON can express, but {error}. Convert arrays by "
+            "`.tolist()`, and leave NaN and infinity out."
+        ) from error
+    raw = b"".join(x.astype(x.dtype.newbyteorder("<")).tobytes() for x in arrays)
+    rest = text + b"\n" + zlib.compress(raw, 9)
+    first = b"%s %d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
+    replace_file(Path(path), lambda temporary: temporary.write_bytes(first + rest))
+
+
+def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | DeepONet:
+    """Reads a network that [`diffrax_conserve.save`][] wrote.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `layer`: the conservative layer, where the file cannot hold it: see [`diffrax_conserve.save`][].
+
+    **Returns:**
+
+    The network, in the precision of the file; in float32 if `jax_enable_x64` is off.
+
+    **Raises:**
+
+    `ValueError` if the file is not one of ours, is truncated or damaged, was written by a newer version,
+    or needs a `layer`; `OSError` if it cannot be read.
+    """
+    header, raw = _read(Path(path))
+    arrays = _split(header["arrays"], raw)
+    model = _skeleton(header)
+    own, static = eqx.partition(model, eqx.is_array)
+    leaves, treedef = jtu.tree_flatten(own)
+    count = len(leaves)
+    model = eqx.combine(jtu.tree_unflatten(treedef, arrays[:count]), static)
+    found = header["layer"]
+    if found is None:
+        if layer is not None:
+            raise ValueError(f"The network in {path} has no conservative layer: leave `layer` out.")
+        return model
+    if layer is None:
+        if found["system"] is None:
+            raise ValueError(
+                f"The network in {path} has a conservative layer, whose functions no file can hold. "
+                f"Give it again: `load(path, layer=ConservativeLayer(manifold, "
+                f"steps={found['steps']}))`."
+            )
+        system = systems.get(found["system"])
+        treedef = jtu.tree_structure(system)
+        system = jtu.tree_unflatten(treedef, arrays[count:])
+        layer = ConservativeLayer(system.manifold, steps=found["steps"])
+    return eqx.tree_at(lambda m: m.layer, model, layer, is_leaf=lambda x: x is None)
+
+
+def read_info(path: _PathLike) -> dict[str, Any]:
+    """What a file says about its network, without building it.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Returns:**
+
+    A dictionary: `kind` and `config` of the network, its `layer`, the `versions` that wrote it, and the
+    `info` that was given to [`diffrax_conserve.save`][].
+
+    **Raises:**
+
+    As [`diffrax_conserve.load`][].
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        found = dfc.read_info(dfc.pretrained_path("rigid-body-conservative"))
+        print(found["info"]["command"])
+        ```
+    """
+    header, _ = _read(Path(path))
+    return header
+
+
+def pretrained_path(name: str) -> Path:
+    """The file of a network that comes with the package.
+
+    **Arguments:**
+
+    - `name`: as of [`diffrax_conserve.load_pretrained`][].
+
+    **Raises:**
+
+    `ValueError` for an unknown name, naming those that there are.
+    """
+    folder = Path(str(resources.files(__package__))) / "pretrained"
+    path = folder / f"{name}{_SUFFIX}"
+    if not path.is_file():
+        known = sorted(file.stem for file in folder.glob(f"*{_SUFFIX}"))
+        raise ValueError(
+            f"There is no pretrained network called {name!r}. There are: {', '.join(known)}."
+        )
+    return path
+
+
+def load_pretrained(name: str) -> PINN | DeepONet:
+    """A network that comes with the package, trained by the paper's recipe.
+
+    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`, the
+    latter with a conservative layer. [`diffrax_conserve.read_info`][] tells the command that made it
+    and its measured errors.
+
+    **Arguments:**
+
+    - `name`: such as `"rigid-body-conservative"`.
+
+    **Raises:**
+
+    `ValueError` for an unknown name, naming those that there are.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        pinn = dfc.load_pretrained("rigid-body-conservative")
+        pinn(1.0)
+        ```
+    """
+    return load(pretrained_path(name))
+
+
+# ---- The header ----
+
+
+def _describe(model: PINN | DeepONet) -> dict[str, Any]:
+    if isinstance(model, PINN):
+        net = model.net
+        config = {
+            "t0": model.t0,
+            "t1": model.t1,
+            "state": _describe_state(model.y0),
+            "width": net.weights[0].shape[1],
+        }
+    elif isinstance(model, DeepONet):
+        net = model.branch
+        config = {
+            "max_step": model.max_step,
+            "unknowns": model.scale.size,
+            "width": net.weights[0].shape[1],
+            "latent": net.weights[-1].shape[1] // model.scale.size,
+        }
+    else:
+        raise TypeError(
+            f"`save` writes a `PINN` or a `DeepONet`, but was given a {type(model).__name__}. For "
+            "other Modules use `equinox.tree_serialise_leaves`."
+        )
+    activation = activation_name(net.activation)
+    if activation is None:
+        raise ValueError(
+            "The activation function of this network has no name that a file could hold. Build the "
+            'network with a named one, for example `activation="tanh"`.'
+        )
+    depth = len(net.weights) - 1
+    config |= {"depth": depth, "activation": activation, "normalise": model.normalise}
+    return {"kind": type(model).__name__, "config": config, "layer": _describe_layer(model.layer)}
+
+
+def _describe_layer(layer: ConservativeLayer | None) -> dict[str, Any] | None:
+    if layer is None:
+        return None
+    system = _system_of(layer)
+    return {"steps": layer.steps, "system": None if system is None else system.name}
+
+
+def _system_of(layer: ConservativeLayer) -> AbstractSystem | None:
+    """The system of the catalogue whose manifold the layer has."""
+    entries = jtu.tree_leaves(layer.manifold, is_leaf=is_entry)
+    owner = getattr(entries[0].fn, "__self__", None)
+    if not isinstance(owner, AbstractSystem) or layer.args is not None:
+        return None
+    same = eqx.tree_equal(layer.manifold, owner.manifold)
+    # Only what `systems.get` builds again.
+    known = owner.name in systems.names() and type(systems.get(owner.name)) is type(owner)
+    return owner if known and bool(same) else None
+
+
+def _describe_state(y: Any) -> Any:
+    match y:
+        case None:
+            return None
+        case dict() if all(isinstance(key, str) for key in y):
+            return {"dict": {key: _describe_state(value) for key, value in y.items()}}
+        case list():
+            return {"list": [_describe_state(value) for value in y]}
+        case tuple() if type(y) is tuple:
+            return {"tuple": [_describe_state(value) for value in y]}
+        case jax.Array():
+            return {"shape": list(y.shape), "dtype": y.dtype.name}
+    raise TypeError(
+        f"The state holds a {type(y).__name__}, which a file cannot describe. Use tuples, lists and "
+        "dictionaries with strings as keys."
+    )
+
+
+def _build_state(description: Any) -> Any:
+    match description:
+        case None:
+            return None
+        case {"dict": items}:
+            return {key: _build_state(value) for key, value in items.items()}
+        case {"list": items}:
+            return [_build_state(value) for value in items]
+        case {"tuple": items}:
+            return tuple(_build_state(value) for value in items)
+    dtype = jax.dtypes.canonicalize_dtype(description["dtype"])
+    return jnp.zeros(description["shape"], dtype)
+
+
+def _skeleton(header: dict[str, Any]) -> PINN | DeepONet:
+    """A network of the right shape, with other weights."""
+    config = dict(header["config"])
+    key = jr.key(0)
+    if header["kind"] == "PINN":
+        y0, t0, t1 = _build_state(config.pop("state")), config.pop("t0"), config.pop("t1")
+        return PINN(y0, t0, t1, key=key, **config)
+    if header["kind"] == "DeepONet":
+        states = jnp.zeros((1, config.pop("unknowns")))
+        return DeepONet(states, config.pop("max_step"), key=key, **config)
+    raise ValueError(f"The file holds a network of the unknown kind {header['kind']!r}.")
+
+
+def _versions() -> dict[str, str]:
+    return {name: _version(name) for name in ("diffrax-conserve", "diffrax", "equinox", "jax")}
+
+
+def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(name)
+    except PackageNotFoundError:  # imported from a folder that is not installed
+        return "unknown"
+
+
+# ---- The arrays ----
+
+
+def _arrays(model: PINN | DeepONet) -> list[Any]:
+    """Those of the network itself, then the parameters of the system of its layer."""
+    plain = eqx.tree_at(lambda m: m.layer, model, None, is_leaf=lambda x: x is None)
+    system = None if model.layer is None else _system_of(model.layer)
+    return [*jtu.tree_leaves(eqx.filter(plain, eqx.is_array)), *jtu.tree_leaves(system)]
+
+
+class _Entry(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _split(entries: list[dict[str, Any]], raw: bytes) -> list[jax.Array]:
+    arrays, start = [], 0
+    for item in entries:
+        entry = _Entry(tuple(item["shape"]), np.dtype(item["dtype"]).newbyteorder("<"))
+        piece = raw[start : start + entry.size]
+        arrays.append(jnp.asarray(np.frombuffer(piece, entry.dtype).reshape(entry.shape)))
+        start += entry.size
+    return arrays
+
+
+# ---- The file ----
+
+
+def _read(path: Path) -> tuple[dict[str, Any], bytes]:
+    content = path.read_bytes()
+    first, _, rest = content.partition(b"\n")
+    words = first[len(_MAGIC) :].split()
+    if not content.startswith(_MAGIC + b" ") or len(words) != 2 or not words[0].isdigit():
+        if content and (_MAGIC + b" ").startswith(content[: len(_MAGIC) + 1]):
+            raise ValueError(f"The file {path} is truncated: it ends in its first line.")
+        raise ValueError(
+            f"The file {path} does not hold a network that `diffrax_conserve.save` wrote."
+        )
+    version, digest = int(words[0]), words[1].decode(errors="replace")
+    if version > _VERSION:
+        raise ValueError(
+            f"The file {path} was written by a newer version of diffrax-conserve: its format is "
+            f"{version}, and this version reads up to {_VERSION}. Upgrade diffrax-conserve."
+        )
+    if hashlib.sha256(rest).hexdigest() != digest:
+        raise ValueError(
+            f"The file {path} is truncated or damaged: its contents do not match its checksum. Copy "
+            "or train it again."
+        )
+    text, _, compressed = rest.partition(b"\n")
+    return json.loads(text), zlib.decompress(compressed)
