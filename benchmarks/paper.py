@@ -54,8 +54,10 @@ def rollout(system, solver, y0s, ts):
 
 
 def judge(system, network, t1=None):
-    """The errors of a network, plain and projected, over the paper's horizon: medians over the initial
-    states."""
+    """The errors of a network, plain and projected, over the paper's horizon.
+
+    Medians over the initial states.
+    """
     y0s = _reproduce.initial_states(system)
     t1 = system.t1 if t1 is None else t1
     ts = jnp.arange(round(t1 / system.dt) + 1) * system.dt

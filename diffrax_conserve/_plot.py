@@ -176,7 +176,8 @@ def _draw_paths(
     for i, (name, path) in enumerate(paths.items()):
         # Large rings round small dots: one solver cannot hide another.
         last = path[-_MARKED_MAX - 1 :].T[:dimension]
-        ring = dict(markersize=4.5, markerfacecolor="none") if i == 0 else dict(markersize=2.2)
+        ring = dict(markersize=4.5, markerfacecolor="none")
+        dots = dict(markersize=max(2.6 - 0.4 * i, 0.8)) if len(paths) > 2 else dict(markersize=2.2)
         ax.plot(
             *last,
             linestyle="none",
@@ -184,7 +185,7 @@ def _draw_paths(
             label=_NAMES.get(name, name),
             color=_colour(name, paths),
             zorder=2 + 0.1 * i,
-            **ring,
+            **(ring if i == 0 else dots),
         )
     for axis, text in zip("xyz", axis_labels, strict=False):
         getattr(ax, f"set_{axis}label")(text)
@@ -229,7 +230,8 @@ def _label(quantity: str, unit: str) -> str:
 
 
 def _legend(figure: Figure, handles: list[Any], labels: list[str]) -> None:
-    figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    columns = 2 if len(labels) > 3 and figure.get_figwidth() < 4 else 3
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns)
 
 
 def _colour(name: str, names: dict[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """Networks in files: a line that names the format, a JSON header, and the arrays. No pickle.
 
-    diffrax-conserve network <version of the format> <SHA-256 of all that follows>
-    {"kind": "DeepONet", "config": {...}, "arrays": [{"shape": ..., "dtype": ...}, ...], ...}
-    <the arrays, little-endian, one after the other, compressed by zlib>
+diffrax-conserve network <version of the format> <SHA-256 of all that follows>
+{"kind": "DeepONet", "config": {...}, "arrays": [{"shape": ..., "dtype": ...}, ...], ...}
+<the arrays, little-endian, one after the other, compressed by zlib>
 """
 
 import hashlib
@@ -42,11 +42,12 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
     **Arguments:**
 
     - `path`: where to write.
-    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. Of a conservative layer
-        whose manifold is that of a system of the catalogue, the system is written; other manifolds are
-        functions, which no file can hold: give the layer again to [`diffrax_conserve.load`][].
-    - `info`: what else to note, such as the system, the sampling domain, the recipe and the measured
-        errors: anything that JSON can express. [`diffrax_conserve.read_info`][] reads it.
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. Of a conservative
+        layer whose manifold is that of a system of the catalogue, the system is written; other
+        manifolds are functions, which no file can hold: give the layer again to
+        [`diffrax_conserve.load`][].
+    - `info`: what else to note, such as the system, the sampling domain, the recipe and the
+        measured errors: anything that JSON can express. [`diffrax_conserve.read_info`][] reads it.
 
     **Raises:**
 
@@ -87,7 +88,8 @@ def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | D
     **Arguments:**
 
     - `path`: the file.
-    - `layer`: the conservative layer, where the file cannot hold it: see [`diffrax_conserve.save`][].
+    - `layer`: the conservative layer, where the file cannot hold it: see
+        [`diffrax_conserve.save`][].
 
     **Returns:**
 
@@ -95,8 +97,8 @@ def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | D
 
     **Raises:**
 
-    `ValueError` if the file is not one of ours, is truncated or damaged, was written by a newer version,
-    or needs a `layer`; `OSError` if it cannot be read.
+    `ValueError` if the file is not one of ours, is truncated or damaged, was written by a newer
+    version, or needs a `layer`; `OSError` if it cannot be read.
     """
     header, raw = _read(Path(path))
     arrays = _split(header["arrays"], raw)
@@ -113,8 +115,8 @@ def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | D
     if layer is None:
         if found["system"] is None:
             raise ValueError(
-                f"The network in {path} has a conservative layer, whose functions no file can hold. "
-                f"Give it again: `load(path, layer=ConservativeLayer(manifold, "
+                f"The network in {path} has a conservative layer, whose functions no file can "
+                f"hold. Give it again: `load(path, layer=ConservativeLayer(manifold, "
                 f"steps={found['steps']}))`."
             )
         system = systems.get(found["system"])
@@ -133,8 +135,8 @@ def read_info(path: _PathLike) -> dict[str, Any]:
 
     **Returns:**
 
-    A dictionary: `kind` and `config` of the network, its `layer`, the `versions` that wrote it, and the
-    `info` that was given to [`diffrax_conserve.save`][].
+    A dictionary: `kind` and `config` of the network, its `layer`, the `versions` that wrote it, and
+    the `info` that was given to [`diffrax_conserve.save`][].
 
     **Raises:**
 
@@ -164,7 +166,7 @@ def pretrained_path(name: str) -> Path:
 
     `ValueError` for an unknown name, naming those that there are.
     """
-    folder = Path(str(resources.files(__package__))) / "pretrained"
+    folder = Path(str(resources.files("diffrax_conserve"))) / "pretrained"
     path = folder / f"{name}{_SUFFIX}"
     if not path.is_file():
         known = sorted(file.stem for file in folder.glob(f"*{_SUFFIX}"))
@@ -178,8 +180,8 @@ def load_pretrained(name: str) -> PINN | DeepONet:
     """A network that comes with the package, trained by the paper's recipe.
 
     For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`, the
-    latter with a conservative layer. [`diffrax_conserve.read_info`][] tells the command that made it
-    and its measured errors.
+    latter with a conservative layer. [`diffrax_conserve.read_info`][] tells the command that made
+    it and its measured errors.
 
     **Arguments:**
 
@@ -269,8 +271,8 @@ def _describe_state(y: Any) -> Any:
         case jax.Array():
             return {"shape": list(y.shape), "dtype": y.dtype.name}
     raise TypeError(
-        f"The state holds a {type(y).__name__}, which a file cannot describe. Use tuples, lists and "
-        "dictionaries with strings as keys."
+        f"The state holds a {type(y).__name__}, which a file cannot describe. Use tuples, lists "
+        "and dictionaries with strings as keys."
     )
 
 
@@ -364,8 +366,8 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes]:
         )
     if hashlib.sha256(rest).hexdigest() != digest:
         raise ValueError(
-            f"The file {path} is truncated or damaged: its contents do not match its checksum. Copy "
-            "or train it again."
+            f"The file {path} is truncated or damaged: its contents do not match its checksum. "
+            "Copy or train it again."
         )
     text, _, compressed = rest.partition(b"\n")
     return json.loads(text), zlib.decompress(compressed)

@@ -26,9 +26,10 @@ _INTERPOLATION = _PROJECTION | {"_interpolation"}
 _NETWORK = _PROJECTION | {"_network"}
 _SOLVER = _INTERPOLATION | {"_network", "_solver"}
 _CORE = _SOLVER | {"_diagnostics"}
-_LEARNED = _CORE | {"_training", "_serialisation"}
+_LEARNED = _CORE | {"_files", "_training", "_serialisation"}
 MAY_IMPORT = {
     "_custom_types": set(),
+    "_files": set(),
     "_tree": _TYPES,
     "_manifold": _TREE,
     "_check": _MANIFOLD,
@@ -38,7 +39,7 @@ MAY_IMPORT = {
     "_solver": _INTERPOLATION | {"_network"},
     "_diagnostics": _SOLVER,
     "_training": _CORE,
-    "_serialisation": _CORE,
+    "_serialisation": _CORE | {"_files", "systems"},
     "_plot": _TYPES,
     "systems": _CORE,
     "testing": _CORE | {"systems", "_check"},

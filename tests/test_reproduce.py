@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve import _reproduce
 from diffrax_conserve.__main__ import main
+from diffrax_conserve._files import replace_file
+from diffrax_conserve._reproduce import _compare, _job
 
 FIGURES = ("trajectory", "drift", "state_error")
+LEARNED = ("standard", "conservative", "standard projected")
 
 
 def reproduce(tmp_path, *arguments, out="out"):
@@ -69,7 +71,7 @@ def test_metrics_of_the_harmonic_oscillator(tmp_path):
     }
     assert status == 0
     assert metrics["system"] == "harmonic-oscillator"
-    assert list(metrics["solvers"]) == list(runs)
+    assert list(metrics["solvers"]) == [*runs, *LEARNED]
     for name, ys in runs.items():
         row = metrics["solvers"][name]
         errors = [np.linalg.norm(y - rotation(k * h) @ y0) for k, y in enumerate(ys)]
@@ -107,7 +109,7 @@ def test_metrics_of_keplers_problem(tmp_path):
 def test_the_largest_drift_is_over_every_step_however_few_are_plotted(tmp_path, monkeypatch):
     arguments = ("kepler", "--t1", "7", "--dt", "0.1")
     _, all_plotted = reproduce(tmp_path, *arguments, out="a")
-    monkeypatch.setattr(_reproduce, "_PLOTTED_MAX", 3)
+    monkeypatch.setattr(_compare, "PLOTTED_MAX", 3)
     _, few_plotted = reproduce(tmp_path, *arguments, out="b")
     for name, row in few_plotted["solvers"].items():
         assert row["drift"] == all_plotted["solvers"][name]["drift"]
@@ -126,9 +128,10 @@ def test_a_last_step_that_is_shorter(tmp_path):
 
 
 def test_files_and_nothing_else(tmp_path, capsys):
-    reproduce(tmp_path, "rigid-body", "--t1", "0.2")
+    reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
     files = list((tmp_path / "out").iterdir())
-    figures = {f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf")}
+    names = (*FIGURES, "loss")
+    figures = {f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")}
     assert {f.name for f in files} == {*figures, "metrics.json"}
     assert all(f.stat().st_size > 100 for f in files)
     printed = capsys.readouterr().out
@@ -145,7 +148,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _reproduce._write(path, half)
+        replace_file(path, half)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -255,10 +258,10 @@ def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys
 
 
 def test_a_solver_that_cannot_start(tmp_path, capsys, monkeypatch):
-    def solvers(system):
+    def solvers(system, networks):
         return {"rk4": dfc.RK4(), "leapfrog": dfx.SemiImplicitEuler()}
 
-    monkeypatch.setattr(_reproduce, "solvers", solvers)
+    monkeypatch.setattr(_job, "solvers", solvers)
     status, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1")
     assert status == 1
     assert "failure" in metrics["solvers"]["leapfrog"]

@@ -125,8 +125,8 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: units in each hidden layer, and hidden layers, of both networks.
 - `latent`: the number $L$ of products in each component.
-- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function (which
-    [`diffrax_conserve.save`][] cannot write).
+- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
+    (which [`diffrax_conserve.save`][] cannot write).
 - `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
     `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
 - `layer`: a [`diffrax_conserve.ConservativeLayer`][].
@@ -142,8 +142,8 @@ def _vectors(states: Y) -> Float[Array, "samples n"]:
     lengths = {jnp.shape(x)[:1] for x in jtu.tree_leaves(states)}
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(
-            "`states` must be at least one state, stacked along a leading axis, but its leaves have "
-            f"shapes {[jnp.shape(x) for x in jtu.tree_leaves(states)]}. For a single state write "
+            "`states` must be at least one state, stacked along a leading axis, but its leaves "
+            f"have shapes {[jnp.shape(x) for x in jtu.tree_leaves(states)]}. For a single state write "
             "`jax.tree.map(lambda x: x[None], y0)`."
         )
     return jax.vmap(flatten)(states).astype(working_dtype(states))

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Y
 from .._tree import working_dtype
@@ -40,6 +40,10 @@ def as_state(y: Y) -> Y:
                 f"The state has a leaf of dtype {jnp.result_type(leaf)}, but a network needs real "
                 "states. Split a complex leaf into its real and its imaginary part."
             )
-    # Whole numbers given for floating-point states become that; strong types compile once.
-    return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, jnp.float32)
-                        if jnp.issubdtype(jnp.result_type(x), jnp.floating) else float), y)
+    return jtu.tree_map(_floating, y)
+
+
+def _floating(leaf: ArrayLike) -> Array:
+    """`leaf` as an array of a definite floating-point type."""
+    dtype = jnp.result_type(leaf)
+    return jnp.asarray(leaf, dtype if jnp.issubdtype(dtype, jnp.floating) else float)

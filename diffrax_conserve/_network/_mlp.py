@@ -1,5 +1,6 @@
 """Fully connected networks."""
 
+import itertools
 from collections.abc import Callable
 from typing import final
 
@@ -63,7 +64,7 @@ class MLP(eqx.Module):
         keys = jr.split(key, len(sizes) - 1)
         # Glorot and Bengio's initialisation, the usual one for tanh.
         initialise = jax.nn.initializers.glorot_normal()
-        shapes = zip(sizes[:-1], sizes[1:], strict=True)
+        shapes = itertools.pairwise(sizes)
         self.weights = tuple(initialise(k, s, dtype) for k, s in zip(keys, shapes, strict=True))
         self.biases = tuple(jnp.zeros(size, dtype) for size in sizes[1:])
         self.activation = find_activation(activation)

@@ -101,8 +101,8 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `t0`, `t1`: the interval of time.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: units in each hidden layer, and hidden layers.
-- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function (which
-    [`diffrax_conserve.save`][] cannot write).
+- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
+    (which [`diffrax_conserve.save`][] cannot write).
 - `normalise`: whether $N$ sees time scaled to $[-1, 1]$ and $S$ holds the largest component of each
     leaf of $u_0$. Otherwise $N$ sees $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.ConservativeLayer`][].

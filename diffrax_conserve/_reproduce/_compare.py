@@ -48,7 +48,8 @@ def compare(system: AbstractSystem, y0s: Any, runs: dict[str, Run]) -> Compariso
         at_times = jtu.tree_map(lambda a, b: np.concatenate([a, b]), at_times, others)
     errors = {
         name: _distance(
-            jtu.tree_map(lambda y: y[:, thinned(y.shape[1], stride)], run.ys), at_times  # noqa: B023
+            jtu.tree_map(lambda y: y[:, thinned(y.shape[1], stride)], run.ys),
+            at_times,
         )
         for name, run in succeeded.items()
     }
@@ -68,9 +69,7 @@ def _reference(system: AbstractSystem, times: np.ndarray, y0s: Any) -> Any:
     """The reference through each of `y0s`, with a leading axis; None where there are none."""
     if jtu.tree_leaves(y0s)[0].shape[0] == 0:
         return None
-    return jtu.tree_map(
-        np.asarray, eqx.filter_vmap(lambda y0: system.reference(times, y0))(y0s)
-    )
+    return jtu.tree_map(np.asarray, eqx.filter_vmap(lambda y0: system.reference(times, y0))(y0s))
 
 
 def _distance(ys: Any, reference: Any) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The learned solvers of the paper's five systems: trained anew, or as they come with the package."""
+"""The learned solvers of the paper's five systems, trained anew or as the package has them."""
 
 import dataclasses
 from typing import Any
@@ -73,13 +73,13 @@ def pretrained(system: AbstractSystem) -> dict[str, Learned]:
     for kind in KINDS:
         path = pretrained_path(f"{system.name}-{kind}")
         history = read_info(path)["info"]["history"]
-        found[kind] = Learned(
-            load(path), np.array(history["epochs"]), np.array(history["losses"])
-        )
+        found[kind] = Learned(load(path), np.array(history["epochs"]), np.array(history["losses"]))
     return found
 
 
-def build(system: AbstractSystem, kind: str, net_key: PRNGKeyArray, states_key: PRNGKeyArray) -> Any:
+def build(
+    system: AbstractSystem, kind: str, net_key: PRNGKeyArray, states_key: PRNGKeyArray
+) -> Any:
     """An untrained network of the paper's size."""
     layer = None
     if kind == "conservative":

@@ -29,8 +29,8 @@ drift: the largest over all steps of |I(t, y) - I(t0, y0)|, relative to the scal
 run, compile: wall time of the second run of the compiled solve, and of its compilation."""
 
 _MANY = """\
-State errors are medians over {states} initial states, drifts the largest over all of them; the picture
-of the trajectory is that of the first one."""
+State errors are medians over {states} initial states, drifts the largest over all of them; the
+    picture of the trajectory is that of the first one."""
 
 
 def json_text(numbers: dict[str, Any]) -> str:
@@ -145,9 +145,7 @@ def figures(
     times = {name: run.ts[index[name]][1:] / time_scale for name, run in succeeded.items()}
     drifts = {
         integral: {
-            name: np.maximum.reduceat(
-                np.max(run.drift[integral], axis=0)[1:], index[name][:-1]
-            )
+            name: np.maximum.reduceat(np.max(run.drift[integral], axis=0)[1:], index[name][:-1])
             for name, run in succeeded.items()
         }
         for integral in system.manifold
@@ -155,9 +153,7 @@ def figures(
     out["trajectory"] = plot.trajectory(paths, reference, system.axes)
     out["drift"] = plot.drift(times, drifts, time_unit)
     if comparison.errors:
-        errors = {
-            name: np.median(values, axis=0)[1:] for name, values in comparison.errors.items()
-        }
+        errors = {name: np.median(values, axis=0)[1:] for name, values in comparison.errors.items()}
         out["state_error"] = plot.state_error(times, errors, time_unit, error_unit)
     return out
 

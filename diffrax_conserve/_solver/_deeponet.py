@@ -29,9 +29,9 @@ class FlowMap(Protocol):
 class DeepONetSolver(dfx.AbstractSolver[None]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
-    The vector field in the term is not evaluated: it is what the flow map was trained for. Steps may
-    have any length up to `flow_map.max_step`; a longer one, or a solve backwards in time, is refused
-    at run time. There is no error estimate, so use fixed steps
+    The vector field in the term is not evaluated: it is what the flow map was trained for. Steps
+    may have any length up to `flow_map.max_step`; a longer one, or a solve backwards in time, is
+    refused at run time. There is no error estimate, so use fixed steps
     ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
     Dense output follows the flow map inside the step: it is the polynomial through its states at
@@ -123,14 +123,14 @@ class DeepONetSolver(dfx.AbstractSolver[None]):
 
 DeepONetSolver.__init__.__doc__ = r"""**Arguments:**
 
-- `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that is called as `(y0, h) -> y` and has an
-    attribute `max_step`.
+- `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that is called as `(y0, h) -> y` and
+    has an attribute `max_step`.
 - `nodes`: how many states of a step dense output goes through.
 
 **Raises:**
 
-`TypeError` or `ValueError` if the flow map cannot be called so, or returns another structure than the
-state's; at run time an error that names the length of a step that is too long or negative.
+`TypeError` or `ValueError` if the flow map cannot be called so, or returns another structure than
+the state's; at run time an error that names the length of a step that is too long or negative.
 """
 
 

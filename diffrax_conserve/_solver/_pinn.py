@@ -29,8 +29,8 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
     fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
     Dense output follows the network inside the step: it is the polynomial through its states at
-    `nodes` Chebyshev points, which are computed only where dense output, saved times or an event ask
-    for them. The weights are not copied.
+    `nodes` Chebyshev points, which are computed only where dense output, saved times or an event
+    ask for them. The weights are not copied.
 
     The result does not depend on `y0`, which can only be the one it was trained for: the derivative
     with respect to it is zero.
@@ -96,9 +96,9 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
         distance, scale = _distance(y0, self.pinn(time), dtype)
         wrong = ~(distance <= jnp.sqrt(jnp.finfo(dtype).eps) * scale)
         template = (
-            "`y0` differs by {:.3g} from the state that the PINN has at the initial time. A PINN is "
-            "one solution: start with `y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or use "
-            "a `DeepONet`."
+            "`y0` differs by {:.3g} from the state that the PINN has at the initial time. A PINN "
+            "is one solution: start with `y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or "
+            "use a `DeepONet`."
         )
         interval = jnp.array([self.pinn.t0, self.pinn.t1], time.dtype)
         return interval + refuse_if(jnp.zeros_like(time), wrong, distance, template)
@@ -136,8 +136,8 @@ PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if `pinn` is not one, or has another structure than the state; at run time an
-error that names the time outside the interval, or how far `y0` is from the network's.
+`TypeError` or `ValueError` if `pinn` is not one, or has another structure than the state; at run
+time an error that names the time outside the interval, or how far `y0` is from the network's.
 """
 
 

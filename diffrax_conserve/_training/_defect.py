@@ -26,9 +26,7 @@ class Points(NamedTuple):
     y0s: Any  # with a leading axis; None for a PINN
 
 
-def draw(
-    model: Any, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray
-) -> Points:
+def draw(model: Any, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
     """`count` random points for `model`."""
     times_key, states_key = jr.split(key)
     if isinstance(model, PINN):

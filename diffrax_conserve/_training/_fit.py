@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, final
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
@@ -42,9 +41,9 @@ class FitLog(eqx.Module):
     **Attributes:**
 
     - `losses`: the training loss at each epoch, before its update.
-    - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and what
-        was compared: the loss on the first collocation points with all iterations of the conservative
-        layer, so that epochs with different iterations are comparable.
+    - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
+        what was compared: the loss on the first collocation points with all iterations of the
+        conservative layer, so that epochs with different iterations are comparable.
     - `best_epoch`, `best`: the epoch of the model that was returned, and its criterion.
     - `skipped`: how many updates were not finite. Each of them was replaced by a return to the best
         model so far, with a new state of the optimiser.
@@ -123,9 +122,10 @@ def fit(
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone: no solution is needed.
 
-    Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output of
-    the network, the time derivative by forward-mode automatic differentiation. For a network with a
-    conservative layer $u$ is the output after as many iterations as the recipe's schedule says.
+    Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output
+    of the network, the time derivative by forward-mode automatic differentiation. For a network
+    with a conservative layer $u$ is the output after as many iterations as the recipe's schedule
+    says.
 
     An update that is not finite is not made. The model that is returned is the best that was seen,
     not the last.
@@ -139,8 +139,9 @@ def fit(
     - `sample`: for a flow map, a function from a random key to an initial state.
     - `args`: passed to `vector_field`.
     - `recipe`: a [`diffrax_conserve.Recipe`][]. Default: [`diffrax_conserve.paper`][]`(model)`.
-    - `progress`: whether to print a line on standard error, or a function that is called now and then
-        with the number of epochs done, that of all epochs, the last loss and the best criterion.
+    - `progress`: whether to print a line on standard error, or a function that is called now and
+        then with the number of epochs done, that of all epochs, the last loss and the best
+        criterion.
 
     **Returns:**
 
@@ -206,8 +207,8 @@ def _check(model: eqx.Module, sample: Sampler | None) -> None:
         return
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
-            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a Module "
-            "`(y0, h) -> y` with an attribute `max_step`, the longest step."
+            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
+            "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
         )
     if sample is None:
         raise ValueError(
@@ -232,9 +233,7 @@ def _start(
         clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
         optimiser = optax.chain(clip, optimiser)
     typical = typical_square(model, vector_field, args, points)
-    problem = _Problem(
-        static, vector_field, args, sample, recipe, optimiser, points, typical, key
-    )
+    problem = _Problem(static, vector_field, args, sample, recipe, optimiser, points, typical, key)
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     carry = _Carry(
         weights=weights,
@@ -252,8 +251,10 @@ def _start(
 def _advance(
     problem: _Problem, carry: _Carry, start: Int[Array, ""], stop: Int[Array, ""]
 ) -> tuple[_Carry, Float[Array, ""]]:
-    """The epochs from `start` up to `stop`, and a comparison with the best model so far. Both may be
-    traced, so that all rounds share one compilation."""
+    """The epochs from `start` up to `stop`, and a comparison with the best model so far.
+
+    Both may be traced, so that all rounds share one compilation.
+    """
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(problem, carry, e), carry)
     criterion = problem.criterion(carry.weights)
     better = criterion < carry.best

@@ -53,12 +53,12 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `epochs`: the number of updates; each uses all collocation points.
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][].
-- `iterations`, `weight`: the projection schedule, for a network with a conservative layer: functions of
-    the epoch (traced), the number of epochs and the number of iterations in the layer, that return
-    $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its
-    output after $k$ iterations. Defaults: `staged_iterations` and `ramped_weight`.
-- `loss`: from the squared norm of the defect at each point, and the median of $|f|^2$ over the initial
-    states, to the loss: `mean_square`, `bounded()`, or a function of your own.
+- `iterations`, `weight`: the projection schedule, for a network with a conservative layer:
+    functions of the epoch (traced), the number of epochs and the number of iterations in the layer,
+    that return $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where
+    $P_k u$ is its output after $k$ iterations. Defaults: `staged_iterations` and `ramped_weight`.
+- `loss`: from the squared norm of the defect at each point, and the median of $|f|^2$ over the
+    initial states, to the loss: `mean_square`, `bounded()`, or a function of your own.
 - `times`: how times are drawn: `uniform_times`, `grid_times`, or a function of your own.
 - `refresh`: after how many epochs new points are drawn. Default: never.
 - `max_gradient_norm`: longer gradients are scaled to this norm. `None` for no limit.

@@ -17,9 +17,7 @@ def uniform_times(
     return jr.uniform(key, (count,), minval=first, maxval=last)
 
 
-def grid_times(
-    key: PRNGKeyArray, count: int, first: float, last: float
-) -> Float[Array, " points"]:
+def grid_times(key: PRNGKeyArray, count: int, first: float, last: float) -> Float[Array, " points"]:
     """Equally spaced times from `first` to `last`."""
     del key
     return jnp.linspace(first, last, count)
