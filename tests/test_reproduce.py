@@ -16,6 +16,7 @@ from diffrax_conserve._files import replace_file
 from diffrax_conserve._reproduce import _compare, _job
 
 FIGURES = ("trajectory", "drift", "state_error")
+PAPER = dfc.systems.names()[:5]
 LEARNED = ("standard", "conservative", "standard projected")
 
 
@@ -119,7 +120,7 @@ def test_the_largest_drift_is_over_every_step_however_few_are_plotted(tmp_path, 
 
 
 def test_a_last_step_that_is_shorter(tmp_path):
-    _, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1.1", "--dt", "0.25")
+    _, metrics = reproduce(tmp_path, "henon-heiles", "--t1", "1.1", "--dt", "0.25")
     assert metrics["solvers"]["rk4"]["steps"] == 5
     assert metrics["solvers"]["projected rk4"]["state_error"] < 1e-4
 
@@ -128,7 +129,9 @@ def test_a_last_step_that_is_shorter(tmp_path):
 
 
 def test_files_and_nothing_else(tmp_path, capsys):
-    reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
+    _, metrics = reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
+    assert max(metrics["solvers"]["conservative"]["drift"].values()) < 1e-14
+    assert metrics["solvers"]["conservative"]["state_error"] < 1e-3
     files = list((tmp_path / "out").iterdir())
     names = (*FIGURES, "loss")
     figures = {f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")}
@@ -155,8 +158,8 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
 
 def test_the_folder_of_the_system_is_the_default(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["reproduce", "harmonic-oscillator", "--t1", "0.5"]) == 0
-    assert (tmp_path / "out" / "harmonic-oscillator" / "metrics.json").exists()
+    assert main(["reproduce", "lotka-volterra", "--t1", "0.5"]) == 0
+    assert (tmp_path / "out" / "lotka-volterra" / "metrics.json").exists()
 
 
 def test_list_names_every_system(capsys):
@@ -165,8 +168,8 @@ def test_list_names_every_system(capsys):
     assert [line.split()[0] for line in lines] == list(dfc.systems.names())
 
 
-# The systems that the rest of the catalogue resembles; the rest is slow only by its number.
-QUICK = dfc.systems.names()[:7]
+# A learned flow map and a classical system; the rest is slow only by its number.
+QUICK = ("conservative-lorenz", "kepler")
 
 
 @pytest.mark.parametrize(
@@ -177,11 +180,13 @@ def test_every_system(name, tmp_path):
     system = dfc.systems.get(name)
     status, metrics = reproduce(tmp_path, name, "--t1", str(3 * system.dt))
     assert status == 0
+    assert set(metrics["solvers"]) == {"rk4", "projected rk4", *(LEARNED if name in PAPER else ())}
     for row in metrics["solvers"].values():
         assert row["steps"] == 3
         assert row["drift"].keys() == system.manifold.keys()
         assert np.isfinite(row["state_error"])
-    assert max(metrics["solvers"]["projected rk4"]["drift"].values()) < 4e-15
+    for solver in {"projected rk4", "conservative", "standard projected"} & set(metrics["solvers"]):
+        assert max(metrics["solvers"][solver]["drift"].values()) < 1e-14
 
 
 # ---- What it refuses ----
@@ -262,11 +267,39 @@ def test_a_solver_that_cannot_start(tmp_path, capsys, monkeypatch):
         return {"rk4": dfc.RK4(), "leapfrog": dfx.SemiImplicitEuler()}
 
     monkeypatch.setattr(_job, "solvers", solvers)
-    status, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1")
+    status, metrics = reproduce(tmp_path, "henon-heiles", "--t1", "1")
     assert status == 1
     assert "failure" in metrics["solvers"]["leapfrog"]
     assert metrics["solvers"]["rk4"]["state_error"] > 0
     assert "leapfrog FAILED at the start" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_step_longer_than_the_flow_map_was_trained_for(tmp_path, capsys):
+    status, metrics = reproduce(
+        tmp_path, "conservative-lorenz", "--dt", "0.5", "--t1", "1", out="long"
+    )
+    assert status == 1
+    assert metrics["solvers"]["rk4"]["state_error"] > 0
+    for name in LEARNED:
+        assert metrics["solvers"][name]["state_error"] is None
+        assert "0.5 " in metrics["solvers"][name]["failure"]
+        assert "0.25" in metrics["solvers"][name]["failure"]
+
+
+@pytest.mark.slow
+def test_training_anew(tmp_path, capsys):
+    arguments = ("rigid-body", "--train", "--epochs", "3", "--seed", "1", "--t1", "0.1")
+    status, metrics = reproduce(tmp_path, *arguments)
+    assert status == 0
+    assert "Training the conservative network: 3 epochs, seed 1" in capsys.readouterr().out
+    for kind in ("standard", "conservative"):
+        file = tmp_path / "out" / f"{kind}.network"
+        assert dfc.read_info(file)["info"]["seed"] == 1
+        assert (dfc.load(file).layer is None) == (kind == "standard")
+    # Three epochs teach nothing, and the manifold holds all the same.
+    assert metrics["solvers"]["conservative"]["state_error"] > 1e-3
+    assert max(metrics["solvers"]["conservative"]["drift"].values()) < 1e-14
 
 
 def test_a_state_that_blows_up(tmp_path):

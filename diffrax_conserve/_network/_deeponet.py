@@ -139,11 +139,12 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 def _vectors(states: Y) -> Float[Array, "samples n"]:
     states = as_state(states)
-    lengths = {jnp.shape(x)[:1] for x in jtu.tree_leaves(states)}
+    shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
+    lengths = {shape[:1] for shape in shapes}
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(
             "`states` must be at least one state, stacked along a leading axis, but its leaves "
-            f"have shapes {[jnp.shape(x) for x in jtu.tree_leaves(states)]}. For a single state write "
+            f"have shapes {shapes}. For a single state write "
             "`jax.tree.map(lambda x: x[None], y0)`."
         )
     return jax.vmap(flatten)(states).astype(working_dtype(states))

@@ -58,9 +58,9 @@ def is_flow_map(system: AbstractSystem) -> bool:
 def initial_states(system: AbstractSystem) -> Any:
     """What all solvers are compared on, with a leading axis: the system's own initial state, and
     for a flow map random ones."""
-    own = system.y0[None]  # pyright: ignore
+    own = jax.tree.map(lambda x: x[None], system.y0)
     if not is_flow_map(system):
-        return jax.tree.map(lambda x: x[None], system.y0)
+        return own
     drawn = jax.vmap(system.sample)(jr.split(jr.key(1234), 4 * _STATES))
     if system.name == "point-vortices":
         drawn = drawn[_separations(drawn) >= _SEPARATION]

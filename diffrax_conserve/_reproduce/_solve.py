@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import time
 from typing import Any
 
@@ -45,12 +46,8 @@ def run(system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float,
 
 def _reason(error: Exception) -> str:
     """What an error says, without the lines that equinox and jax put around it."""
-    text = str(error)
-    lines = [line.strip() for line in text.splitlines()]
-    lines = [line for line in lines if line]
-    if "Below is the stack inside of JIT" in text:
-        return lines[-1].removeprefix("equinox.EquinoxRuntimeError: ")
-    return lines[0] if isinstance(error, RuntimeError) else text
+    found = re.search(r"EquinoxRuntimeError: (.*)", str(error))
+    return str(error) if found is None else found[1]
 
 
 @eqx.filter_jit

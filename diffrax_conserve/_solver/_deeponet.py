@@ -1,7 +1,7 @@
 """A learned flow map as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, final
+from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -16,13 +16,8 @@ from ._learned import check_learned_terms, check_nodes, check_output
 from ._refusal import refuse_if
 from ._terms import time_direction
 
-
-class FlowMap(Protocol):
-    """What `DeepONetSolver` steps: `(y0, h) ↦ y` for `0 <= h <= max_step`."""
-
-    max_step: Any
-
-    def __call__(self, y0: Any, h: Any) -> Any: ...
+# `(y0, h) ↦ y` with an attribute `max_step`: a `DeepONet`, or a Module of the user's own.
+FlowMap = Any
 
 
 @final

@@ -9,30 +9,30 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
-def staged_iterations(epoch: Int[Array, ""], epochs: int, steps: int) -> Int[Array, ""]:
+def staged_iterations(epoch: Int[Array, "..."], epochs: int, steps: int) -> Int[Array, "..."]:
     """`p = min(P, floor(e (P + 1) / E))`: none at first, one more after each stage."""
     return jnp.minimum(steps, epoch * (steps + 1) // epochs)
 
 
-def every_iteration(epoch: Int[Array, ""], epochs: int, steps: int) -> Int[Array, ""]:
+def every_iteration(epoch: Int[Array, "..."], epochs: int, steps: int) -> Int[Array, "..."]:
     """`p = P` from the first epoch on."""
     del epochs
     return jnp.full_like(epoch, steps)
 
 
-def ramped_weight(epoch: Int[Array, ""], epochs: int, steps: int) -> Float[Array, ""]:
+def ramped_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Array, "..."]:
     """`s` rises from 0 to 1 within each stage, so that it is continuous where `p` increases."""
     position = epoch * (steps + 1) / epochs
     return position - jnp.minimum(jnp.floor(position), steps)
 
 
-def linear_weight(epoch: Int[Array, ""], epochs: int, steps: int) -> Float[Array, ""]:
+def linear_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Array, "..."]:
     """`s = e / E`, as the paper has it: what is trained jumps wherever `p` increases."""
     del steps
     return epoch / epochs
 
 
-def constant_weight(epoch: Int[Array, ""], epochs: int, steps: int) -> Float[Array, ""]:
+def constant_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Array, "..."]:
     """`s = 1`: the last iteration counts alone."""
     del epochs, steps
     return jnp.ones_like(epoch, float)

@@ -1,0 +1,235 @@
+"""The conservative layer: where it moves to, and that its derivatives are those of what it does."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import diffrax_conserve as dfc
+
+from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution, states
+from ..problems import OMEGA0, RIGID_BODY
+
+ONE = jnp.ones(())
+
+
+def residual(layer, y, values):
+    now = layer.values(0.0, y)
+    scale = jax.tree.map(lambda v: 1 + jnp.abs(v), values)
+    ratios = jax.tree.map(lambda a, b, s: jnp.abs(a - b) / s, now, values, scale)
+    return max(float(jnp.max(x)) for x in jax.tree.leaves(ratios))
+
+
+@eqx.filter_jit
+def moved(layer, y, values, radius, schedule=None):
+    return layer(y, values, 0.0, radius, schedule)
+
+
+@given(st.integers(0, 10**6), st.floats(1e-6, 0.3))
+def test_enough_iterations_reach_the_manifold_from_far_away(seed, distance):
+    layer = dfc.ConservativeLayer(RIGID_BODY, steps=12)
+    values = layer.values(0.0, OMEGA0)
+    candidate = OMEGA0 + distance * jr.normal(jr.key(seed), (3,))
+    y = moved(layer, candidate, values, ONE)
+    assert residual(layer, y, values) < 1e-14
+
+
+def test_each_iteration_comes_nearer():
+    candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
+    left = []
+    for steps in range(1, 6):
+        layer = dfc.ConservativeLayer(RIGID_BODY, steps=steps)
+        values = layer.values(0.0, OMEGA0)
+        left.append(residual(layer, moved(layer, candidate, values, ONE), values))
+    assert all(b < a / 3 or b < 1e-15 for a, b in itertools.pairwise(left))
+    assert left[-1] < 1e-12
+
+
+def test_the_move_is_along_the_gradients_at_the_candidate():
+    layer = dfc.ConservativeLayer(RIGID_BODY, steps=8)
+    values = layer.values(0.0, OMEGA0)
+    candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
+    rows = jnp.stack(jax.tree.leaves(jax.jacrev(lambda y: layer.values(0.0, y))(candidate)))
+    move = moved(layer, candidate, values, ONE) - candidate
+    multipliers = np.linalg.lstsq(rows.T, move)[0]
+    np.testing.assert_allclose(rows.T @ multipliers, move, atol=1e-15)
+
+
+def test_a_state_on_the_manifold_stays():
+    layer = dfc.ConservativeLayer(RIGID_BODY)
+    y = moved(layer, OMEGA0, layer.values(0.0, OMEGA0), ONE)
+    np.testing.assert_allclose(y, OMEGA0, rtol=0, atol=1e-15)
+
+
+def test_where_the_gradient_vanishes_nothing_blows_up():
+    layer = dfc.ConservativeLayer(RADIUS, steps=5)
+    for scale in (0.0, 1e-300, 1e-12, 1e-3):
+        y = moved(layer, scale * EAST, layer.values(0.0, EAST), ONE)
+        assert float(jnp.max(jnp.abs(y))) <= 1 + 5
+
+
+def test_dependent_integrals_change_nothing():
+    once, twice = (dfc.ConservativeLayer(m, steps=8) for m in (RADIUS, (RADIUS, RADIUS)))
+    candidate = jnp.array([1.1, 0.3])
+    a, b = (moved(x, candidate, x.values(0.0, EAST), ONE) for x in (once, twice))
+    np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_many_constraints_use_the_dense_solve():
+    sphere = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2, axis=1))
+    layer = dfc.ConservativeLayer(sphere, steps=8)
+    y0 = jr.normal(jr.key(0), (9, 3))
+    candidate = 1.1 * y0
+    y = moved(layer, candidate, layer.values(0.0, y0), ONE)
+    np.testing.assert_allclose(y, y0, rtol=1e-14)
+
+
+# ---- The schedule ----
+
+CANDIDATE = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
+
+
+def scheduled(p, s, steps=3):
+    layer = dfc.ConservativeLayer(RIGID_BODY, steps=steps)
+    schedule = (jnp.asarray(p), jnp.asarray(s))
+    return moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE, schedule)
+
+
+def test_a_schedule_blends_successive_iterates():
+    np.testing.assert_array_equal(scheduled(0, 0.7), CANDIDATE)
+    np.testing.assert_allclose(scheduled(1, 0.0), CANDIDATE, rtol=1e-15)
+    for p in (1, 2, 3):
+        # With `p` iterations in all, the layer makes them without a schedule.
+        layer = dfc.ConservativeLayer(RIGID_BODY, steps=p)
+        expected = moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE)
+        np.testing.assert_allclose(scheduled(p, 1.0), expected, rtol=1e-15)
+        blend = 0.75 * scheduled(p - 1, 1.0) + 0.25 * scheduled(p, 1.0)
+        np.testing.assert_allclose(scheduled(p, 0.25), blend, rtol=1e-14)
+
+
+def test_every_schedule_compiles_once():
+    traces = 0
+
+    def energy(t, y, args):
+        nonlocal traces
+        traces += 1
+        return jnp.sum(y**2)
+
+    layer = dfc.ConservativeLayer(dfc.FirstIntegral(energy), steps=4)
+
+    @jax.jit
+    def run(p, s):
+        return layer(jnp.array([1.1, 0.2]), jnp.array(1.0), 0.0, ONE, (p, s))
+
+    run(jnp.asarray(0), ONE)
+    first = traces
+    for p in range(1, 5):
+        run(jnp.asarray(p), ONE / 2)
+    assert traces == first
+
+
+# ---- Derivatives ----
+
+
+def finite_difference(f, x, direction, h=1e-5):
+    return (f(x + h * direction) - f(x - h * direction)) / (2 * h)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 0.3])
+def test_first_and_second_derivatives(distance):
+    """To second order, since every loss with a time derivative needs the gradient of one."""
+    layer = dfc.ConservativeLayer(RIGID_BODY, steps=12)
+    values = layer.values(0.0, OMEGA0)
+    start = OMEGA0 + distance * jnp.array([0.3, -1.0, 0.5])
+    velocity, direction = jnp.array([0.2, 0.5, -0.4]), jnp.array([-0.7, 0.1, 0.4])
+
+    @jax.jit
+    def f(y):
+        return layer(y, values, 0.0, ONE)
+
+    @jax.jit
+    def rate(y):
+        return jnp.sum(jax.jvp(f, (y,), (velocity,))[1] ** 3)
+
+    np.testing.assert_allclose(
+        jax.jvp(f, (start,), (velocity,))[1], finite_difference(f, start, velocity), atol=1e-8
+    )
+    np.testing.assert_allclose(
+        jax.grad(rate)(start) @ direction, finite_difference(rate, start, direction), atol=1e-7
+    )
+    np.testing.assert_allclose(
+        jax.jvp(rate, (start,), (direction,))[1], jax.grad(rate)(start) @ direction, atol=1e-12
+    )
+
+
+def test_derivatives_with_respect_to_the_manifold_and_the_values():
+    @jax.jit
+    def moved_to(omega, value):
+        energy = dfc.FirstIntegral(lambda t, y, args: (y[1] ** 2 + (omega * y[0]) ** 2) / 2)
+        layer = dfc.ConservativeLayer(energy, steps=12)
+        return layer(jnp.array([1.1, 0.4]), value, 0.0, ONE)[0]
+
+    point, h = jnp.array([1.3, 0.9]), 1e-6
+    gradient = jnp.stack(jax.grad(moved_to, argnums=(0, 1))(*point))
+    for i, direction in enumerate(jnp.eye(2)):
+        plus, minus = (moved_to(*(point + s * direction)) for s in (h, -h))
+        np.testing.assert_allclose(gradient[i], (plus - minus) / (2 * h), rtol=1e-7)
+
+
+def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifold():
+    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=12)
+    net = flow_map(layer=layer)
+
+    @jax.jit
+    def rates(t):
+        state, velocity = jax.jvp(lambda h: net(LORENZ.y0, h), (t,), (ONE,))
+        return velocity, jax.jvp(lambda y: layer.values(0.0, y), (state,), (velocity,))[1]
+
+    velocity, changes = rates(jnp.array(0.2))
+    assert float(jnp.linalg.norm(velocity)) > 1e-2
+    assert max(abs(float(change)) for change in changes.values()) < 1e-12
+
+
+# ---- As a part of a network ----
+
+
+def test_a_conservative_network_is_its_candidate_moved():
+    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=12)
+    plain, y0 = flow_map(), LORENZ.y0
+    conservative = eqx.filter_jit(flow_map(layer=layer))
+    values = layer.values(0.0, y0)
+    expected = moved(layer, plain(y0, 0.2), values, plain.radius())
+    np.testing.assert_allclose(conservative(y0, 0.2), expected, rtol=1e-14)
+    assert residual(layer, conservative(y0, 0.2), values) < 1e-14
+    np.testing.assert_allclose(conservative(y0, 0.0), y0, rtol=0, atol=1e-15)
+    pinn = eqx.filter_jit(solution(layer=layer))
+    assert residual(layer, pinn(1.5), values) < 1e-14
+    np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
+
+
+def test_a_batch_is_its_lanes():
+    net = flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold))
+    y0s, hs = states(6), jnp.linspace(0, 0.25, 6)
+    batch, lane = jax.jit(jax.vmap(net))(y0s, hs), jax.jit(net)
+    for i in range(6):
+        np.testing.assert_allclose(batch[i], lane(y0s[i], hs[i]), rtol=1e-13)
+
+
+def test_args_are_passed_to_the_manifold():
+    weighted = dfc.FirstIntegral(lambda t, y, args: jnp.sum(args * y**2))
+    layer = dfc.ConservativeLayer(weighted, steps=12, args=jnp.array([1.0, 3.0]))
+    pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
+    assert abs(float(weighted.fn(0, pinn(0.7), layer.args)) - 1) < 1e-14
+
+
+def test_what_is_refused():
+    with pytest.raises(ValueError, match="`steps` must be a positive integer"):
+        dfc.ConservativeLayer(RADIUS, steps=0)
+    with pytest.raises(TypeError, match="neither a `FirstIntegral`"):
+        dfc.ConservativeLayer(lambda t, y, args: y)

@@ -1,0 +1,336 @@
+"""Learned solvers in `diffeqsolve`: they follow their networks, as RK4 would follow its formula."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import LORENZ, flow_map, solution, states
+
+DEEPONET, PINN = flow_map(), solution()
+FLOW, FOLLOW = dfc.DeepONetSolver(DEEPONET), dfc.PINNSolver(PINN)
+SOLVERS = pytest.mark.parametrize("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"])
+STEPS = dfx.SaveAt(t0=True, steps=True)
+
+
+@eqx.filter_jit
+def solve(solver, y0=LORENZ.y0, *, t0=0.0, t1=1.0, dt0=0.25, args=None, **kwargs):
+    term = dfx.ODETerm(LORENZ.vector_field)
+    return dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, args, **kwargs)
+
+
+def path(solver, t):
+    """The state at time `t` by hand, in steps of 0.25."""
+    if solver is FOLLOW:
+        return PINN(t)
+    y = LORENZ.y0
+    for _ in range(int(t / 0.25)):
+        y = DEEPONET(y, 0.25)
+    return DEEPONET(y, t % 0.25)
+
+
+# ---- What diffrax offers ----
+
+
+@SOLVERS
+def test_steps_saved_times_and_dense_output_follow_the_network(solver):
+    ts = jnp.array([0.1, 0.25, 0.6, 0.97])
+    subs = dict(a=dfx.SubSaveAt(ts=ts), b=dfx.SubSaveAt(t0=True, steps=True))
+    sol = solve(solver, saveat=dfx.SaveAt(subs=subs, dense=True))
+    for t, y in zip(ts, sol.ys["a"], strict=True):
+        np.testing.assert_allclose(y, path(solver, float(t)), rtol=0, atol=1e-8)
+        np.testing.assert_allclose(sol.evaluate(t), y, rtol=0, atol=1e-14)
+    for t, y in zip(np.arange(5) / 4, sol.ys["b"], strict=False):
+        np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
+
+
+@SOLVERS
+def test_more_nodes_follow_it_more_closely(solver):
+    def error(nodes):
+        network = PINN if solver is FOLLOW else DEEPONET
+        sol = solve(type(solver)(network, nodes=nodes), t1=0.25, saveat=dfx.SaveAt(dense=True))
+        return float(jnp.max(jnp.abs(sol.evaluate(0.07) - path(solver, 0.07))))
+
+    errors = [error(nodes) for nodes in (2, 5, 9)]
+    assert errors[0] > 10 * errors[1] > 100 * errors[2]
+
+
+@SOLVERS
+def test_the_chebyshev_series_does_not_hold_the_weights(solver):
+    sol = solve(solver, saveat=dfx.SaveAt(dense=True), max_steps=4)
+    numbers = sum(x.size for x in jax.tree.leaves(sol.interpolation))
+    assert numbers < 4 * 12 * 3 + 50
+
+
+@SOLVERS
+def test_events(solver):
+    # The component that changes most in the step from 0.5 to 0.75 crosses its value at 0.6 there.
+    k = int(jnp.argmax(jnp.abs(path(solver, 0.75) - path(solver, 0.5))))
+    level = float(path(solver, 0.6)[k])
+
+    def crossing(t, y, args, **kwargs):
+        return y[k] - level
+
+    event = dfx.Event(crossing, optx.Newton(1e-10, 1e-10))
+    sol = solve(solver, path(solver, 0.5), t0=0.5, event=event)
+    assert sol.result == dfx.RESULTS.event_occurred
+    np.testing.assert_allclose(sol.ts[-1], 0.6, atol=1e-7)
+    np.testing.assert_allclose(sol.ys[-1], path(solver, 0.6), atol=1e-7)
+
+
+def test_a_batch_is_its_lanes():
+    y0s = states(4)
+    batch = jax.vmap(lambda y0: solve(FLOW, y0, saveat=STEPS).ys)(y0s)
+    for y0, ys in zip(y0s, batch, strict=True):
+        np.testing.assert_allclose(ys, solve(FLOW, y0, saveat=STEPS).ys, rtol=1e-13)
+
+
+def test_any_flow_map_of_the_user():
+    class Rotation(eqx.Module):
+        rate: jax.Array
+        max_step: float = 0.5
+
+        def __call__(self, y0, h):
+            x, v = y0
+            c, s = jnp.cos(self.rate * h), jnp.sin(self.rate * h)
+            return c * x + s * v, c * v - s * x
+
+    solver = dfc.DeepONetSolver(Rotation(jnp.array(1.0)))
+    term = dfx.ODETerm(lambda t, y, args: (y[1], -y[0]))
+    y0 = (jnp.array(1.0), jnp.array(0.0))
+    sol = dfx.diffeqsolve(term, solver, 0.0, 3.0, 0.5, y0, saveat=dfx.SaveAt(ts=[0.7, 3.0]))
+    np.testing.assert_allclose(sol.ys[0], np.cos([0.7, 3.0]), atol=1e-12)
+
+
+def test_a_shorter_last_step():
+    sol = solve(FLOW, t1=0.6, saveat=STEPS)
+    y = LORENZ.y0
+    for i, h in enumerate(np.diff(sol.ts[np.isfinite(sol.ts)])):
+        y = DEEPONET(y, h)
+        np.testing.assert_allclose(sol.ys[i + 1], y, rtol=0, atol=1e-14)
+
+
+def test_a_pinn_may_start_later_and_go_back():
+    later = solve(FOLLOW, PINN(0.5), t0=0.5, t1=0.1, dt0=-0.1, saveat=dfx.SaveAt(ts=[0.33, 0.1]))
+    np.testing.assert_allclose(later.ys, jax.vmap(PINN)(jnp.array([0.33, 0.1])), atol=1e-10)
+
+
+def test_float32():
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), DEEPONET)
+    y0 = LORENZ.y0.astype(jnp.float32)
+    ts = jnp.array([0.3, 1.0], jnp.float32)
+    sol = solve(dfc.DeepONetSolver(single), y0, saveat=dfx.SaveAt(ts=ts))
+    assert sol.ys.dtype == jnp.float32
+    np.testing.assert_allclose(sol.ys[1], path(FLOW, 1.0), rtol=1e-5)
+
+
+# ---- Derivatives ----
+
+
+def difference(f, x, h=1e-6):
+    return (f(x + h) - f(x - h)) / (2 * h)
+
+
+def conserving(t, y, args):
+    return y[0] ** 2 / 2 - args * y[2]
+
+
+def loss(network, y0, args, adjoint, projected=True):
+    """Of a rollout that saves between the steps, and is projected to a manifold with `args`."""
+    solver = dfc.DeepONetSolver(network)
+    if projected:
+        solver = dfc.ManifoldProjection(
+            solver, dfc.FirstIntegral(conserving), projection=dfc.Newton()
+        )
+    saveat = dfx.SaveAt(ts=jnp.array([0.3, 1.0]))
+    ys = solve(solver, y0, args=args, saveat=saveat, adjoint=adjoint, max_steps=8).ys
+    return jnp.sum(jnp.sin(ys))
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [pytest.param(None, marks=pytest.mark.slow), dfc.ConservativeLayer(LORENZ.manifold, steps=8)],
+)
+def test_gradients_of_a_rollout(layer):
+    """With respect to the initial state, args and every weight, against finite differences."""
+    network = flow_map(layer=layer)
+    weights, static = eqx.partition(network, eqx.is_inexact_array)
+    moves = jax.tree.map(lambda x: jr.normal(jr.key(1), x.shape), weights)
+    start = (weights, LORENZ.y0, jnp.array(0.9))
+    direction = (moves, jnp.array([0.3, -1.0, 0.5]), jnp.array(0.7))
+
+    @jax.jit
+    def f(point):
+        weights, y0, args = point
+        network = eqx.combine(weights, static)
+        return loss(network, y0, args, dfx.RecursiveCheckpointAdjoint())
+
+    gradient = jax.jit(jax.grad(f))(start)
+    for i in range(3):
+
+        def along(h, i=i):
+            moved = jax.tree.map(lambda x, d: x + h * d, start[i], direction[i])
+            return f((*start[:i], moved, *start[i + 1 :]))
+
+        products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient[i], direction[i])
+        expected = difference(along, 0.0)
+        assert abs(expected) > 1e-3
+        np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
+
+
+def test_adjoints_agree():
+    def f(y0, adjoint):
+        return loss(DEEPONET, y0, 1.0, adjoint, projected=False)
+
+    direction = jnp.array([0.3, -1.0, 0.5])
+    expected = jax.grad(f)(LORENZ.y0, dfx.RecursiveCheckpointAdjoint()) @ direction
+    direct = jax.grad(f)(LORENZ.y0, dfx.DirectAdjoint()) @ direction
+    _, forward = jax.jvp(lambda y0: f(y0, dfx.ForwardMode()), (LORENZ.y0,), (direction,))
+    np.testing.assert_allclose([direct, forward], expected, rtol=1e-12)
+
+
+def test_gradient_with_respect_to_the_weights_of_a_pinn():
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def through_the_solver(pinn):
+        return jnp.sum(solve(dfc.PINNSolver(pinn), saveat=STEPS, max_steps=4).ys[1:] ** 2)
+
+    @eqx.filter_grad
+    def directly(pinn):
+        return jnp.sum(jax.vmap(pinn)(jnp.arange(1, 5) / 4) ** 2)
+
+    a, b = through_the_solver(PINN).net, directly(PINN).net
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-13)
+
+
+@SOLVERS
+def test_backsolve_adjoint_explains(solver):
+    with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=diffrax.Tsit5\(\)\)"):
+        jax.grad(lambda y0: solve(solver, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0])(LORENZ.y0)
+
+
+# ---- On the manifold ----
+
+
+@pytest.mark.parametrize("layer", [None, dfc.ConservativeLayer(LORENZ.manifold)])
+def test_random_networks_are_on_the_manifold_or_fail(layer):
+    """Whatever the quality of the network: at steps and between them."""
+
+    @eqx.filter_jit
+    def run(network):
+        solver = dfc.ManifoldProjection(
+            dfc.DeepONetSolver(network), LORENZ.manifold, projection=dfc.Newton()
+        )
+        ts = jnp.linspace(0, 5, 41)
+        sol = solve(solver, t1=5.0, saveat=dfx.SaveAt(ts=ts), throw=False)
+        drift = dfc.drift(sol, LORENZ.manifold)
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(d)) for d in drift.values()]))
+        return sol.result == dfx.RESULTS.successful, largest
+
+    outcomes = []
+    network = flow_map(layer=layer)
+    for seed in range(10):
+        # From nearly nothing to wild.
+        factor = 10.0 ** (seed / 3 - 1.5)
+        key = jr.key(seed)
+        noisy = jax.tree.map(
+            lambda x, k=key, f=factor: x + f * jr.normal(k, x.shape),
+            (network.branch, network.trunk),
+        )
+        ok, drift = run(eqx.tree_at(lambda n: (n.branch, n.trunk), network, noisy))
+        outcomes.append(bool(ok))
+        assert not ok or drift <= 1e-14
+    assert sum(outcomes) >= 3
+
+
+# ---- What is refused ----
+
+
+def refusal(function):
+    with pytest.raises(RuntimeError) as error:
+        jax.block_until_ready(function())
+    return str(error.value)
+
+
+TRANSFORMS = {
+    "eager": lambda f: f,
+    "jit": jax.jit,
+    "filter_jit": eqx.filter_jit,
+    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x])),
+}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
+def test_a_step_that_is_too_long(transform):
+    """Whether the length is known to the compiler or not, with both numbers in the message."""
+
+    def run(dt0):
+        term = dfx.ODETerm(LORENZ.vector_field)
+        return dfx.diffeqsolve(term, FLOW, 0.0, 2.0, dt0, LORENZ.y0).ys
+
+    message = refusal(lambda: transform(run)(jnp.array(0.375)))
+    assert "A step of 0.375 " in message
+    assert "from 0 to 0.25" in message
+
+
+def test_a_solve_backwards_in_time():
+    message = refusal(lambda: solve(FLOW, t1=-1.0, dt0=-0.125).ys)
+    assert "A step of -0.125 " in message
+    assert "from 0 to 0.25" in message
+
+
+def test_a_largest_step_that_is_an_array():
+    class Still(eqx.Module):
+        max_step: jax.Array
+
+        def __call__(self, y0, h):
+            return y0 + 0 * h
+
+    still = dfc.DeepONetSolver(Still(jnp.array(0.25)))
+    assert "A step of 0.5 " in refusal(lambda: solve(still, dt0=0.5).ys)
+    np.testing.assert_array_equal(solve(still).ys[0], LORENZ.y0)
+
+
+def test_a_pinn_from_another_initial_state():
+    message = refusal(lambda: solve(FOLLOW, LORENZ.y0 + jnp.array([0, 0.125, 0])).ys)
+    assert "differs by 0.125 " in message
+    assert "differs by 0.0625 " in refusal(lambda: solve(FOLLOW, LORENZ.y0 - 0.0625).ys)
+
+
+@pytest.mark.parametrize(("t0", "t1"), [(0.0, 3.0), (0.0, -1.0)])
+def test_a_pinn_outside_its_interval(t0, t1):
+    message = refusal(lambda: solve(FOLLOW, t0=t0, t1=t1, dt0=float(np.sign(t1))).ys)
+    assert f"The time {t1:g} " in message
+    assert "from 0 to 2 " in message
+
+
+def test_roundoff_in_the_times_is_not_refused():
+    sol = solve(FLOW, t0=1e6, t1=1e6 + 1.0, saveat=dfx.SaveAt(t1=True))
+    np.testing.assert_allclose(sol.ys[0], path(FLOW, 1.0), atol=1e-8)
+    tenth = dfc.DeepONetSolver(flow_map(max_step=0.1))
+    assert solve(tenth, t1=10.0, dt0=0.1).result == dfx.RESULTS.successful
+
+
+def test_arguments_that_are_refused():
+    with pytest.raises(TypeError):
+        dfc.DeepONetSolver(lambda y0, h: y0)
+    with pytest.raises(TypeError):
+        dfc.PINNSolver(DEEPONET)
+    with pytest.raises(ValueError, match="`nodes` must be an integer of at least 2"):
+        dfc.DeepONetSolver(DEEPONET, nodes=1)
+    term = dfx.ODETerm(lambda t, y, args: y)
+    with pytest.raises(ValueError, match="Both must be the same"):
+        dfx.diffeqsolve(term, FOLLOW, 0.0, 1.0, 0.25, (LORENZ.y0, LORENZ.y0))
+
+
+def test_adaptive_steps_need_an_error_estimate():
+    controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
+    with pytest.raises(RuntimeError, match="error"):
+        solve(FLOW, stepsize_controller=controller)

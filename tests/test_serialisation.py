@@ -1,0 +1,197 @@
+"""Networks in files: what comes back is what went in, and a bad file says what is wrong with it."""
+
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution
+
+NETWORKS = {
+    "pinn": solution(activation="sin"),
+    "raw pinn": solution(normalise=False),
+    "deeponet": flow_map(depth=3),
+    "conservative pinn": solution(layer=dfc.ConservativeLayer(LORENZ.manifold, steps=4)),
+    "conservative deeponet": flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold)),
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.network"
+
+
+@pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
+def test_what_is_loaded_is_what_was_saved(network, path):
+    dfc.save(path, network)
+    loaded = dfc.load(path)
+    assert eqx.tree_equal(loaded, network)
+    assert jax.tree.structure(loaded) == jax.tree.structure(network)
+
+
+def test_a_state_of_any_standard_container(path):
+    y0 = {"a": (jnp.ones(2), [jnp.zeros((2, 1), jnp.float32), None]), "b": jnp.array(2.0)}
+    pinn = dfc.PINN(y0, 0.0, 1.0, key=jr.key(0), **SMALL)
+    dfc.save(path, pinn)
+    assert eqx.tree_equal(dfc.load(path), pinn)
+
+
+def test_the_parameters_of_the_system_are_kept(path):
+    system = dfc.systems.PointVortices(strengths=(1.0, 2.0, 3.0, -1.0))
+    y0s = jax.vmap(system.sample)(jr.split(jr.key(0), 4))
+    layer = dfc.ConservativeLayer(system.manifold, steps=2)
+    network = dfc.DeepONet(y0s, 0.5, key=jr.key(0), layer=layer, **SMALL)
+    dfc.save(path, network)
+    assert eqx.tree_equal(dfc.load(path), network)
+
+
+def test_a_layer_of_the_users_own_is_given_again(path):
+    layer = dfc.ConservativeLayer(RADIUS, steps=4)
+    pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
+    dfc.save(path, pinn)
+    with pytest.raises(ValueError, match=r"layer=ConservativeLayer\(manifold, steps=4\)"):
+        dfc.load(path)
+    assert eqx.tree_equal(dfc.load(path, layer=layer), pinn)
+    dfc.save(path, NETWORKS["pinn"])
+    with pytest.raises(ValueError, match="leave `layer` out"):
+        dfc.load(path, layer=layer)
+
+
+def test_the_info(path):
+    dfc.save(path, NETWORKS["deeponet"], info={"system": "lorenz", "errors": [1.0, 2.0]})
+    found = dfc.read_info(path)
+    assert found["info"] == {"system": "lorenz", "errors": [1.0, 2.0]}
+    assert found["kind"] == "DeepONet"
+    assert found["config"]["max_step"] == 0.25
+    assert found["config"]["depth"] == 3
+    assert set(found["versions"]) >= {"diffrax-conserve", "jax"}
+
+
+def test_float32_arrays_stay_float32(path):
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), NETWORKS["deeponet"])
+    dfc.save(path, single)
+    assert eqx.tree_equal(dfc.load(path), single)
+
+
+def test_the_file_is_no_pickle(path):
+    dfc.save(path, NETWORKS["pinn"])
+    first, header, _ = path.read_bytes().split(b"\n", 2)
+    assert first.startswith(b"diffrax-conserve network 1 ")
+    assert json.loads(header)["kind"] == "PINN"
+
+
+# ---- What cannot be saved ----
+
+
+def test_what_cannot_be_saved(path):
+    with pytest.raises(ValueError, match="activation"):
+        dfc.save(path, solution(activation=lambda x: x))
+    with pytest.raises(ValueError, match="JSON"):
+        dfc.save(path, NETWORKS["pinn"], info={"array": np.ones(3)})
+    with pytest.raises(ValueError, match="JSON"):
+        dfc.save(path, NETWORKS["pinn"], info={"error": np.nan})
+
+    class State(eqx.Module):
+        x: jax.Array
+
+    custom = dfc.PINN(State(EAST), 0.0, 1.0, key=jr.key(0), **SMALL)
+    with pytest.raises(TypeError, match="State"):
+        dfc.save(path, custom)
+    assert list(path.parent.iterdir()) == []
+
+
+def test_a_save_that_fails_leaves_the_old_file(path, monkeypatch):
+    dfc.save(path, NETWORKS["pinn"])
+    old = path.read_bytes()
+
+    def fail(*arguments):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="no space"):
+        dfc.save(path, NETWORKS["deeponet"])
+    assert path.read_bytes() == old
+    assert list(path.parent.iterdir()) == [path]
+
+
+# ---- Bad files ----
+
+
+@pytest.fixture
+def content(path):
+    dfc.save(path, NETWORKS["pinn"])
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("fraction", [0.001, 0.01, 0.05, 0.5, 0.999])
+def test_a_truncated_file(path, content, fraction):
+    path.write_bytes(content[: int(fraction * len(content))])
+    with pytest.raises(ValueError, match="truncated"):
+        dfc.load(path)
+
+
+@pytest.mark.parametrize("position", [60, 300, 2000, -1])
+def test_a_damaged_file(path, content, position):
+    damaged = bytearray(content)
+    damaged[position] ^= 1
+    path.write_bytes(bytes(damaged))
+    with pytest.raises(ValueError, match="damaged"):
+        dfc.load(path)
+
+
+def test_a_foreign_file(path):
+    for foreign in (b"", b"PK\x03\x04 something else\n", b"{}\n", np.arange(99).tobytes()):
+        path.write_bytes(foreign)
+        with pytest.raises(ValueError, match=r"does not hold a network|truncated"):
+            dfc.load(path)
+
+
+def test_a_file_of_a_newer_version(path, content):
+    path.write_bytes(content.replace(b"network 1 ", b"network 2 ", 1))
+    with pytest.raises(ValueError, match=r"newer version .* Upgrade"):
+        dfc.load(path)
+
+
+def test_a_missing_file(path):
+    with pytest.raises(FileNotFoundError):
+        dfc.load(path)
+
+
+# ---- The networks of the package ----
+
+SYSTEMS = dfc.systems.names()[:5]
+
+
+@pytest.mark.parametrize(
+    "name", [f"{s}-{k}" for s in SYSTEMS for k in ("standard", "conservative")]
+)
+def test_every_pretrained_network(name):
+    network = dfc.load_pretrained(name)
+    file = dfc.pretrained_path(name)
+    info = dfc.read_info(file)["info"]
+    system = dfc.systems.get(info["system"])
+    assert file.stat().st_size < 150_000
+    assert (network.layer is not None) == name.endswith("conservative")
+    assert info["command"].startswith("python benchmarks/paper.py")
+    assert info["errors"]["plain"]["largest_state_error"] > 0
+    assert len(info["history"]["epochs"]) == len(info["history"]["losses"])
+    # It is the network whose error is noted.
+    if isinstance(network, dfc.PINN):
+        y = network(system.dt)
+        exact = system.reference(jnp.array([system.dt]))[0]
+        expected = info["errors"]["plain"]["one_step_error"]
+        np.testing.assert_allclose(jnp.linalg.norm(y - exact), expected, rtol=1e-6)
+    else:
+        assert network.max_step == system.dt
+        assert bool(jnp.all(network(system.y0, 0.0) - system.y0 < 1e-14))
+
+
+def test_a_pretrained_network_that_does_not_exist():
+    with pytest.raises(ValueError, match=r"rigid-body-conservative"):
+        dfc.load_pretrained("rigid-bodies")

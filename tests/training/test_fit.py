@@ -1,0 +1,288 @@
+"""`fit` on problems that train in a second."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator
+
+LAYER = dfc.ConservativeLayer(RADIUS, steps=2)
+KEY = jr.key(5)
+
+
+def circle(layer=None, seed=0):
+    """A PINN for a quarter of a turn."""
+    return dfc.PINN(EAST, 0.0, 1.5, key=jr.key(seed), layer=layer, **SMALL)
+
+
+def recipe(model, epochs=60, points=30, **options):
+    parts = dict(check_every=20, optimiser=optax.adam(1e-2))
+    return dataclasses.replace(dfc.paper(model, epochs=epochs, points=points), **(parts | options))
+
+
+def train(
+    model, vector_field=oscillator, key=KEY, sample=None, args=None, progress=False, **options
+):
+    return dfc.fit(
+        model,
+        vector_field,
+        key=key,
+        sample=sample,
+        args=args,
+        recipe=recipe(model, **options),
+        progress=progress,
+    )
+
+
+def defect(pinn, points=50):
+    """The mean squared defect, written out for one point at a time."""
+
+    def one(t):
+        y, velocity = jax.jvp(pinn, (t,), (jnp.ones(()),))
+        return jnp.sum((velocity - oscillator(t, y, None)) ** 2)
+
+    return float(jnp.mean(jax.jit(jax.vmap(one))(jnp.linspace(0, 1.5, points))))
+
+
+def error(pinn):
+    ts = jnp.linspace(0, 1.5, 20)
+    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
+    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
+
+
+# ---- It learns ----
+
+
+@pytest.mark.parametrize("layer", [None, LAYER], ids=["standard", "conservative"])
+def test_a_pinn_learns_a_solution(layer):
+    before = circle(layer)
+    after, log = train(before, epochs=300, optimiser=optax.adam(5e-3))
+    assert defect(after) < defect(before) / 100
+    assert error(after) < 0.05 < error(before)
+    assert log.best < log.criteria[0] / 100
+
+
+def test_a_deeponet_learns_a_flow_map():
+    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=2)
+    before = flow_map(layer=layer)
+    after, log = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=150, points=200)
+    y0s = jax.vmap(LORENZ.sample)(jr.split(jr.key(9), 10))  # not those of the training
+    exact = jax.vmap(lambda y0: LORENZ.reference(jnp.array([0.25]), y0)[0])(y0s)
+
+    def largest(network):
+        return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network, (0, None)))(y0s, 0.25) - exact)))
+
+    assert largest(after) < largest(before) / 2
+    assert log.best < log.criteria[0] / 3
+
+
+def test_any_flow_map_of_the_user_learns():
+    class Linear(eqx.Module):
+        rate: jax.Array
+        max_step: float = eqx.field(static=True, default=0.5)
+
+        def __call__(self, y0, h):
+            return y0 * jnp.exp(self.rate * h)
+
+    fitted, _ = train(
+        Linear(jnp.array(0.0)),
+        lambda t, y, args: args * y,
+        args=-1.5,
+        sample=lambda key: jr.uniform(key, minval=1.0, maxval=2.0),
+        epochs=200,
+        optimiser=optax.adam(0.05),
+    )
+    assert abs(float(fitted.rate) + 1.5) < 1e-3
+
+
+def test_only_the_weights_are_trained():
+    before = flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold))
+    after, _ = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=3, points=20)
+    assert eqx.tree_equal(before.layer, after.layer)
+    assert eqx.tree_equal((before.shift, before.scale), (after.shift, after.scale))
+    assert not eqx.tree_equal(before.branch, after.branch)
+    assert not eqx.tree_equal(before.trunk, after.trunk)
+
+
+# ---- What it records and returns ----
+
+
+def test_the_first_loss_is_that_of_the_formula():
+    points = 40
+
+    def grid(key, count, first, last):
+        return jnp.linspace(first, last, count)
+
+    model = circle()
+    _, log = train(model, epochs=1, points=points, times=grid)
+    np.testing.assert_allclose(log.losses[0], defect(model, points), rtol=1e-12)
+    np.testing.assert_allclose(log.criteria[0], defect(model, points), rtol=1e-12)
+
+
+def test_the_best_model_is_returned_not_the_last():
+    """A learning rate that grows until the training diverges."""
+    rate = optax.schedules.exponential_decay(1e-3, 1, 1.08)
+    options = dict(epochs=200, points=40, optimiser=optax.sgd(rate), times=dfc.grid_times)
+    model, log = train(circle(), max_gradient_norm=None, **options)
+    assert 0 < log.best_epoch < 200
+    assert log.best == min(log.criteria)
+    assert not log.criteria[-1] <= 1.1 * log.best
+    np.testing.assert_allclose(defect(model, 40), log.best, rtol=1e-10)
+
+
+def test_the_same_key_gives_the_same_result():
+    a, log_a = train(circle(LAYER))
+    b, log_b = train(circle(LAYER))
+    c, _ = train(circle(LAYER), key=jr.key(6))
+    assert eqx.tree_equal(a, b)
+    np.testing.assert_array_equal(log_a.losses, log_b.losses)
+    assert not eqx.tree_equal(a, c)
+
+
+def test_a_planted_nan_is_survived():
+    """A vector field that is NaN where the network soon is."""
+
+    def trap(t, y, args):
+        return jnp.where(y[1] < -0.5, jnp.nan, 1.0) * oscillator(t, y, args)
+
+    model, log = train(circle(), trap, epochs=100)
+    assert log.skipped > 0
+    assert np.isfinite(log.best)
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(model.net))
+    assert log.best <= log.criteria[0]
+
+
+def test_a_problem_that_is_nan_everywhere_returns_the_model_as_it_came():
+    before = circle()
+    after, log = train(before, lambda t, y, args: jnp.nan * y, epochs=5)
+    assert eqx.tree_equal(before, after)
+    assert log.skipped == 5
+    assert np.isinf(log.best)
+
+
+def test_long_gradients_are_shortened():
+    before = circle()
+    options = dict(epochs=1, optimiser=optax.sgd(1.0))
+    after, _ = train(before, max_gradient_norm=1e-3, **options)
+    moved = jax.tree.map(lambda a, b: a - b, after.net, before.net)
+    assert float(optax.global_norm(eqx.filter(moved, eqx.is_array))) <= 1.001e-3
+
+
+def test_new_points_are_drawn_when_the_recipe_says_so():
+    # Without updates the loss changes only with the points.
+    still = dict(optimiser=optax.sgd(0.0), epochs=9)
+    _, fixed = train(circle(), **still)
+    _, fresh = train(circle(), refresh=3, **still)
+    assert len(np.unique(fixed.losses)) == 1
+    np.testing.assert_array_equal(np.diff(fresh.losses) != 0, [0, 0, 1, 0, 0, 1, 0, 0])
+
+
+def test_epochs_that_are_no_multiple_of_the_checks():
+    _, log = train(circle(), epochs=45)
+    np.testing.assert_array_equal(log.checked, [0, 20, 40, 45])
+    assert log.losses.shape == (45,)
+    assert np.all(np.isfinite(log.losses))
+
+
+def test_progress(capsys):
+    calls = []
+    train(circle(), progress=lambda *numbers: calls.append(numbers))
+    assert [call[:2] for call in calls] == [(0, 60), (20, 60), (40, 60), (60, 60)]
+    assert calls[-1][3] <= calls[0][3]
+    train(circle(), progress=True)
+    assert "epoch 60 of 60" in capsys.readouterr().err
+
+
+# ---- The schedule ----
+
+
+def test_the_whole_schedule_compiles_once():
+    traces = 0
+
+    def counted(t, y, args):
+        nonlocal traces
+        traces += 1
+        return oscillator(t, y, args)
+
+    def count(epochs):
+        nonlocal traces
+        traces = 0
+        model = circle(LAYER)
+        train(model, counted, epochs=epochs, iterations=dfc.staged_iterations)
+        return traces
+
+    assert count(90) == count(3) > 0
+
+
+def test_the_schedules():
+    epochs, steps = 400, 3
+    es = jnp.arange(epochs)
+    p = dfc.staged_iterations(es, epochs, steps)
+    s = dfc.ramped_weight(es, epochs, steps)
+    np.testing.assert_array_equal(p, np.repeat([0, 1, 2, 3], 100))
+    np.testing.assert_allclose(s, np.tile(np.arange(100) / 100, 4), atol=1e-12)
+    np.testing.assert_allclose(dfc.linear_weight(es, epochs, steps), es / epochs)
+    np.testing.assert_array_equal(dfc.every_iteration(es, epochs, steps), np.full(epochs, 3))
+    np.testing.assert_array_equal(dfc.constant_weight(es, epochs, steps), np.ones(epochs))
+
+
+def test_the_trained_loss_follows_the_schedule():
+    """At the start of the staged schedule the layer does nothing, at its end everything."""
+    still = dict(optimiser=optax.sgd(0.0), epochs=6, times=dfc.grid_times)
+    staged = dict(iterations=dfc.staged_iterations, weight=dfc.ramped_weight)
+    _, plain = train(circle(), **still)
+    _, log = train(circle(LAYER), **still, **staged)
+    _, full = train(circle(LAYER), **still, weight=dfc.constant_weight)
+    np.testing.assert_allclose(log.losses[0], plain.losses[0], rtol=1e-12)
+    np.testing.assert_allclose(full.losses[0], log.criteria[0], rtol=1e-12)
+    assert len(np.unique(log.losses)) == 6
+
+
+# ---- The loss ----
+
+
+def test_the_losses():
+    q = jnp.array([0.0, 1.0, 3.0, 1e12])
+    assert dfc.mean_square(q[:3], jnp.array(9.0)) == 4 / 3
+    bounded = dfc.bounded(2.0)(q, jnp.array(1.5))
+    np.testing.assert_allclose(bounded, np.mean([0, 1 / (1 + 1 / 3), 3 / 2, 3.0]), rtol=1e-10)
+
+
+# ---- What is refused ----
+
+
+def test_arguments_that_are_refused():
+    with pytest.raises(ValueError, match="leave `sample` out"):
+        dfc.fit(circle(), oscillator, key=KEY, sample=LORENZ.sample)
+    with pytest.raises(ValueError, match="pass `sample`"):
+        dfc.fit(flow_map(), LORENZ.vector_field, key=KEY)
+    with pytest.raises(TypeError, match="max_step"):
+        dfc.fit(LAYER, oscillator, key=KEY)
+    with pytest.raises(ValueError, match="`epochs` must be at least 1"):
+        dfc.Recipe(epochs=0)
+    with pytest.raises(ValueError, match="`refresh`"):
+        dfc.Recipe(refresh=0)
+
+
+# ---- The real thing ----
+
+
+@pytest.mark.slow
+def test_the_papers_recipe_on_the_rigid_body():
+    system = dfc.systems.get("rigid-body")
+    layer = dfc.ConservativeLayer(system.manifold, steps=5)
+    pinn = dfc.PINN(system.y0, 0.0, system.t1, key=jr.key(0), layer=layer)
+    pinn, log = dfc.fit(pinn, system.vector_field, key=jr.key(1))
+    ts = jnp.linspace(0, system.t1, 100)
+    assert float(jnp.max(jnp.abs(jax.vmap(pinn)(ts) - system.reference(ts)))) < 1e-3
+    assert log.skipped == 0
+    assert log.best == min(log.criteria)
+    assert log.compile_seconds < 30
