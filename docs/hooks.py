@@ -14,6 +14,7 @@ from pathlib import Path
 DIFFRAX = "https://docs.kidger.site/diffrax/api"
 EQUINOX = "https://docs.kidger.site/equinox/api"
 OPTIMISTIX = "https://docs.kidger.site/optimistix/api"
+OPTAX = "https://optax.readthedocs.io/en/latest/api"
 
 PAGES = {
     f"{DIFFRAX}/diffeqsolve/": "diffrax.diffeqsolve",
@@ -46,6 +47,7 @@ PAGES = {
     f"{EQUINOX}/transformations/": (
         "equinox.filter_jit equinox.filter_grad equinox.filter_value_and_grad equinox.filter_vmap"
     ),
+    f"{OPTAX}/transformations.html": "optax.GradientTransformation",
     f"{OPTIMISTIX}/root_find/": "optimistix.root_find optimistix.Newton optimistix.Chord",
 }
 

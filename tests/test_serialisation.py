@@ -136,7 +136,7 @@ def test_a_truncated_file(path, content, fraction):
         dfc.load(path)
 
 
-@pytest.mark.parametrize("position", [60, 300, 2000, -1])
+@pytest.mark.parametrize("position", [60, 300, 1000, -1])
 def test_a_damaged_file(path, content, position):
     damaged = bytearray(content)
     damaged[position] ^= 1
@@ -168,28 +168,29 @@ def test_a_missing_file(path):
 SYSTEMS = dfc.systems.names()[:5]
 
 
-@pytest.mark.parametrize(
-    "name", [f"{s}-{k}" for s in SYSTEMS for k in ("standard", "conservative")]
-)
-def test_every_pretrained_network(name):
+@pytest.mark.parametrize("kind", ["standard", "conservative"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_pretrained_network(name, kind):
+    name = f"{name}-{kind}"
     network = dfc.load_pretrained(name)
     file = dfc.pretrained_path(name)
     info = dfc.read_info(file)["info"]
     system = dfc.systems.get(info["system"])
     assert file.stat().st_size < 150_000
-    assert (network.layer is not None) == name.endswith("conservative")
+    assert (network.layer is not None) == (kind == "conservative")
     assert info["command"].startswith("python benchmarks/paper.py")
     assert info["errors"]["plain"]["largest_state_error"] > 0
     assert len(info["history"]["epochs"]) == len(info["history"]["losses"])
     # It is the network whose error is noted.
     if isinstance(network, dfc.PINN):
-        y = network(system.dt)
+        y = eqx.filter_jit(network)(system.dt)
         exact = system.reference(jnp.array([system.dt]))[0]
         expected = info["errors"]["plain"]["one_step_error"]
         np.testing.assert_allclose(jnp.linalg.norm(y - exact), expected, rtol=1e-6)
     else:
         assert network.max_step == system.dt
-        assert bool(jnp.all(network(system.y0, 0.0) - system.y0 < 1e-14))
+        y = eqx.filter_jit(network)(system.y0, 0.0)
+        np.testing.assert_allclose(y, system.y0, rtol=0, atol=1e-14)
 
 
 def test_a_pretrained_network_that_does_not_exist():

@@ -82,6 +82,11 @@ def test_a_deeponet_learns_a_flow_map():
 
     assert largest(after) < largest(before) / 2
     assert log.best < log.criteria[0] / 3
+    # Only the weights were trained.
+    assert eqx.tree_equal(before.layer, after.layer)
+    assert eqx.tree_equal((before.shift, before.scale), (after.shift, after.scale))
+    assert not eqx.tree_equal(before.branch, after.branch)
+    assert not eqx.tree_equal(before.trunk, after.trunk)
 
 
 def test_any_flow_map_of_the_user_learns():
@@ -103,15 +108,6 @@ def test_any_flow_map_of_the_user_learns():
     assert abs(float(fitted.rate) + 1.5) < 1e-3
 
 
-def test_only_the_weights_are_trained():
-    before = flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold))
-    after, _ = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=3, points=20)
-    assert eqx.tree_equal(before.layer, after.layer)
-    assert eqx.tree_equal((before.shift, before.scale), (after.shift, after.scale))
-    assert not eqx.tree_equal(before.branch, after.branch)
-    assert not eqx.tree_equal(before.trunk, after.trunk)
-
-
 # ---- What it records and returns ----
 
 
@@ -128,20 +124,20 @@ def test_the_first_loss_is_that_of_the_formula():
 
 
 def test_the_best_model_is_returned_not_the_last():
-    """A learning rate that grows until the training diverges."""
-    rate = optax.schedules.exponential_decay(1e-3, 1, 1.08)
-    options = dict(epochs=200, points=40, optimiser=optax.sgd(rate), times=dfc.grid_times)
-    model, log = train(circle(), max_gradient_norm=None, **options)
-    assert 0 < log.best_epoch < 200
-    assert log.best == min(log.criteria)
-    assert not log.criteria[-1] <= 1.1 * log.best
+    """A training that turns round and climbs."""
+    optimiser = optax.sgd(lambda step: jnp.where(step < 60, 1e-2, -1e-2))
+    options = dict(epochs=120, points=40, optimiser=optimiser, times=dfc.grid_times)
+    model, log = train(circle(), **options)
+    assert log.best_epoch == 60
+    assert log.best == min(log.criteria) < log.criteria[0]
+    assert log.criteria[-1] > 1.01 * log.best
     np.testing.assert_allclose(defect(model, 40), log.best, rtol=1e-10)
 
 
 def test_the_same_key_gives_the_same_result():
-    a, log_a = train(circle(LAYER))
-    b, log_b = train(circle(LAYER))
-    c, _ = train(circle(LAYER), key=jr.key(6))
+    a, log_a = train(circle())
+    b, log_b = train(circle())
+    c, _ = train(circle(), key=jr.key(6))
     assert eqx.tree_equal(a, b)
     np.testing.assert_array_equal(log_a.losses, log_b.losses)
     assert not eqx.tree_equal(a, c)
@@ -172,8 +168,9 @@ def test_long_gradients_are_shortened():
     before = circle()
     options = dict(epochs=1, optimiser=optax.sgd(1.0))
     after, _ = train(before, max_gradient_norm=1e-3, **options)
-    moved = jax.tree.map(lambda a, b: a - b, after.net, before.net)
-    assert float(optax.global_norm(eqx.filter(moved, eqx.is_array))) <= 1.001e-3
+    nets = (eqx.filter(model.net, eqx.is_array) for model in (after, before))
+    moved = jax.tree.map(lambda a, b: a - b, *nets)
+    assert sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(moved)) <= 1.001e-6
 
 
 def test_new_points_are_drawn_when_the_recipe_says_so():
@@ -243,7 +240,8 @@ def test_the_trained_loss_follows_the_schedule():
     _, full = train(circle(LAYER), **still, weight=dfc.constant_weight)
     np.testing.assert_allclose(log.losses[0], plain.losses[0], rtol=1e-12)
     np.testing.assert_allclose(full.losses[0], log.criteria[0], rtol=1e-12)
-    assert len(np.unique(log.losses)) == 6
+    # The weight makes the loss continuous where the number of iterations increases.
+    assert log.losses[0] == log.losses[1] == log.losses[2] != log.losses[3]
 
 
 # ---- The loss ----
