@@ -101,8 +101,8 @@ class ConservativeLayer(eqx.Module):
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
         fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
-        multipliers = _multipliers(residual, candidate, fixed, steps=self.steps)
-        return _displaced(residual, candidate, multipliers)
+        y, _ = _conserve(residual, candidate, fixed, steps=self.steps)
+        return y
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
@@ -120,16 +120,9 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 _Fixed = tuple[Vector, Array, Array, Array]
 
 
-def _displaced(residual: Residual, candidate: Y, multipliers: Vector) -> Y:
-    """`ŷ + G(ŷ)ᵀ λ`, by one reverse pass for all constraints."""
-    _, vjp = eqx.filter_vjp(residual, candidate)
-    (direction,) = vjp(multipliers)
-    return tree_add(candidate, direction)
-
-
 @eqx.filter_custom_jvp
-def _multipliers(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) -> Vector:
-    """`(1 - s) λ_{p-1} + s λ_p`."""
+def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) -> tuple[Y, Vector]:
+    """`ŷ + G(ŷ)ᵀ λ` with `λ = (1 - s) λ_{p-1} + s λ_p`, and `λ`."""
     magnitude, radius, p, s = fixed
     before, at_candidate = linearise(residual, candidate)
     weights = jtu.tree_map(jnp.ones_like, candidate)
@@ -150,11 +143,12 @@ def _multipliers(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int)
 
     zeros = jtu.tree_map(jnp.zeros_like, before)
     (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
-    return jtu.tree_map(lambda a, b: a + s * (b - a), previous, last)
+    multipliers = jtu.tree_map(lambda a, b: a + s * (b - a), previous, last)
+    return tree_add(candidate, at_candidate.pullback(multipliers)), multipliers
 
 
-@_multipliers.def_jvp
-def _multipliers_jvp(primals, tangents, *, steps):
+@_conserve.def_jvp
+def _conserve_jvp(primals, tangents, *, steps):
     """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = what is left of it`.
 
     With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
@@ -166,21 +160,23 @@ def _multipliers_jvp(primals, tangents, *, steps):
     """
     residual, candidate, fixed = primals
     t_residual, t_candidate, _ = tangents
-    multipliers = _multipliers(residual, candidate, fixed, steps=steps)
+    y, multipliers = _conserve(residual, candidate, fixed, steps=steps)
 
     def displaced(residual: Residual, candidate: Y) -> tuple[Y, Vector]:
-        y = _displaced(residual, candidate, multipliers)
-        return y, residual(y)
+        # `Gᵀ λ` by one reverse pass for all constraints.
+        _, vjp = eqx.filter_vjp(residual, candidate)
+        (direction,) = vjp(multipliers)
+        state = tree_add(candidate, direction)
+        return state, residual(state)
 
-    (y, _), (_, t_g) = eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
+    _, (t_y, t_g) = eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
     _, at_candidate = linearise(*_stop_gradient((residual, candidate)))
     _, at_y = linearise(*_stop_gradient((residual, y)))
     weights = jtu.tree_map(jnp.ones_like, candidate)
+    _, vjp = eqx.filter_vjp(residual, candidate)
 
     def product(multipliers: Vector) -> Vector:
-        _, vjp = eqx.filter_vjp(residual, candidate)
-        (direction,) = vjp(multipliers)
-        return jax.jvp(residual, (y,), (direction,))[1]
+        return jax.jvp(residual, (y,), vjp(multipliers))[1]
 
     t_multipliers = lax.custom_linear_solve(
         product,
@@ -190,7 +186,9 @@ def _multipliers_jvp(primals, tangents, *, steps):
     )
     _, _, p, s = fixed
     share = jnp.where(p == 0, 0, jnp.where(p == 1, s, 1))
-    return multipliers, jtu.tree_map(lambda x: -share * x, t_multipliers)
+    t_multipliers = jtu.tree_map(lambda x: -share * x, t_multipliers)
+    (direction,) = vjp(t_multipliers)
+    return (y, multipliers), (tree_add(t_y, direction), t_multipliers)
 
 
 def _stop_gradient(tree: Any) -> Any:

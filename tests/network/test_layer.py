@@ -216,7 +216,7 @@ def test_a_conservative_network_is_its_candidate_moved():
 def test_a_batch_is_its_lanes():
     net = flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold))
     y0s, hs = states(6), jnp.linspace(0, 0.25, 6)
-    batch, lane = jax.jit(jax.vmap(net))(y0s, hs), jax.jit(net)
+    batch, lane = jax.jit(jax.vmap(net))(y0s, hs), eqx.filter_jit(net)
     for i in range(6):
         np.testing.assert_allclose(batch[i], lane(y0s[i], hs[i]), rtol=1e-13)
 
