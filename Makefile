@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow lint format types docs examples bench bench-smoke build clean distclean
+.PHONY: help demo test slow lint format types docs examples bench bench-smoke bench-learned build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -85,6 +85,9 @@ bench: $(PLOTS) ## measure the overhead of the projection
 
 bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/overhead.py --smoke
+
+bench-learned: $(PLOTS) ## measure what learned solvers cost
+	$(BIN)/python benchmarks/learned.py
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.
 build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own

@@ -8,16 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-PATH = Path(__file__).parent.parent / "benchmarks" / "overhead.py"
+FOLDER = Path(__file__).parent.parent / "benchmarks"
 
 
-@pytest.fixture(scope="module")
-def overhead():
-    spec = importlib.util.spec_from_file_location("overhead", PATH)
+def benchmark(name):
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def overhead():
+    return benchmark("overhead")
 
 
 def test_a_smoke_run_measures_verified_answers(overhead, tmp_path, capsys):
@@ -54,3 +58,30 @@ def test_another_answer_from_c_is_refused(overhead):
     theirs = overhead.Contestant(lambda steps: (start + 1e-9, steps), np.inf)
     with pytest.raises(AssertionError, match="C and we differ"):
         overhead.check_states({"plain": ours, "plain, C": theirs}, 1)
+
+
+# ---- Learned solvers ----
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_the_cost_of_learning(capsys):
+    found = benchmark("learned").main(["--smoke"])
+    assert found["epochs"]["rigid-body"]["ratio"] > 0
+    assert found["solves"]["ratio"] > 0
+    assert "| `rigid-body` |" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_the_paper():
+    standard, conservative = benchmark("paper").main(["--smoke"])
+    assert standard["plain"]["drift"] > 1e-6
+    for found in (standard, conservative):
+        assert found["projected"]["drift"] < 1e-14
+        assert found["projected"]["failed"] == 0
+
+
+def test_the_papers_results_are_what_the_documentation_shows():
+    """The table of all seeds is that of the result files."""
+    paper = benchmark("paper")
+    page = (FOLDER.parent / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert paper.table(paper.read_results()) in page

@@ -221,7 +221,10 @@ def test_backsolve_adjoint_explains(solver):
 # ---- On the manifold ----
 
 
-@pytest.mark.parametrize("layer", [None, dfc.ConservativeLayer(LORENZ.manifold)])
+@pytest.mark.parametrize(
+    "layer",
+    [pytest.param(None, marks=pytest.mark.slow), dfc.ConservativeLayer(LORENZ.manifold)],
+)
 def test_random_networks_are_on_the_manifold_or_fail(layer):
     """Whatever the quality of the network: at steps and between them."""
 
