@@ -1,2 +1,4 @@
 from ._manifold_projection import ManifoldProjection as ManifoldProjection
 from ._rk4 import RK4 as RK4
+from ._statistics import ProjectionStatistics as ProjectionStatistics
+from ._statistics import statistics as statistics
