@@ -17,7 +17,7 @@ from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values,
 
 # Above this many scalar constraints their gradients are never formed: what is needed of them is
 # computed from products with them.
-DENSE_MAX = 200
+DENSE_MAX = 128
 
 
 class AbstractConserved(eqx.Module):

@@ -68,7 +68,7 @@ class ProjectionInfo(eqx.Module):
         $|\\partial g/\\partial y| \\, |y - \\hat y|$.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate. With more
-        than 200 constraints, where it is not formed, their number.
+        than 128 constraints, where it is not formed, their number.
     - `failure`: what was left of the worst constraint, if the projection failed.
     """
 

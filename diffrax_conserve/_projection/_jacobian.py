@@ -29,7 +29,7 @@ Residual = Callable[[Y], Vector]
 
 # Up to this many constraints are unrolled: work and compile time grow as m², against a call into
 # LAPACK that costs some microseconds however small the matrix.
-UNROLLED_MAX = 6
+UNROLLED_MAX = 10
 
 
 class AbstractJacobian(eqx.Module):
