@@ -1,5 +1,6 @@
 """Assertions that a solution, or a state, lies on its manifold."""
 
+import functools
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -96,9 +97,9 @@ def assert_conserved(
         batch = jtu.tree_map(
             lambda x: jnp.reshape(x, (-1, *x.shape[len(lanes) :])), (ts, ys, *reference)
         )
-        measured = _measure_lanes(manifold, None, *batch, args)
+        measured = _measure_lanes(manifold, None, batch, args)
         limits = _limits(measured, rtol, atol, ys)
-        samples += _samples(manifold, kind, lanes, batch[0], batch[1], measured, limits)
+        samples += _samples(manifold, kind, lanes, batch[:2], measured, limits)
     report_constraints(samples)
 
 
@@ -146,9 +147,9 @@ def assert_on_manifold(
     values = _given_values(manifold, value, t, y, args)
     ts, ys = t[None], jtu.tree_map(lambda x: x[None], y)
     lane = jtu.tree_map(lambda x: x[None], (ts, ys, t, y))
-    measured = _measure_lanes(manifold, values, *lane, args)
+    measured = _measure_lanes(manifold, values, lane, args)
     limits = _limits(measured, rtol, atol, ys)
-    report_constraints(_samples(manifold, "given", (), *lane[:2], measured, limits))
+    report_constraints(_samples(manifold, "given", (), lane[:2], measured, limits))
 
 
 class Measured(NamedTuple):
@@ -163,21 +164,20 @@ class Measured(NamedTuple):
 
 @eqx.filter_jit
 def _measure_lanes(
-    manifold: Manifold, values: Values | None, ts: Array, ys: Any, t0: Array, y0: Any, args: Args
+    manifold: Manifold, values: Values | None, lanes: tuple[Array, Any, Array, Any], args: Args
 ) -> Measured:
-    return jax.vmap(lambda *lane: measure(manifold, values, *lane, args))(ts, ys, t0, y0)
+    return jax.vmap(lambda lane: measure(manifold, values, lane, args))(lanes)
 
 
 def measure(
     manifold: Manifold,
     values: Values | None,
-    ts: Real[Array, " times"],
-    ys: Any,
-    t0: Real[Array, ""],
-    y0: Any,
+    lane: tuple[Real[Array, " times"], Any, Real[Array, ""], Any],
     args: Args,
 ) -> Measured:
-    """The residuals at `(ts, ys)` and their scales; padded rows are taken for the initial state."""
+    """The residuals and their scales in a lane `(ts, ys, t0, y0)`; rows that are padded are taken
+    for the initial state."""
+    ts, ys, t0, y0 = lane
     target = conserved_values(manifold, t0, y0, args) if values is None else values
     initial_scale = scales(manifold, target, t0, y0, args)
 
@@ -217,7 +217,8 @@ def _sampled(solution: dfx.Solution, num_dense: int) -> list[tuple[str, Array, A
             )
         kinds.append(("saved", solution.ts, solution.ys))
     if solution.interpolation is not None:
-        kinds.append(("dense", *_dense(solution, num_dense)))
+        ts, ys = _dense(solution, num_dense)
+        kinds.append(("dense", ts, ys))
     if not kinds or any(ts.shape[-1] == 0 for _, ts, _ in kinds):
         raise ValueError(
             "`solution` holds no states to check. Save some, for example with "
@@ -283,8 +284,7 @@ def _samples(
     manifold: Manifold,
     kind: str,
     lanes: tuple[int, ...],
-    ts: Array,
-    ys: Any,
+    rows: tuple[Array, Any],
     measured: Measured,
     limits: tuple[Any, float],
 ) -> list[Sample]:
@@ -302,18 +302,27 @@ def _samples(
         for (path, residual), *arrays in zip(paths, *leaves, strict=True):
             for index in np.ndindex(residual.shape[2:]):
                 label = name + jtu.keystr(path) + (f"[{', '.join(map(str, index))}]" * bool(index))
-                scalars = [np.asarray(x)[(..., *index)] for x in arrays]
+                pick = functools.partial(_element, index)
                 samples.append(
                     Sample(
                         label,
                         isinstance(entry, Constraint),
                         kind,
                         lanes,
-                        np.asarray(ts),
-                        ys,
+                        np.asarray(rows[0]),
+                        rows[1],
                         np.asarray(measured.finite),
-                        *scalars,
-                        eps,
+                        residual=pick(residual),
+                        scale=pick(arrays[1]),
+                        found=pick(arrays[2]),
+                        limit=pick(arrays[3]),
+                        target=pick(arrays[4]),
+                        eps=eps,
                     )
                 )
     return samples
+
+
+def _element(index: tuple[int, ...], x: Any) -> np.ndarray:
+    """One scalar of each value."""
+    return np.asarray(x)[(..., *index)]

@@ -66,7 +66,7 @@ def assert_gradients(
     if not names:
         raise ValueError("`args` holds no floating-point array, so there is nothing to vary.")
     eps = float(jnp.finfo(working_dtype(varied)).eps)
-    rtol = eps**0.5 if rtol is None else rtol
+    relative = eps**0.5 if rtol is None else float(rtol)
 
     @jax.jit
     def value(x: PyTree[Array]) -> PyTree[Array]:
@@ -88,8 +88,8 @@ def assert_gradients(
             got["forward mode"] = _dot(cotangent, pushforward(varied, v))[0]
         if reverse:
             got["reverse mode"] = _dot(by_reverse, v)[0]
-        floor = rtol * _largest(output) if atol is None else atol
-        limit = rtol * size + floor
+        floor = relative * _largest(output) if atol is None else float(atol)
+        limit = relative * size + floor
         for mode, found in got.items():
             if not abs(found - expected) <= limit:
                 lines.append(

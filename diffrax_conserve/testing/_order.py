@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree, Real
+from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
 
@@ -75,9 +75,9 @@ def assert_order(
     span = jnp.asarray(t1, float) - t0
     count = int(np.ceil(float(jnp.abs(span / dt0)) - 1e-6))
     counts = count * _REFINEMENTS
-    args_of = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
-    finals = [_final(solver, *args_of, n, max_steps=int(counts[-1]) + 2) for n in counts]
-    exact = _reference(solver, args_of, count) if reference is None else reference
+    problem = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
+    finals = [_final(solver, problem, n, max_steps=int(counts[-1]) + 2) for n in counts]
+    exact = _reference(solver, problem, count) if reference is None else reference
     errors = np.array([float(_distance(y, exact)) for y in finals])
     _check_slope(errors, float(span) / counts, float(order), float(margin), _roundoff(exact))
 
@@ -85,15 +85,12 @@ def assert_order(
 @eqx.filter_jit
 def _final(
     solver: dfx.AbstractSolver,
-    terms: PyTree[dfx.AbstractTerm],
-    t0: Real[Array, ""],
-    span: Real[Array, ""],
-    y0: Y,
-    args: Args,
+    problem: tuple[PyTree[dfx.AbstractTerm], Array, Array, Y, Args],
     count: Any,
     *,
     max_steps: int,
 ) -> Y:
+    terms, t0, span, y0, args = problem
     sol = dfx.diffeqsolve(
         terms, solver, t0, t0 + span, span / count, y0, args, max_steps=max_steps, throw=False
     )
@@ -102,12 +99,12 @@ def _final(
     return jtu.tree_map(lambda y: jnp.where(okay, y[-1], jnp.nan), sol.ys)
 
 
-def _reference(solver: dfx.AbstractSolver, args_of: tuple[Any, ...], count: int) -> Y:
-    if isinstance(args_of[0], dfx.ODETerm):
+def _reference(solver: dfx.AbstractSolver, problem: tuple[Any, ...], count: int) -> Y:
+    if isinstance(problem[0], dfx.ODETerm):
         n = 10 * count * int(_REFINEMENTS[-1])
-        return _final(dfx.Dopri8(), *args_of, n, max_steps=n + 2)
+        return _final(dfx.Dopri8(), problem, n, max_steps=n + 2)
     n = 8 * count * int(_REFINEMENTS[-1])
-    return _final(solver, *args_of, n, max_steps=n + 2)
+    return _final(solver, problem, n, max_steps=n + 2)
 
 
 def _distance(y: Y, exact: Y) -> Float[Array, ""]:
