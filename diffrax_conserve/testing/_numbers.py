@@ -23,7 +23,7 @@ def rounded(magnitude: RealScalarLike) -> st.SearchStrategy[float]:
 
 def step_sizes(
     largest: RealScalarLike, *, smallest: RealScalarLike | None = None
-) -> st.SearchStrategy[float]:
+) -> st.SearchStrategy[np.float64]:
     r"""Step sizes for `dt0`, spread evenly on a logarithmic scale.
 
     **Arguments:**
@@ -33,8 +33,9 @@ def step_sizes(
 
     **Returns:**
 
-    A strategy of positive Python floats with three significant digits. It shrinks to `largest`:
-    a counter-example with few steps is the easiest to follow.
+    A strategy of positive numbers with three significant digits. It shrinks to `largest`: a
+    counter-example with few steps is the easiest to follow. They are NumPy's `float64`, since
+    [`equinox.filter_jit`][] compiles anew for each Python float.
 
     **Raises:**
 
@@ -62,8 +63,8 @@ def step_sizes(
         )
     ratio = smallest / largest
 
-    def step(fraction: float) -> float:
-        return min(max(float(f"{largest * ratio**fraction:.3g}"), smallest), largest)
+    def step(fraction: float) -> np.float64:
+        return np.float64(min(max(float(f"{largest * ratio**fraction:.3g}"), smallest), largest))
 
     return st.floats(0, 1).map(step)
 

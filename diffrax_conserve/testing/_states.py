@@ -6,16 +6,19 @@ from typing import Any
 import equinox as eqx
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, DTypeLike, PyTree
+from jaxtyping import ArrayLike, DTypeLike, PyTree
 
 from .. import systems as catalogue
-from .._custom_types import RealScalarLike, Y
+from .._custom_types import RealScalarLike
 from ..systems import AbstractSystem
 from ._numbers import rounded
+
+_TABLE_SIZE = 256
 
 
 def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.SearchStrategy[Any]:
@@ -72,12 +75,12 @@ def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.Se
 def system_states(
     system: AbstractSystem, *, dtype: DTypeLike | None = None
 ) -> st.SearchStrategy[Any]:
-    """Initial states of a system of the catalogue, from its sampling domain.
+    """Initial states of a system of the catalogue: its `y0` and 255 from its sampling domain.
 
     **Arguments:**
 
-    - `system`: an [`diffrax_conserve.systems.AbstractSystem`][], whose `sample` is called with
-        a drawn key.
+    - `system`: an [`diffrax_conserve.systems.AbstractSystem`][], whose `sample` is called
+        once, for all of them, so that nothing is compiled while a test draws.
     - `dtype`: of the states. Default: that of `system.y0`.
 
     **Returns:**
@@ -102,16 +105,19 @@ def system_states(
         ```
     """
 
-    def state(seed: int) -> Y:
-        y = system.y0 if seed == 0 else _sample(system, jnp.asarray(seed))
-        return jtu.tree_map(lambda x: np.asarray(x, x.dtype if dtype is None else dtype), y)
-
-    return st.integers(0, 2**16 - 1).map(state)
+    table = jtu.tree_map(
+        lambda x: np.asarray(x, x.dtype if dtype is None else dtype), _table(system)
+    )
+    # Copies, so that a test which writes to its input does not change what others draw.
+    return st.integers(0, _TABLE_SIZE - 1).map(
+        lambda index: jtu.tree_map(lambda x: x[index].copy(), table)
+    )
 
 
 @eqx.filter_jit
-def _sample(system: AbstractSystem, seed: Array) -> Y:
-    return system.sample(jr.key(seed))
+def _table(system: AbstractSystem) -> Any:
+    samples = jax.vmap(system.sample)(jr.split(jr.key(0), _TABLE_SIZE - 1))
+    return jtu.tree_map(lambda x, xs: jnp.concatenate([x[None], xs]), system.y0, samples)
 
 
 def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[AbstractSystem]:

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, PyTree
 
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._custom_types import Args, Manifold, RealScalarLike, Values
 from .._manifold import Constraint, FirstIntegral, is_entry
 
 
@@ -43,21 +43,22 @@ class Restructuring(eqx.Module):
         ```
     """
 
-    shapes: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
-    like: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    shapes: Any = eqx.field(static=True)
+    like: Any = eqx.field(static=True)
+    # Both are PyTrees of `jax.ShapeDtypeStruct`.
 
-    def pack(self, y: Y) -> Y:
+    def pack(self, y: Any) -> Any:
         """`y` in the new structure."""
         return _fill(self.shapes, y)
 
-    def unpack(self, z: Y) -> Y:
+    def unpack(self, z: Any) -> Any:
         """The state whose packed form is `z`."""
         return _fill(self.like, z)
 
     def vector_field(self, vector_field: Callable[..., Any]) -> Callable[..., Any]:
         """The vector field `f(t, z, args)` of the packed state."""
 
-        def packed(t: RealScalarLike, z: Y, args: Args) -> Y:
+        def packed(t: RealScalarLike, z: Any, args: Args) -> Any:
             return self.pack(vector_field(t, self.unpack(z), args))
 
         return packed
@@ -66,7 +67,7 @@ class Restructuring(eqx.Module):
         """The manifold of the packed state, with the same names and conserved values."""
 
         def repack(entry: FirstIntegral | Constraint) -> FirstIntegral | Constraint:
-            def fn(t: RealScalarLike, z: Y, args: Args) -> Values:
+            def fn(t: RealScalarLike, z: Any, args: Args) -> Values:
                 return entry.fn(t, self.unpack(z), args)
 
             return eqx.tree_at(lambda e: e.fn, entry, fn)
@@ -84,7 +85,7 @@ class _Shape(tuple):
         return f"<{'×'.join(map(str, self)) or 'scalar'}>"
 
 
-def _fill(shapes: PyTree[jax.ShapeDtypeStruct], y: Y) -> Y:
+def _fill(shapes: Any, y: Any) -> Any:
     flat, _ = ravel_pytree(y)
     leaves, treedef = jtu.tree_flatten(shapes)
     out, start = [], 0
