@@ -1,6 +1,7 @@
 """Strategies for numbers: components of states, step sizes, times."""
 
 import math
+from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -23,7 +24,7 @@ def rounded(magnitude: RealScalarLike) -> st.SearchStrategy[float]:
 
 def step_sizes(
     largest: RealScalarLike, *, smallest: RealScalarLike | None = None
-) -> st.SearchStrategy[np.float64]:
+) -> st.SearchStrategy[Any]:
     r"""Step sizes for `dt0`, spread evenly on a logarithmic scale.
 
     **Arguments:**

@@ -143,7 +143,7 @@ def _trees(size: int, depth: int, dtype: Any) -> st.SearchStrategy[Any]:
     return st.one_of(leaf, first.flatmap(container))
 
 
-def _shapes(size: int) -> list[tuple[int, ...]]:
+def _shapes(size: int) -> list[Any]:
     """Shapes of `size` scalars, the simplest first."""
     matrices = [(n, size // n) for n in range(1, size + 1) if size % n == 0]
     return [*([()] if size == 1 else []), (size,), *matrices]
