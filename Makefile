@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow lint format types docs examples bench bench-smoke bench-learned build clean distclean
+.PHONY: help demo test slow soak lint format types docs examples bench bench-smoke bench-learned build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -60,6 +60,12 @@ test: $(TEST) ## run the tests, without the slow ones
 
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+
+COUNT ?= 10000
+SEED ?= 0
+
+soak: $(TEST) ## try COUNT random combinations of everything, in search of a wrong one
+	$(BIN)/python tests/soak.py --count $(COUNT) --seed $(SEED)
 
 lint: $(DEV) ## check style and formatting
 	$(BIN)/ruff check .

@@ -9,7 +9,10 @@ from ._network import PINN as PINN
 from ._network import ConservativeLayer as ConservativeLayer
 from ._network import DeepONet as DeepONet
 from ._projection import AbstractProjection as AbstractProjection
+from ._projection import ClosedForm as ClosedForm
+from ._projection import Failure as Failure
 from ._projection import Newton as Newton
+from ._projection import Problem as Problem
 from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
 from ._projection import project as project
@@ -22,6 +25,8 @@ from ._solver import RK4 as RK4
 from ._solver import DeepONetSolver as DeepONetSolver
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
+from ._solver import ProjectionStatistics as ProjectionStatistics
+from ._solver import statistics as statistics
 from ._training import FitLog as FitLog
 from ._training import Recipe as Recipe
 from ._training import bounded as bounded

@@ -17,59 +17,47 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PyTree
 
-from ._custom_types import Args, DenseInfo, Manifold, RealScalarLike, Values
-from ._projection import AbstractProjection, apply
+from ._custom_types import DenseInfo, RealScalarLike
+from ._projection import Target
 from ._tree import tree_sub
 
 
 @final
-class Target(eqx.Module):
-    """Where to project to, as it travels in `dense_info`: only arrays are leaves."""
+class PackedTarget(eqx.Module):
+    """A `Target` as it travels in `dense_info`: only arrays are leaves."""
 
     arrays: PyTree[Array]
     static: Any = eqx.field(static=True)
 
-    def __init__(
-        self,
-        projection: AbstractProjection,
-        manifold: Manifold,
-        values: Values,
-        args: Args,
-        direction: Array,
-    ):
-        arrays, static = eqx.partition(
-            (projection, manifold, values, args, direction), eqx.is_array_like
-        )
+    def __init__(self, target: Target):
+        arrays, static = eqx.partition(target, eqx.is_array_like)
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
         leaves, treedef = jtu.tree_flatten(static)
         self.static = (tuple(leaves), treedef)
 
-    def project(self, t: RealScalarLike, candidate: PyTree[Array]) -> PyTree[Array]:
-        """The projected state, NaN where the projection failed."""
+    def unpack(self) -> Target:
         leaves, treedef = self.static
-        projection, manifold, values, args, direction = eqx.combine(
-            self.arrays, jtu.tree_unflatten(treedef, leaves)
-        )
-        y, info = apply(projection, manifold, values, t * direction, candidate, args)
-        success = info.result == optx.RESULTS.successful
-        return jtu.tree_map(lambda x: jnp.where(success, x, jnp.asarray(np.nan, x.dtype)), y)
+        return eqx.combine(self.arrays, jtu.tree_unflatten(treedef, leaves))
 
 
 @final
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
-    """A local interpolation whose values lie on a manifold."""
+    """A local interpolation whose values lie on a manifold, or are NaN where the projection
+    fails."""
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
-    target: Target
+    target: PackedTarget
 
     def evaluate(
         self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        return self.target.project(t0, self.inner.evaluate(t0, left=left))
+        y, info = self.target.unpack().project(t0, self.inner.evaluate(t0, left=left))
+        success = info.result == optx.RESULTS.successful
+        return jtu.tree_map(lambda x: jnp.where(success, x, jnp.asarray(np.nan, x.dtype)), y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +68,6 @@ class MakeManifoldInterpolation:
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 
     def __call__(
-        self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, target: Target
+        self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, target: PackedTarget
     ) -> ManifoldInterpolation:
         return ManifoldInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **inner), target)

@@ -3,15 +3,21 @@
 import abc
 import functools as ft
 import math
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
+
+# Above this many scalar constraints their gradients are never formed: what is needed of them is
+# computed from products with them.
+DENSE_MAX = 128
 
 
 class AbstractConserved(eqx.Module):
@@ -158,7 +164,14 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
 
 
 def scales(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """What roundoff in `evaluate` is relative to, `|value| + Σ_k |y_k ∂I/∂y_k|`."""
+    """What roundoff in `evaluate` is relative to, `|value| + Σ_k |y_k ∂I/∂y_k|`.
+
+    With more than `DENSE_MAX` constraints an estimate of the Euclidean norm takes the place of the
+    sum.
+    """
+    if sum(jnp.size(value) for value in jtu.tree_leaves(values)) > DENSE_MAX:
+        _, forward = jax.linearize(lambda y: evaluate(manifold, t, y, args), y)
+        return jtu.tree_map(lambda v, e: jnp.abs(v) + e, values, estimated_norms(forward, y))
     jacobian = jax.jacrev(lambda y: evaluate(manifold, t, y, args))(y)
 
     def scale(value: Array, rows: Y) -> Array:
@@ -169,6 +182,26 @@ def scales(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Ar
         return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(contract, rows, y)), jnp.abs(value))
 
     return jtu.tree_map(scale, values, jacobian)
+
+
+def estimated_norms(linear: Callable[[Y], Values], weights: Y) -> Values:
+    """The norms of the rows of `G diag(weights)`, where `linear` is `y ↦ G y`.
+
+    Estimated without forming a row: for random signs `s` the mean of `(G (weights s))²` is the
+    squared norm, so over 16 draws, always the same, it is good to about a third.
+    """
+    leaves, treedef = jtu.tree_flatten(weights)
+    keys = jr.split(jr.key(0), len(leaves))
+
+    def probe(index: Array) -> Values:
+        signed = [
+            jr.rademacher(jr.fold_in(key, index), jnp.shape(leaf), jnp.result_type(leaf)) * leaf
+            for key, leaf in zip(keys, leaves, strict=True)
+        ]
+        return jtu.tree_map(jnp.square, linear(jtu.tree_unflatten(treedef, signed)))
+
+    squares = jax.vmap(probe)(jnp.arange(16))
+    return jtu.tree_map(lambda x: jnp.sqrt(jnp.mean(x, axis=0)), squares)
 
 
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:

@@ -153,3 +153,14 @@ def test_drift_of_nothing():
         dfc.drift(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=dfx.SaveAt(dense=True)), RIGID_BODY)
     with pytest.raises(ValueError, match=r"jax\.vmap"):
         dfc.drift(batch, RIGID_BODY)
+
+
+def test_a_closed_form_needs_a_function():
+    with pytest.raises(TypeError, match="not callable"):
+        dfc.ClosedForm(3.0)  # pyright: ignore
+
+
+@pytest.mark.parametrize("bad", [1.5, "2"])
+def test_every_is_an_integer(bad):
+    with pytest.raises(ValueError, match="`every`"):
+        wrap(dfc.FirstIntegral(lambda t, y, args: y), every=bad)

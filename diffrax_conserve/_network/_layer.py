@@ -133,7 +133,7 @@ def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) ->
         g, at_y = linearise(residual, y)
         scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
         damping = jnp.minimum(1e-2, _relative_square(g, scale)).astype(dtype)
-        change = at_y.gram_solver(weights, at_candidate, damping)(g)
+        change = at_y.gram_solver(weights, at_candidate, damping).solve(g)
         step = at_candidate.pullback(change)
         shortening = lax.rsqrt(1 + tree_dot(step, step, dtype) / jnp.square(radius))
         return tree_sub(multipliers, tree_scale(shortening, change))
@@ -181,8 +181,8 @@ def _conserve_jvp(primals, tangents, *, steps):
     t_multipliers = lax.custom_linear_solve(
         product,
         t_g,
-        solve=lambda _, b: at_y.gram_solver(weights, at_candidate)(b),
-        transpose_solve=lambda _, b: at_candidate.gram_solver(weights, at_y)(b),
+        solve=lambda _, b: at_y.gram_solver(weights, at_candidate).solve(b),
+        transpose_solve=lambda _, b: at_candidate.gram_solver(weights, at_y).solve(b),
     )
     _, _, p, s = fixed
     share = jnp.where(p == 0, 0, jnp.where(p == 1, s, 1))

@@ -1,8 +1,13 @@
+from ._base import DECADES as DECADES
 from ._base import AbstractProjection as AbstractProjection
+from ._base import Failure as Failure
+from ._base import Problem as Problem
 from ._base import ProjectionInfo as ProjectionInfo
+from ._closed_form import ClosedForm as ClosedForm
 from ._newton import Newton as Newton
-from ._project import apply as apply
 from ._project import check_metric as check_metric
 from ._project import check_state as check_state
 from ._project import project as project
+from ._project import tangential as tangential
 from ._simplified_newton import SimplifiedNewton as SimplifiedNewton
+from ._target import Target as Target

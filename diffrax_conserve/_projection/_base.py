@@ -11,9 +11,47 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from .._custom_types import Y
+from .._custom_types import Args, RealScalarLike, Values, Y
 from .._tree import tree_all_finite, tree_dot, tree_sub, working_dtype
-from ._jacobian import AbstractJacobian, Residual, Vector
+from ._elimination import Vector
+from ._jacobian import AbstractJacobian, Residual
+
+
+class Failure(eqx.Module):
+    """The constraint with the largest relative residual after a projection that failed.
+
+    **Attributes:**
+
+    - `index`: its position among the scalar constraints, in the order in which the manifold is
+        flattened; 0 if the projection succeeded.
+    - `decade`: the order of magnitude of its residual relative to its scale, `⌊log10⌋`, from -16
+        to 3, beyond which it is cut off; -17 if the projection succeeded.
+    """
+
+    index: Int[Array, ""]
+    decade: Int[Array, ""]
+
+    @classmethod
+    def none(cls) -> "Failure":
+        return cls(jnp.asarray(0), jnp.asarray(DECADES[0] - 1))
+
+    @classmethod
+    def of(
+        cls, before: Vector, scale_before: Vector, after: Vector, scale_after: Vector
+    ) -> "Failure":
+        """Of the residuals before and after, which can be larger, the smaller ones count."""
+        relative = [_relative(before, scale_before), _relative(after, scale_after)]
+        relative = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in relative]
+        smaller = jnp.minimum(*relative)
+        index = jnp.argmax(smaller)
+        bounded = jnp.clip(smaller[index], 10.0 ** DECADES[0], 10.0 ** DECADES[-1])
+        return cls(index, jnp.floor(jnp.log10(bounded)).astype(int))
+
+    def unless(self, success: Bool[Array, ""]) -> "Failure":
+        return jtu.tree_map(lambda a, b: jnp.where(success, a, b), Failure.none(), self)
+
+
+DECADES = range(-16, 4)
 
 
 class ProjectionInfo(eqx.Module):
@@ -29,6 +67,9 @@ class ProjectionInfo(eqx.Module):
         $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus
         $|\\partial g/\\partial y| \\, |y - \\hat y|$.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
+    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate. With more
+        than 128 constraints, where it is not formed, their number.
+    - `failure`: what was left of the worst constraint, if the projection failed.
     """
 
     result: optx.RESULTS
@@ -36,6 +77,29 @@ class ProjectionInfo(eqx.Module):
     residual_before: Float[Array, ""]
     residual_after: Float[Array, ""]
     correction: Float[Array, ""]
+    rank: Int[Array, ""]
+    failure: "Failure"
+
+
+class Problem(eqx.Module):
+    """What a projection solves.
+
+    **Attributes:**
+
+    - `residual`: `y ↦ g(y)`, whose closed-over arrays are part of its PyTree. Its values are a
+        tuple of scalars, or one array if there are many.
+    - `magnitude`: the absolute conserved values, as `residual` returns them.
+    - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
+    - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
+        manifold, from which `residual` was made.
+    """
+
+    residual: Residual
+    magnitude: Vector
+    weights: Y
+    t: RealScalarLike
+    args: Args
+    values: Values
 
 
 class AbstractProjection(eqx.Module):
@@ -44,17 +108,10 @@ class AbstractProjection(eqx.Module):
     metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
 
     @abc.abstractmethod
-    def solve(
-        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
-    ) -> tuple[Y, ProjectionInfo]:
-        """The state on the manifold that belongs to `candidate`.
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        """The state on the manifold that belongs to `candidate`, shaped like it.
 
-        **Arguments:**
-
-        - `residual`: `y ↦ g(y)`, whose closed-over arrays are part of its PyTree.
-        - `magnitude`: the absolute conserved values, as `residual` returns them.
-        - `candidate`: the state to be projected.
-        - `weights`: `M⁻¹`, the inverse of the metric, shaped like the candidate.
+        Never raises at run time; `info.result` is successful only if every residual is small.
         """
 
 
@@ -134,26 +191,35 @@ def report(
     before: Vector,
     after: Vector,
     scale: Vector,
+    rank: Int[Array, ""],
+    failure: Failure,
 ) -> ProjectionInfo:
     """The `ProjectionInfo` of a projection from `candidate` to `y`."""
-    failure = optx.RESULTS.where(
-        tree_all_finite(after), optx.RESULTS.nonlinear_max_steps_reached, optx.RESULTS.nonfinite
+    kinds = optx.RESULTS
+    unsatisfied = kinds.where(
+        tree_all_finite(after), kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
     )
+    unsuccessful = kinds.where(tree_all_finite(before), unsatisfied, kinds.nonfinite)
     correction = tree_sub(y, candidate)
     return ProjectionInfo(
-        result=optx.RESULTS.where(success, optx.RESULTS.successful, failure),
+        result=kinds.where(success, kinds.successful, unsuccessful),
         num_steps=num_steps,
         residual_before=largest_relative(before, scale),
         residual_after=largest_relative(after, scale),
         correction=jnp.sqrt(tree_dot(correction, correction, working_dtype(y))),
+        rank=rank,
+        failure=failure,
     )
 
 
 def largest_relative(residual: Vector, scale: Vector) -> Float[Array, ""]:
     """The largest residual relative to its scale."""
+    return jnp.max(_relative(residual, scale))
 
+
+def _relative(residual: Vector, scale: Vector) -> Float[Array, " m"]:
     def relative(g: Array, s: Array) -> Array:
         tiny = jnp.finfo(s.dtype).tiny
-        return jnp.max(jnp.abs(g) / jnp.maximum(s, tiny))
+        return jnp.atleast_1d(jnp.abs(g) / jnp.maximum(s, tiny))
 
-    return jnp.max(jnp.stack(jtu.tree_leaves(jtu.tree_map(relative, residual, scale))))
+    return jnp.concatenate(jtu.tree_leaves(jtu.tree_map(relative, residual, scale)))

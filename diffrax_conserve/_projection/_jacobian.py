@@ -3,7 +3,8 @@
 Vectors of `m` numbers (residuals, multipliers) come in two forms, and code that uses them must
 treat them as PyTrees: for few constraints a tuple of `m` scalars, so that each product, sum and
 2×2 solve is plain elementwise arithmetic that XLA fuses into the step around it (a `linalg` call on
-a 2×2 matrix costs more than the step itself); for many, one array of shape `(m,)`.
+a 2×2 matrix costs more than the step itself); for many, one array of shape `(m,)`. For very many
+the rows are never formed.
 """
 
 import abc
@@ -16,17 +17,19 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import Y
+from .._manifold import DENSE_MAX, estimated_norms
 from .._tree import tree_dot, tree_mul, working_dtype
+from ._elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
-Vector = PyTree[Real[Array, "..."]]  # a tuple of m scalars, or an array of shape (m,)
 Residual = Callable[[Y], Vector]
 
 # Up to this many constraints are unrolled: work and compile time grow as m², against a call into
 # LAPACK that costs some microseconds however small the matrix.
-UNROLLED_MAX = 6
+UNROLLED_MAX = 10
 
 
 class AbstractJacobian(eqx.Module):
@@ -54,10 +57,10 @@ class AbstractJacobian(eqx.Module):
         weights: Y,
         other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
-    ) -> Callable[[Vector], Vector]:
-        """`b ↦ (G W Hᵀ)⁻¹ b`, where `H` is `other`, a Jacobian of the same kind, or `G`.
+    ) -> GramSolver:
+        """Solves with `G W Hᵀ`, where `H` is `other`, a Jacobian of the same kind, or `G`.
 
-        `damping` is added to the diagonal after the rows are scaled to a diagonal of ones.
+        `damping` is relative to the diagonal, to which it is added.
         """
 
 
@@ -73,6 +76,9 @@ def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
         )
         return outs, _Unrolled(rows)
     out, vjp = jax.vjp(residual, y)
+    if out.size > DENSE_MAX:
+        _, jvp = jax.linearize(residual, y)
+        return out, _MatrixFree(jvp, lambda multiplier: vjp(multiplier)[0])
     (rows,) = jax.vmap(vjp)(jnp.eye(out.size, dtype=out.dtype))
     return out, _Dense(rows)
 
@@ -106,7 +112,7 @@ class _Unrolled(AbstractJacobian):
         weights: Y,
         other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
-    ) -> Callable[[Vector], Vector]:
+    ) -> GramSolver:
         columns = self.rows if other is None else other.rows
         dtype = working_dtype(columns[0])
         weighted = [tree_mul(column, weights) for column in columns]
@@ -119,7 +125,7 @@ class _Unrolled(AbstractJacobian):
                     for j in range(len(columns))
                 ]
             )
-        return _unrolled_solver(gram, damping)
+        return unrolled_solver(gram, damping)
 
 
 @final
@@ -154,7 +160,7 @@ class _Dense(AbstractJacobian):
         weights: Y,
         other: Any = None,
         damping: Real[Array, ""] | float = 0.0,
-    ) -> Callable[[Vector], Vector]:
+    ) -> GramSolver:
         columns = self.rows if other is None else other.rows
         dtype = working_dtype(columns)
 
@@ -166,81 +172,67 @@ class _Dense(AbstractJacobian):
             ).astype(dtype)
 
         products = jtu.tree_leaves(jtu.tree_map(product, self.rows, columns, weights))
-        gram = ft.reduce(jnp.add, products)
-        inverse = _reciprocal(jnp.diagonal(gram))
-        return _dense_solver(gram * inverse[:, None], inverse, damping)
+        return dense_solver(ft.reduce(jnp.add, products), damping)
 
 
-# Rows are scaled so that the diagonal of the Gram matrix is 1. The factors are those of Gaussian
-# elimination without pivoting: a Gram matrix is positive semi-definite, and `G W Hᵀ` of two nearby
-# Jacobians nearly so. A pivot at the level of roundoff marks a constraint whose gradient depends on
-# the earlier ones; its multiplier is zero, which changes nothing where the constraints are
-# consistent. (Damping instead would leave huge multipliers along the null vector, whose roundoff
-# moves the state.) Where gradients are merely almost parallel nothing is dropped: the direction in
-# which they differ is the one that is needed.
+# The accuracy of one iterative solve. The iteration around it corrects what is left, so the total
+# number of inner iterations hardly depends on it.
+_SOLVE_RTOL = 1e-4
+# With two different Jacobians, how often the solve with one is corrected: to roundoff.
+_CORRECTIONS = 4
 
 
-def _least_pivot(m: int, dtype: jnp.dtype) -> float:
-    return 4 * m * float(jnp.finfo(dtype).eps)
+@final
+class _MatrixFree(AbstractJacobian):
+    """Only products: `G y` by forward mode, `Gᵀ λ` by reverse mode, solves by conjugate gradients.
 
+    Memory is that of a few states. Norms of rows are estimates, good to about a third: see
+    `estimated_norms`.
+    """
 
-def _reciprocal(x: Array) -> Array:
-    positive = x > 0
-    return jnp.where(positive, 1 / jnp.where(positive, x, 1), 0)
+    forward: Callable[[Y], Vector]
+    backward: Callable[[Vector], Y]
 
+    def pullback(self, multiplier: Vector) -> Y:
+        return self.backward(multiplier)
 
-def _unrolled_solver(
-    gram: list[list[Array]], damping: Real[Array, ""] | float
-) -> Callable[[Vector], Vector]:
-    m = len(gram)
-    least = _least_pivot(m, gram[0][0].dtype)
-    inverse = [_reciprocal(gram[i][i]) for i in range(m)]
-    lu = [[gram[i][j] * inverse[i] for j in range(m)] for i in range(m)]
-    pivots = []
-    for k in range(m):
-        pivot = lu[k][k] + damping
-        pivots.append(jnp.where(pivot > least, 1 / jnp.where(pivot > least, pivot, 1), 0))
-        for i in range(k + 1, m):
-            lu[i][k] = lu[i][k] * pivots[k]
-            for j in range(k + 1, m):
-                lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
+    def pushforward(self, y: Y) -> Vector:
+        return self.forward(y)
 
-    def solve(b: Vector) -> Vector:
-        x = [b[i] * inverse[i] for i in range(m)]
-        for i in range(1, m):
-            for j in range(i):
-                x[i] = x[i] - lu[i][j] * x[j]
-        for i in reversed(range(m)):
-            for j in range(i + 1, m):
-                x[i] = x[i] - lu[i][j] * x[j]
-            x[i] = x[i] * pivots[i]
-        return tuple(x)
+    def scale(self, y: Y) -> Vector:
+        return estimated_norms(self.forward, y)
 
-    return solve
+    def squared_norms(self, weights: Y) -> Vector:
+        return jnp.square(estimated_norms(self.forward, jtu.tree_map(jnp.sqrt, weights)))
 
+    def gram_solver(
+        self,
+        weights: Y,
+        other: Any = None,
+        damping: Real[Array, ""] | float = 0.0,
+    ) -> GramSolver:
+        diagonal = self.squared_norms(weights)
+        diagonal = jnp.where(diagonal > 0, diagonal, 1)
+        struct = jax.eval_shape(lambda: diagonal)
 
-def _dense_solver(
-    scaled: Real[Array, "m m"], inverse: Real[Array, " m"], damping: Real[Array, ""] | float
-) -> Callable[[Vector], Vector]:
-    m = scaled.shape[0]
-    least = _least_pivot(m, scaled.dtype)
-    index = jnp.arange(m)
+        def symmetric(x: Vector) -> Vector:
+            return self.forward(tree_mul(self.backward(x), weights)) + damping * diagonal * x
 
-    def eliminate(k: Array, factors: tuple[Array, Array]) -> tuple[Array, Array]:
-        lower, upper = factors
-        pivot = upper[k, k]
-        used = (index > k) & (pivot > least)
-        column = jnp.where(used, upper[:, k] / jnp.where(pivot > least, pivot, 1), 0)
-        upper = upper - column[:, None] * upper[k][None, :]
-        return lower.at[:, k].add(column), upper
+        tag = lx.positive_semidefinite_tag
+        operator = lx.FunctionLinearOperator(symmetric, struct, tag)
+        preconditioner = lx.TaggedLinearOperator(lx.DiagonalLinearOperator(1 / diagonal), tag)
+        solver = lx.CG(rtol=_SOLVE_RTOL, atol=float(jnp.finfo(diagonal.dtype).tiny))
 
-    identity = jnp.eye(m, dtype=scaled.dtype)
-    lower, upper = lax.fori_loop(0, m, eliminate, (identity, scaled + damping * identity))
-    kept = jnp.diagonal(upper) > least
-    upper = jnp.where(kept[:, None], upper, identity)
+        def solve(b: Vector) -> Vector:
+            options = dict(preconditioner=preconditioner)
+            return lx.linear_solve(operator, b, solver, options=options, throw=False).value
 
-    def solve(b: Vector) -> Vector:
-        x = jax.scipy.linalg.solve_triangular(lower, b * inverse, lower=True, unit_diagonal=True)
-        return jax.scipy.linalg.solve_triangular(upper, jnp.where(kept, x, 0))
+        def corrected(b: Vector) -> Vector:
+            x = solve(b)
+            for _ in range(_CORRECTIONS):
+                product = self.forward(tree_mul(other.backward(x), weights))
+                x = x + solve(b - product)
+            return x
 
-    return solve
+        rank = jnp.asarray(diagonal.size)
+        return GramSolver(solve if other is None else corrected, rank)

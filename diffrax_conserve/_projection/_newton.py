@@ -14,13 +14,16 @@ from .._custom_types import Y
 from .._tree import tree_add, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
 from ._base import (
     AbstractProjection,
+    Failure,
+    Problem,
     ProjectionInfo,
     positive_weights,
     report,
     tolerances,
     within,
 )
-from ._jacobian import Residual, Vector, linearise
+from ._elimination import Vector
+from ._jacobian import Residual, linearise
 
 # Above this many unknowns the optimality system is solved iteratively, matrix-free.
 _DENSE_MAX = 256
@@ -78,19 +81,25 @@ class Newton(AbstractProjection):
         self.max_steps = max_steps
         self.metric = positive_weights(metric)
 
-    def solve(
-        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
-    ) -> tuple[Y, ProjectionInfo]:
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        residual, magnitude, weights = problem.residual, problem.magnitude, problem.weights
         # The iterations are not differentiated: the optimality system is.
         fixed = _stop_gradient((residual, magnitude, candidate, weights))
         start, count = _reach(*fixed, projection=self)
         y, nearest = _nearest(residual, candidate, weights, start, self.max_steps)
 
         after, at_y = linearise(residual, y)
-        scale, tolerance = tolerances(at_y, y, candidate, weights, magnitude, self.rtol, self.atol)
+
+        def scales(y: Y) -> tuple[Vector, Vector]:
+            return tolerances(at_y, y, candidate, weights, magnitude, self.rtol, self.atol)
+
+        scale, tolerance = scales(y)
         success = within(after, tolerance) & (nearest.result == optx.RESULTS.successful)
-        num_steps = count + nearest.stats["num_steps"]
-        info = report(success, num_steps, candidate, y, residual(candidate), after, scale)
+        count = count + nearest.stats["num_steps"]
+        rank = at_y.gram_solver(weights).rank
+        before = residual(candidate)
+        failure = Failure.of(before, scales(candidate)[0], after, scale).unless(success)
+        info = report(success, count, candidate, y, before, after, scale, rank, failure)
         return y, _stop_gradient(info)
 
 
@@ -135,8 +144,8 @@ def _reach(
             jacobian, y, candidate, weights, magnitude, projection.rtol, projection.atol
         )
         merit = squared(g, scale)
-        gram_solve = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
-        step = tree_mul(jacobian.pullback(gram_solve(g)), weights)
+        gram_solver = jacobian.gram_solver(weights, damping=jnp.minimum(1e-2, merit))
+        step = tree_mul(jacobian.pullback(gram_solver.solve(g)), weights)
 
         def attempt(fraction: Array) -> tuple[Array, Array, Y]:
             trial = tree_sub(y, tree_scale(fraction, step))
@@ -183,7 +192,8 @@ def _nearest(
     multipliers that suit the candidate best there."""
     fixed = _stop_gradient((residual, candidate, weights))
     _, jacobian = linearise(fixed[0], start)
-    multiplier = jacobian.gram_solver(fixed[2])(jacobian.pushforward(tree_sub(start, fixed[1])))
+    offset = jacobian.pushforward(tree_sub(start, fixed[1]))
+    multiplier = jacobian.gram_solver(fixed[2]).solve(offset)
     # Gradients of norm one, so that a linear solver sees the rank of the system.
     norms = jtu.tree_map(
         lambda x: jnp.sqrt(jnp.where(x > 0, x, 1)), jacobian.squared_norms(fixed[2])

@@ -1,10 +1,12 @@
 """`project`: one state to the manifold. Also what the solver and the interpolation call."""
 
+import functools as ft
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
@@ -16,10 +18,12 @@ from .._manifold import (
     conserved_values,
     evaluate,
     is_entry,
+    scales,
 )
-from .._tree import working_dtype
-from ._base import AbstractProjection, ProjectionInfo
-from ._jacobian import UNROLLED_MAX, Vector
+from .._tree import tree_mul, tree_sub, working_dtype
+from ._base import AbstractProjection, Problem, ProjectionInfo
+from ._elimination import Vector
+from ._jacobian import UNROLLED_MAX, linearise
 from ._newton import Newton
 
 
@@ -105,6 +109,48 @@ def apply(
     args: Args,
 ) -> tuple[Y, ProjectionInfo]:
     """`project` without its checks."""
+    return projection.solve(_problem(projection, manifold, values, t, candidate, args), candidate)
+
+
+def tangential(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    vector: Y,
+) -> Y:
+    """The part of `vector` that is tangent to the manifold at `y`, `v - M⁻¹Gᵀ(GM⁻¹Gᵀ)⁻¹G v`."""
+    problem = _problem(projection, manifold, values, t, y, args)
+    _, jacobian = linearise(problem.residual, y)
+    gram_solver = jacobian.gram_solver(problem.weights)
+    normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(vector)))
+    return tree_sub(vector, tree_mul(normal, problem.weights))
+
+
+def relative_residual(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> Real[Array, ""]:
+    """The largest residual at `y`, relative to its scale there."""
+    out = evaluate(manifold, t, y, args)
+    ratios = jtu.tree_map(
+        lambda g, v, s: jnp.max(jnp.abs(g - v) / jnp.where(s > 0, s, 1)),
+        out,
+        values,
+        scales(manifold, values, t, y, args),
+    )
+    return ft.reduce(jnp.maximum, jtu.tree_leaves(ratios))
+
+
+def _problem(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+) -> Problem:
     dtype = working_dtype(candidate)
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
     unrolled = sum(x.size for x in jtu.tree_leaves(outputs)) <= UNROLLED_MAX
@@ -122,7 +168,8 @@ def apply(
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
     residual = eqx.filter_closure_convert(residual, candidate)
     magnitude = vector(jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values))
-    return projection.solve(residual, magnitude, candidate, _inverse(projection.metric, candidate))
+    weights = _inverse(projection.metric, candidate)
+    return Problem(residual, magnitude, weights, t, args, values)
 
 
 def check_state(y: Y) -> None:

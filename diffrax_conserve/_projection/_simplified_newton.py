@@ -1,18 +1,22 @@
 """The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4: one Jacobian, few
 iterations. For candidates that are as close as an integrator's local error."""
 
+import functools as ft
 from typing import final
 
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import BoolScalarLike, Y
 from .._tree import tree_add, tree_all_finite, tree_mul, tree_scale
+from ._any_lane import continue_if_any
 from ._base import (
     AbstractProjection,
+    Failure,
+    Problem,
     ProjectionInfo,
     largest_relative,
     positive_weights,
@@ -20,7 +24,8 @@ from ._base import (
     tolerances,
     within,
 )
-from ._jacobian import AbstractJacobian, Residual, Vector, linearise
+from ._elimination import GramSolver, Vector
+from ._jacobian import AbstractJacobian, Residual, linearise
 
 # Iterations that are written out before the loop: enough for nearly every step of an integrator,
 # so that in a batch no lane waits for a loop that it does not need.
@@ -81,11 +86,15 @@ class SimplifiedNewton(AbstractProjection):
         self.max_steps = max_steps
         self.metric = positive_weights(metric)
 
-    def solve(
-        self, residual: Residual, magnitude: Vector, candidate: Y, weights: Y
-    ) -> tuple[Y, ProjectionInfo]:
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         y, _, info = _solve(
-            residual, candidate, weights, magnitude, self.rtol, self.atol, max_steps=self.max_steps
+            problem.residual,
+            candidate,
+            problem.weights,
+            problem.magnitude,
+            self.rtol,
+            self.atol,
+            max_steps=self.max_steps,
         )
         return y, info
 
@@ -113,6 +122,42 @@ def _displaced(jacobian: AbstractJacobian, multiplier: Vector, y: Y, weights: Y)
     return tree_add(y, tree_mul(jacobian.pullback(multiplier), weights))
 
 
+class _Iteration(eqx.Module):
+    """The iteration from one candidate, with its frozen Jacobian."""
+
+    residual: Residual
+    candidate: Y
+    weights: Y
+    magnitude: Vector
+    rtol: float | Array | None
+    atol: float | Array | None
+
+    def stepper(self) -> tuple[Vector, AbstractJacobian, GramSolver]:
+        g, jacobian = linearise(self.residual, self.candidate)
+        return g, jacobian, jacobian.gram_solver(self.weights)
+
+    def step(
+        self, jacobian: AbstractJacobian, gram_solver: GramSolver, iterate: _Iterate
+    ) -> _Iterate:
+        # The state is updated by increments, which shrink, rather than from the multipliers, which
+        # can be large and cancel: so its roundoff is relative to its own size in the end.
+        y, multiplier, g, count = iterate
+        change = jtu.tree_map(jnp.negative, gram_solver.solve(g))
+        y = _displaced(jacobian, change, y, self.weights)
+        return y, jtu.tree_map(jnp.add, multiplier, change), self.residual(y), count + 1
+
+    def judge(
+        self, jacobian: AbstractJacobian, iterate: _Iterate, stalled: BoolScalarLike
+    ) -> tuple[Bool[Array, ""], Bool[Array, ""], Vector]:
+        """Whether it is done, whether it has succeeded, and the scales of the constraints."""
+        y, _, g, _ = iterate
+        scale, tolerance = tolerances(
+            jacobian, y, self.candidate, self.weights, self.magnitude, self.rtol, self.atol
+        )
+        success = within(g, tolerance)
+        return success & (within(g, tree_scale(0.25, tolerance)) | stalled), success, scale
+
+
 @eqx.filter_custom_jvp
 def _solve(
     residual: Residual,
@@ -124,44 +169,54 @@ def _solve(
     *,
     max_steps: int,
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    before, jacobian = linearise(residual, candidate)
-    gram_solve = jacobian.gram_solver(weights)
+    iteration = _Iteration(residual, candidate, weights, magnitude, rtol, atol)
+    before, jacobian, gram_solver = iteration.stepper()
+    iterate = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
+    for _ in range(min(INLINE_STEPS, max_steps)):
+        iterate = iteration.step(jacobian, gram_solver, iterate)
+    done, success, scale = iteration.judge(jacobian, iterate, stalled=False)
+    # Few steps need more, so the loop recomputes what it needs: if it shared the Jacobian, that
+    # would be written to memory at every step of the solve.
+    state = (iterate, success, scale, Failure.none())
+    iterate, success, scale, failure = continue_if_any(
+        ft.partial(_loop, max_steps), ~done, state, iteration
+    )
+    y, multiplier, after, count = iterate
+    rank = gram_solver.rank
+    info = report(success, count, candidate, y, before, after, scale, rank, failure)
+    return y, multiplier, info
 
-    def scales(y: Y) -> tuple[Vector, Vector]:
-        return tolerances(jacobian, y, candidate, weights, magnitude, rtol, atol)
 
-    def iterate(carry: _Iterate) -> _Iterate:
-        # The state is updated by increments, which shrink, rather than from the multipliers, which
-        # can be large and cancel: so its roundoff is relative to its own size in the end.
-        y, multiplier, g, count = carry
-        change = jtu.tree_map(jnp.negative, gram_solve(g))
-        y = _displaced(jacobian, change, y, weights)
-        return y, jtu.tree_map(jnp.add, multiplier, change), residual(y), count + 1
+_State = tuple[_Iterate, Bool[Array, ""], Vector, Failure]
+
+
+def _loop(
+    max_steps: int, unfinished: Bool[Array, ""], state: _State, iteration: _Iteration
+) -> _State:
+    """Iterates until `state` is finished, or hopeless; not at all unless `unfinished`."""
+    before, jacobian, gram_solver = iteration.stepper()
+
+    def hopeful(iterate: _Iterate) -> Bool[Array, ""]:
+        _, _, g, count = iterate
+        return (count < max_steps) & tree_all_finite(g)
 
     # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
     # and then never ends: so the condition is evaluated once, and carried.
-    def judged(carry: _Iterate, stalled: BoolScalarLike) -> tuple[Array, Array, _Iterate]:
-        y, _, g, count = carry
-        _, tolerance = scales(y)
-        success = within(g, tolerance)
-        done = success & (within(g, tree_scale(0.25, tolerance)) | stalled)
-        return ~done & (count < max_steps) & tree_all_finite(g), success, carry
+    def body(carry: tuple[Array, _Iterate, Array, Vector]) -> tuple[Array, _Iterate, Array, Vector]:
+        _, old, _, _ = carry
+        new = iteration.step(jacobian, gram_solver, old)
+        _, _, scale = iteration.judge(jacobian, new, stalled=False)
+        stalled = largest_relative(new[2], scale) > 0.5 * largest_relative(old[2], scale)
+        done, success, scale = iteration.judge(jacobian, new, stalled)
+        return ~done & hopeful(new), new, success, scale
 
-    def body(state: tuple[Array, Array, _Iterate]) -> tuple[Array, Array, _Iterate]:
-        _, _, carry = state
-        new = iterate(carry)
-        scale, _ = scales(new[0])
-        stalled = largest_relative(new[2], scale) > 0.5 * largest_relative(carry[2], scale)
-        return judged(new, stalled)
-
-    carry = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
-    for _ in range(min(INLINE_STEPS, max_steps)):
-        carry = iterate(carry)
-    _, success, (y, multiplier, after, count) = lax.while_loop(
-        lambda state: state[0], body, judged(carry, stalled=False)
-    )
-    scale, _ = scales(y)
-    return y, multiplier, report(success, count, candidate, y, before, after, scale)
+    iterate, success, scale, _ = state
+    start = (unfinished & hopeful(iterate), iterate, success, scale)
+    _, iterate, success, scale = lax.while_loop(lambda carry: carry[0], body, start)
+    at_candidate = (iteration.candidate, iterate[1], before, iterate[3])
+    _, _, scale_before = iteration.judge(jacobian, at_candidate, stalled=False)
+    failure = Failure.of(before, scale_before, iterate[2], scale).unless(success)
+    return iterate, success, scale, failure
 
 
 @_solve.def_jvp
@@ -187,7 +242,8 @@ def _solve_jvp(primals, tangents, *, max_steps):
     )
     _, at_candidate = linearise(residual, candidate)
     _, at_y = linearise(residual, y)
-    t_multiplier = at_y.gram_solver(weights, at_candidate)(jtu.tree_map(jnp.negative, t_g))
+    gram_solver = at_y.gram_solver(weights, at_candidate)
+    t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
     t_y = _displaced(at_candidate, t_multiplier, t_y, weights)
     t_info = jtu.tree_map(lambda _: None, info)
     return (y, multiplier, info), (t_y, t_multiplier, t_info)

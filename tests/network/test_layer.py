@@ -84,7 +84,7 @@ def test_dependent_integrals_change_nothing():
 def test_many_constraints_use_the_dense_solve():
     sphere = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2, axis=1))
     layer = dfc.ConservativeLayer(sphere, steps=8)
-    y0 = jr.normal(jr.key(0), (9, 3))
+    y0 = jr.normal(jr.key(0), (12, 3))
     candidate = 1.1 * y0
     y = moved(layer, candidate, layer.values(0.0, y0), ONE)
     np.testing.assert_allclose(y, y0, rtol=1e-14)

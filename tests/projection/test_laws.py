@@ -1,7 +1,9 @@
-"""Laws that every projection obeys, at drawn candidates."""
+"""Laws that every projection obeys, at drawn candidates.
+
+On one system, with both projections; `tests/laws` has laws over all systems of the catalogue.
+"""
 
 import equinox as eqx
-import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import pytest
 from hypothesis import assume, given
 
 import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
 
 from ..problems import OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
 
@@ -23,9 +26,7 @@ PROJECTIONS = {"simplified": dfc.SimplifiedNewton(), "newton": dfc.Newton()}
 
 
 def vectors(shape, size):
-    """To nine decimals: squares of what is drawn do not underflow."""
-    numbers = st.floats(-size, size).map(lambda x: round(x, 9))
-    return hnp.arrays(np.float64, shape, elements=numbers)
+    return dct.states(np.zeros(shape), magnitude=size)
 
 
 # Near the curve of the rigid body, where both projections must succeed.

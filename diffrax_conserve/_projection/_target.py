@@ -1,0 +1,66 @@
+"""What a solver projects to, and on which terms: the same at the end of a step and inside it."""
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Real
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._tree import tree_all_finite, working_dtype
+from ._base import AbstractProjection, Failure, ProjectionInfo
+from ._project import apply, relative_residual
+
+
+class Target(eqx.Module):
+    """Everything that a projection needs but the time and the candidate.
+
+    **Attributes:**
+
+    - `direction`: -1 where the solver's time is the negative of the manifold's.
+    - `limit`: a larger correction is a failure.
+    - `threshold`: a candidate whose relative residual is not larger is left as it is.
+    - `due`: if not set, any finite candidate is left as it is.
+    """
+
+    projection: AbstractProjection
+    manifold: Manifold
+    values: Values
+    args: Args
+    direction: Real[Array, ""]
+    limit: Real[Array, ""] | None = None
+    threshold: RealScalarLike | None = None
+    due: Bool[Array, ""] | None = None
+
+    def project(self, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        t = t * self.direction
+        if self.threshold is None and self.due is None:
+            return self._project(t, candidate)
+        residual = relative_residual(self.manifold, self.values, t, candidate, self.args)
+        needed = jnp.asarray(True) if self.due is None else self.due
+        if self.threshold is not None:
+            needed = needed & ~(residual <= self.threshold)
+        needed = needed | ~tree_all_finite(candidate)
+        return lax.cond(
+            needed,
+            lambda: self._project(t, candidate),
+            lambda: (candidate, _untouched(candidate, residual)),
+        )
+
+    def _project(self, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        y, info = apply(self.projection, self.manifold, self.values, t, candidate, self.args)
+        if self.limit is None:
+            return y, info
+        too_far = (info.result == optx.RESULTS.successful) & ~(info.correction <= self.limit)
+        # With the `failure` of a success, which tells this from a divergence.
+        result = optx.RESULTS.where(too_far, optx.RESULTS.nonlinear_divergence, info.result)
+        return y, eqx.tree_at(lambda i: i.result, info, result)
+
+
+def _untouched(candidate: Y, residual: Real[Array, ""]) -> ProjectionInfo:
+    zero = jnp.asarray(0)
+    residual = residual.astype(working_dtype(candidate))
+    none = Failure.none()
+    # Traced, as in the other branch.
+    result = optx.RESULTS.where(zero == 0, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+    return ProjectionInfo(result, zero, residual, residual, jnp.zeros_like(residual), zero, none)

@@ -1,0 +1,96 @@
+"""Messages of failed projections, which say what failed, how far off it is, and what to do.
+
+A step reports its failure by a member of `diffrax.RESULTS`, which diffrax turns into an error where
+the solve really ends (an adaptive solver rejects the step and goes on). The members that diffrax
+has speak of implicit solvers and cannot hold a name or a number. So messages of ours, one for each
+entry of a manifold and each order of magnitude, are added to the end of its list when a solver is
+traced.
+"""
+
+import itertools
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+
+from .._custom_types import Manifold, Values
+from .._manifold import is_entry, named_entries
+from .._projection import DECADES, ProjectionInfo
+
+# The kinds of messages for one entry; the decades follow.
+_NONFINITE, _TOO_FAR, _FIRST_DECADE = 0, 1, 2
+_KINDS = _FIRST_DECADE + len(DECADES)
+# Of a manifold with more entries, none is named.
+_NAMED_MAX = 50
+
+
+def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RESULTS:
+    """The result of a step whose projection failed as `info` says."""
+    names = tuple(name for name, _ in named_entries(manifold))
+    treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
+    sizes = [
+        sum(jnp.size(x) for x in jtu.tree_leaves(entry)) for entry in treedef.flatten_up_to(values)
+    ]
+    if len(names) > _NAMED_MAX:
+        names, sizes = ("manifold",), [sum(sizes)]
+    first = _register(names)
+    if first is None:
+        return dfx.RESULTS.promote(info.result)
+    # Written out: this is computed at every step, needed or not.
+    entry = jnp.asarray(0)
+    for end in itertools.accumulate(sizes[:-1]):
+        entry = entry + (info.failure.index >= end).astype(int)
+    unsatisfied = info.failure.decade - DECADES[0]
+    kind = jnp.where(unsatisfied < 0, _TOO_FAR, _FIRST_DECADE + unsatisfied)
+    kind = jnp.where(info.result == optx.RESULTS.nonfinite, _NONFINITE, kind)
+    return _member(first + _KINDS * entry + kind)
+
+
+def _messages(name: str) -> list[str]:
+    start = "diffrax_conserve: the projection of a step failed. "
+    nonfinite = (
+        f"`{name}` is not finite at the state that the wrapped solver proposed, or the state "
+        "itself is not. Take smaller steps, and check the vector field and `fn` there."
+    )
+    too_far = (
+        f"It moved the state further than `max_correction` allows, to satisfy `{name}` among "
+        "others: perhaps to another part of the manifold. Take smaller steps, or raise "
+        "`max_correction`. If the conserved `value` is not that of the initial state, project "
+        "that first, with `diffrax_conserve.project`."
+    )
+
+    def unsatisfied(decade: int) -> str:
+        remedy = (
+            "That is close: if `fn` is not accurate to roundoff, pass `projection="
+            "SimplifiedNewton(rtol=...)` with its accuracy"
+            if decade < -8
+            else "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes "
+            "with candidates far from the manifold. If that fails too, the constraints may "
+            "contradict each other"
+        )
+        size = "1e3 or more" if decade == DECADES[-1] else f"about 1e{decade}"
+        return f"`{name}` is still off by {size} of its scale. {remedy}."
+
+    return [start + x for x in (nonfinite, too_far, *map(unsatisfied, DECADES))]
+
+
+# The index of the first message for the names of each manifold.
+_REGISTERED: dict[tuple[str, ...], int] = {}
+
+
+def _register(names: tuple[str, ...]) -> int | None:
+    # private: `equinox.Enumeration` has no public way to add to one. Without it the members that
+    # diffrax has must do.
+    messages = getattr(dfx.RESULTS, "_index_to_message", None)
+    if not isinstance(messages, list):
+        return None
+    if names not in _REGISTERED:
+        _REGISTERED[names] = len(messages)
+        messages.extend(message for name in names for message in _messages(name))
+    return _REGISTERED[names]
+
+
+def _member(index) -> dfx.RESULTS:
+    kind = type(dfx.RESULTS.successful)
+    return kind(index.astype(jnp.int32), dfx.RESULTS)  # pyright: ignore

@@ -1,0 +1,111 @@
+"""What the projections of a solve did, carried in the solver state."""
+
+from typing import Any, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, Int
+
+from .._projection import ProjectionInfo
+
+
+@final
+class ProjectionStatistics(eqx.Module):
+    """Totals over the accepted steps of a solve, including those that it was continued from.
+
+    **Attributes:**
+
+    - `num_projections`: how many steps were projected.
+    - `num_iterations`, `max_iterations`: the iterations of all projections, and of the longest.
+    - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
+        state, relative to the scale of its constraint.
+    - `correction`: the largest Euclidean norm of a projected state minus its candidate.
+    - `rank`: the smallest numerical rank of the constraints.
+    """
+
+    num_projections: Int[Array, "..."]
+    num_iterations: Int[Array, "..."]
+    max_iterations: Int[Array, "..."]
+    residual_before: Float[Array, "..."]
+    residual_after: Float[Array, "..."]
+    correction: Float[Array, "..."]
+    rank: Int[Array, "..."]
+
+    @classmethod
+    def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
+        count, size = jnp.asarray(0), jnp.zeros((), dtype)
+        return cls(count, count, count, size, size, size, jnp.asarray(num_constraints))
+
+    def add(self, info: ProjectionInfo) -> "ProjectionStatistics":
+        projected = info.num_steps > 0
+        return ProjectionStatistics(
+            self.num_projections + projected.astype(int),
+            self.num_iterations + info.num_steps,
+            jnp.maximum(self.max_iterations, info.num_steps),
+            jnp.maximum(self.residual_before, info.residual_before),
+            jnp.maximum(self.residual_after, info.residual_after),
+            jnp.maximum(self.correction, info.correction),
+            jnp.where(projected, jnp.minimum(self.rank, info.rank), self.rank),
+        )
+
+
+def statistics(sol: dfx.Solution) -> ProjectionStatistics:
+    """What the projections of a solve did.
+
+    They are part of the state of a `ManifoldProjection`, so diffrax must be asked to return that,
+    by `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
+
+    diffrax discards the solver state of a rejected step, so rejected steps count only in
+    `sol.stats["num_rejected_steps"]`.
+
+    **Arguments:**
+
+    - `sol`: what `diffrax.diffeqsolve` returned, with `saveat=SaveAt(..., solver_state=True)`; from
+        `jax.vmap` of it, a batch.
+
+    **Returns:**
+
+    A [`diffrax_conserve.ProjectionStatistics`][].
+
+    **Raises:**
+
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+        sol = diffrax.diffeqsolve(
+            term,
+            dfc.ManifoldProjection(diffrax.Tsit5(), square),
+            t0=0,
+            t1=9,
+            dt0=0.1,
+            y0=jnp.array([1.0, 0.0]),
+            saveat=diffrax.SaveAt(t1=True, solver_state=True),
+        )
+        print(dfc.statistics(sol).max_iterations)
+        ```
+    """
+    found = [
+        x
+        for x in jtu.tree_leaves(sol.solver_state, is_leaf=_is_statistics)
+        if isinstance(x, ProjectionStatistics)
+    ]
+    if not found:
+        raise ValueError(
+            "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
+            "and with `saveat=SaveAt(..., solver_state=True)`."
+        )
+    return found[0]
+
+
+def _is_statistics(x: Any) -> bool:
+    return isinstance(x, ProjectionStatistics)

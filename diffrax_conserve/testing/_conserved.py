@@ -1,0 +1,328 @@
+"""Assertions that a solution, or a state, lies on its manifold."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, Real
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import (
+    Constraint,
+    FirstIntegral,
+    check_manifold,
+    check_values,
+    conserved_values,
+    evaluate,
+    is_entry,
+    named_entries,
+    scales,
+)
+from ._report import Sample, report_constraints, unsuccessful
+
+# Twice what a projection accepts by default: the residual is evaluated here once more.
+ULPS = 32
+
+
+def assert_conserved(
+    solution: dfx.Solution,
+    manifold: Manifold,
+    args: Args = None,
+    *,
+    y0: Y | None = None,
+    rtol: RealScalarLike | None = None,
+    atol: RealScalarLike = 0.0,
+    num_dense: int = 101,
+) -> None:
+    r"""Asserts that a solution stays on a manifold, at each saved time and in dense output.
+
+    At $(t_k, y_k)$ the residual of each scalar constraint is at most $atol + rtol \cdot s_k$. The
+    scale $s_k$, what roundoff is relative to, is the larger one of
+    $|I_0| + \sum_i |y_i\, \partial I/\partial y_i|$ at $(t_k, y_k)$ and at the initial state.
+
+    **Arguments:**
+
+    - `solution`: what `diffrax.diffeqsolve` returned, or `jax.vmap` of it: each lane is checked.
+        Rows that diffrax padded (times `inf`) are ignored.
+    - `manifold`: a PyTree of [`diffrax_conserve.FirstIntegral`][]s and
+        [`diffrax_conserve.Constraint`][]s.
+    - `args`: as given to `diffeqsolve`; the same in every lane.
+    - `y0`: the initial state, with whose integrals all is compared. Default: the first saved state.
+    - `rtol`, `atol`: tolerances. Default: 32 units of roundoff of the coarsest dtype in the state,
+        twice what a projection accepts, and 0.
+    - `num_dense`: at how many times, evenly spaced, to check dense output where there is some.
+
+    **Raises:**
+
+    `AssertionError` if the solve did not succeed, if a state is infinite or NaN, or if a constraint
+    is violated. Its message names the constraint and says where, by how much in units of roundoff,
+    and what to look at. `ValueError` if there is nothing to check.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import diffrax_conserve.testing as dct
+
+        system = dfc.systems.RigidBody()
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(system.vector_field),
+            dfc.ManifoldProjection(diffrax.Tsit5(), system.manifold),
+            t0=0.0,
+            t1=1.0,
+            dt0=0.1,
+            y0=system.y0,
+            saveat=diffrax.SaveAt(t0=True, steps=True),
+        )
+        dct.assert_conserved(solution, system.manifold)
+        ```
+    """
+    check_manifold(manifold)
+    _refuse_unsuccessful(solution)
+    kinds = _sampled(solution, num_dense)
+    lanes = jnp.shape(solution.t0)
+    reference = None if y0 is None else (solution.t0, jtu.tree_map(jnp.asarray, y0))
+    samples = []
+    for kind, ts, ys in kinds:
+        if reference is None:
+            first = (slice(None),) * len(lanes) + (0,)
+            reference = jtu.tree_map(lambda x, first=first: x[first], (ts, ys))
+            _check_comparable(ts, manifold)
+        batch = jtu.tree_map(
+            lambda x: jnp.reshape(x, (-1, *x.shape[len(lanes) :])), (ts, ys, *reference)
+        )
+        measured = _measure_lanes(manifold, None, batch, args)
+        limits = _limits(measured, rtol, atol, ys)
+        samples += _samples(manifold, kind, lanes, batch[:2], measured, limits)
+    report_constraints(samples)
+
+
+def assert_on_manifold(
+    manifold: Manifold,
+    y: Y,
+    *,
+    t: RealScalarLike = 0.0,
+    args: Args = None,
+    value: Values | None = None,
+    rtol: RealScalarLike | None = None,
+    atol: RealScalarLike = 0.0,
+) -> None:
+    """Asserts that one state lies on a manifold.
+
+    **Arguments:**
+
+    - `manifold`: a PyTree of [`diffrax_conserve.FirstIntegral`][]s and
+        [`diffrax_conserve.Constraint`][]s.
+    - `y`: the state; for several, use a loop, or a solution and `assert_conserved`.
+    - `t`, `args`: passed to the functions of the manifold.
+    - `value`: the conserved values, as in [`diffrax_conserve.project`][]. Not needed where each
+        `FirstIntegral` has a `value` of its own.
+    - `rtol`, `atol`: as in [`diffrax_conserve.testing.assert_conserved`][].
+
+    **Raises:**
+
+    `AssertionError` if the state is infinite or NaN, or violates a constraint; `ValueError` if a
+    conserved value is missing or does not fit.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import diffrax_conserve.testing as dct
+        import jax.numpy as jnp
+
+        circle = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        dct.assert_on_manifold(circle, jnp.array([0.6, 0.8]))
+        ```
+    """
+    check_manifold(manifold)
+    y = jtu.tree_map(jnp.asarray, y)
+    t = jnp.asarray(t, jnp.result_type(float))
+    values = _given_values(manifold, value, t, y, args)
+    ts, ys = t[None], jtu.tree_map(lambda x: x[None], y)
+    lane = jtu.tree_map(lambda x: x[None], (ts, ys, t, y))
+    measured = _measure_lanes(manifold, values, lane, args)
+    limits = _limits(measured, rtol, atol, ys)
+    report_constraints(_samples(manifold, "given", (), lane[:2], measured, limits))
+
+
+class Measured(NamedTuple):
+    """Arrays of shape `(lanes, times, ...)`, in PyTrees like the values of the manifold."""
+
+    residual: Any
+    scale: Any
+    found: Any
+    target: Any  # of shape `(lanes, ...)`
+    finite: Array  # whether the state is, of shape `(lanes, times)`
+
+
+@eqx.filter_jit
+def _measure_lanes(
+    manifold: Manifold, values: Values | None, lanes: tuple[Array, Any, Array, Any], args: Args
+) -> Measured:
+    return jax.vmap(lambda lane: measure(manifold, values, lane, args))(lanes)
+
+
+def measure(
+    manifold: Manifold,
+    values: Values | None,
+    lane: tuple[Real[Array, " times"], Any, Real[Array, ""], Any],
+    args: Args,
+) -> Measured:
+    """The residuals and their scales in a lane `(ts, ys, t0, y0)`; rows that are padded are taken
+    for the initial state."""
+    ts, ys, t0, y0 = lane
+    target = conserved_values(manifold, t0, y0, args) if values is None else values
+    initial_scale = scales(manifold, target, t0, y0, args)
+
+    def at(t: Array, y: Y) -> tuple[Values, Values, Values, Array]:
+        padded = jnp.isinf(t)
+        t = jnp.where(padded, t0.astype(t.dtype), t)
+        y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
+        found = evaluate(manifold, t, y, args)
+        residual = jtu.tree_map(
+            lambda a, b: jnp.where(padded, 0, a - jnp.asarray(b, a.dtype)), found, target
+        )
+        scale = jtu.tree_map(jnp.maximum, scales(manifold, target, t, y, args), initial_scale)
+        finite = [jnp.all(jnp.isfinite(x)) for x in (t, *jtu.tree_leaves(y))]
+        return residual, scale, found, jnp.all(jnp.stack(finite))
+
+    residual, scale, found, finite = jax.vmap(at)(ts, ys)
+    return Measured(residual, scale, found, target, finite)
+
+
+def _refuse_unsuccessful(solution: dfx.Solution) -> None:
+    okay = np.asarray(dfx.is_okay(solution.result))
+    if not np.all(okay):
+        lane = tuple(int(i) for i in np.argwhere(~okay)[0])
+        result = jtu.tree_map(lambda x: x[lane], solution.result)
+        raise AssertionError(unsuccessful(result, lane, int(np.sum(~okay)), okay.size))
+
+
+def _sampled(solution: dfx.Solution, num_dense: int) -> list[tuple[str, Array, Any]]:
+    """Names, times and states of what a solution holds."""
+    kinds = []
+    if solution.ts is not None and solution.ys is not None:
+        if not eqx.is_array(solution.ts):
+            raise ValueError(
+                "`solution` has states saved by several `SubSaveAt`s. Check one of them at a time: "
+                "`equinox.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], "
+                "solution.ys[0]))`."
+            )
+        kinds.append(("saved", solution.ts, solution.ys))
+    if solution.interpolation is not None:
+        ts, ys = _dense(solution, num_dense)
+        kinds.append(("dense", ts, ys))
+    if not kinds or any(ts.shape[-1] == 0 for _, ts, _ in kinds):
+        raise ValueError(
+            "`solution` holds no states to check. Save some, for example with "
+            "`saveat=SaveAt(t0=True, steps=True)` or `SaveAt(dense=True)`."
+        )
+    return kinds
+
+
+@eqx.filter_jit
+def _dense(solution: dfx.Solution, num: int) -> tuple[Array, Any]:
+    def lane(path: Any) -> tuple[Array, Any]:
+        ts = jnp.linspace(path.t0, path.t1, num)
+        return ts, jax.vmap(path.evaluate)(ts)
+
+    for _ in jnp.shape(solution.t0):
+        lane = eqx.filter_vmap(lane)
+    return lane(solution.interpolation)
+
+
+def _check_comparable(ts: Float[Array, "..."], manifold: Manifold) -> None:
+    for name, entry in named_entries(manifold):
+        if isinstance(entry, FirstIntegral) and entry.value is None and ts.shape[-1] == 1:
+            raise ValueError(
+                f"`solution` holds one saved state, with nothing to compare `{name}` with. Pass "
+                "`y0=...`, or save the initial state too, as in `SaveAt(t0=True, t1=True)`."
+            )
+
+
+def _given_values(manifold: Manifold, value: Values | None, t: Array, y: Y, args: Args) -> Values:
+    for name, entry in named_entries(manifold):
+        if value is None and isinstance(entry, FirstIntegral) and entry.value is None:
+            raise ValueError(
+                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, or "
+                "write `FirstIntegral(fn, value=...)`."
+            )
+    own = conserved_values(manifold, t, y, args)
+    if value is None:
+        return own
+    check_values(manifold, value, t, y, args)
+    return jtu.tree_map(
+        lambda entry, given, own: (
+            own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
+        ),
+        manifold,
+        value,
+        own,
+        is_leaf=is_entry,
+    )
+
+
+def _limits(
+    measured: Measured, rtol: RealScalarLike | None, atol: RealScalarLike, ys: Any
+) -> tuple[Any, float]:
+    """What the residuals may be, and the unit of roundoff: that of the coarsest dtype."""
+    dtypes = [x.dtype for x in jtu.tree_leaves((ys, measured.residual))]
+    eps = max(float(jnp.finfo(dtype).eps) for dtype in dtypes)
+    relative = ULPS * eps if rtol is None else rtol
+    limits = jtu.tree_map(lambda s: relative * np.asarray(s, np.float64) + atol, measured.scale)
+    return limits, eps
+
+
+def _samples(
+    manifold: Manifold,
+    kind: str,
+    lanes: tuple[int, ...],
+    rows: tuple[Array, Any],
+    measured: Measured,
+    limits: tuple[Any, float],
+) -> list[Sample]:
+    """One for each scalar constraint, with its readable name."""
+    treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
+    limit, eps = limits
+    trees = (measured.residual, measured.scale, measured.found, limit, measured.target)
+    entries = zip(
+        named_entries(manifold), *(treedef.flatten_up_to(tree) for tree in trees), strict=True
+    )
+    samples = []
+    for (name, entry), *parts in entries:
+        paths = jtu.tree_flatten_with_path(parts[0])[0]
+        leaves = [jtu.tree_leaves(part) for part in parts]
+        for (path, residual), *arrays in zip(paths, *leaves, strict=True):
+            for index in np.ndindex(residual.shape[2:]):
+                label = name + jtu.keystr(path) + (f"[{', '.join(map(str, index))}]" * bool(index))
+                pick = functools.partial(_element, index)
+                samples.append(
+                    Sample(
+                        label,
+                        isinstance(entry, Constraint),
+                        kind,
+                        lanes,
+                        np.asarray(rows[0]),
+                        rows[1],
+                        np.asarray(measured.finite),
+                        residual=pick(residual),
+                        scale=pick(arrays[1]),
+                        found=pick(arrays[2]),
+                        limit=pick(arrays[3]),
+                        target=pick(arrays[4]),
+                        eps=eps,
+                    )
+                )
+    return samples
+
+
+def _element(index: tuple[int, ...], x: Any) -> np.ndarray:
+    """One scalar of each value."""
+    return np.asarray(x)[(..., *index)]

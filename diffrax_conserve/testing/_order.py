@@ -1,0 +1,145 @@
+"""An assertion about the order of a solver."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, RealScalarLike, Y
+
+_REFINEMENTS = np.array([1, 2, 3, 4, 6])
+# Errors below this many units of roundoff of the state are not the method's.
+_FLOOR = 1e3
+
+
+def assert_order(
+    solver: dfx.AbstractSolver,
+    terms: PyTree[dfx.AbstractTerm],
+    y0: Y,
+    *,
+    t0: RealScalarLike = 0.0,
+    t1: RealScalarLike,
+    dt0: RealScalarLike,
+    args: Args = None,
+    order: RealScalarLike | None = None,
+    reference: Y | None = None,
+    margin: RealScalarLike = 0.3,
+) -> None:
+    r"""Asserts that the error of a solver falls with the step as its order says.
+
+    Solves with fixed steps of $h/1$, $h/2$, $h/3$, $h/4$ and $h/6$, where $h$ is `dt0`, fits
+    $\log(\text{error at } t_1) = p \log h + c$ by least squares, and demands
+    $p \ge order - margin$. Errors that are lost in roundoff are left out. A higher order than
+    claimed is no failure.
+
+    **Arguments:**
+
+    - `solver`: a diffrax solver, wrapped or not, for which fixed steps make sense.
+    - `terms`, `y0`, `t0`, `t1`, `dt0`, `args`: as for `diffrax.diffeqsolve`. Take a smooth problem,
+        a horizon of a few steps or more, and a `dt0` at which the method already is asymptotic.
+    - `order`: what is claimed. Default: `solver.order(terms)`.
+    - `reference`: the exact state at `t1`. Default: computed by `diffrax.Dopri8` with ten times as
+        many steps, if `terms` is a `diffrax.ODETerm`; otherwise by `solver` with 48 times as many.
+    - `margin`: how much smaller the measured slope may be.
+
+    **Raises:**
+
+    `AssertionError` with the table of steps and errors if the slope is too small or a solve fails;
+    `ValueError` if there is no order to compare with, or too few errors are above roundoff.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import diffrax_conserve.testing as dct
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        system = dfc.systems.RigidBody()
+        solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
+        dct.assert_order(
+            solver, diffrax.ODETerm(system.vector_field), system.y0, t1=1.0, dt0=0.1
+        )
+        ```
+    """
+    order = solver.order(terms) if order is None else order
+    if order is None:
+        raise ValueError(
+            f"{type(solver).__name__} states no order for these terms. Pass `order=...`."
+        )
+    span = jnp.asarray(t1, float) - t0
+    count = int(np.ceil(float(jnp.abs(span / dt0)) - 1e-6))
+    counts = count * _REFINEMENTS
+    problem = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
+    finals = [_final(solver, problem, n, max_steps=int(counts[-1]) + 2) for n in counts]
+    exact = _reference(solver, problem, count) if reference is None else reference
+    errors = np.array([float(_distance(y, exact)) for y in finals])
+    _check_slope(errors, float(span) / counts, float(order), float(margin), _roundoff(exact))
+
+
+@eqx.filter_jit
+def _final(
+    solver: dfx.AbstractSolver,
+    problem: tuple[PyTree[dfx.AbstractTerm], Array, Array, Y, Args],
+    count: Any,
+    *,
+    max_steps: int,
+) -> Y:
+    terms, t0, span, y0, args = problem
+    sol = dfx.diffeqsolve(
+        terms, solver, t0, t0 + span, span / count, y0, args, max_steps=max_steps, throw=False
+    )
+    # NaN in the table says which of the solves failed.
+    okay = dfx.is_okay(sol.result)
+    return jtu.tree_map(lambda y: jnp.where(okay, y[-1], jnp.nan), sol.ys)
+
+
+def _reference(solver: dfx.AbstractSolver, problem: tuple[Any, ...], count: int) -> Y:
+    if isinstance(problem[0], dfx.ODETerm):
+        n = 10 * count * int(_REFINEMENTS[-1])
+        return _final(dfx.Dopri8(), problem, n, max_steps=n + 2)
+    n = 8 * count * int(_REFINEMENTS[-1])
+    return _final(solver, problem, n, max_steps=n + 2)
+
+
+def _distance(y: Y, exact: Y) -> Float[Array, ""]:
+    gaps = jtu.tree_map(lambda a, b: jnp.max(jnp.abs(a - b)).astype(float), y, exact)
+    return jnp.max(jnp.stack(jtu.tree_leaves(gaps)))
+
+
+def _roundoff(exact: Y) -> float:
+    """One unit of roundoff of the largest component."""
+    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(exact)]
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in leaves)
+    return eps * max(float(jnp.max(jnp.abs(x))) for x in leaves)
+
+
+def _check_slope(
+    errors: np.ndarray, steps: np.ndarray, order: float, margin: float, roundoff: float
+) -> None:
+    table = "\n".join(f"    {abs(h):<12.6g} {e:.3e}" for h, e in zip(steps, errors, strict=True))
+    table = f"    step         error\n{table}"
+    if not np.all(np.isfinite(errors)):
+        raise AssertionError(
+            f"A solve did not succeed (its error is NaN):\n{table}\n"
+            "To look at: a smaller `dt0`; whether the solver works with fixed steps."
+        )
+    used = errors > _FLOOR * roundoff
+    if np.sum(used) < 2:
+        raise ValueError(
+            f"The order cannot be measured: all errors but {int(np.sum(used))} are lost in "
+            f"roundoff.\n{table}\nTake a larger `dt0`, a longer solve, or float64."
+        )
+    slope = np.polyfit(np.log(np.abs(steps[used])), np.log(errors[used]), 1)[0]
+    if not slope >= order - margin:
+        raise AssertionError(
+            f"The measured order is {slope:.2f}, but {order:g} is claimed:\n{table}\n"
+            "To look at: is `dt0` small enough for the method to be asymptotic? Are the stages "
+            "evaluated at the right times? Is the state at the end of a step moved by more than "
+            "the local error?"
+        )

@@ -1,0 +1,149 @@
+"""A strategy for PyTree structures: one state, packed in many ways."""
+
+import math
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import ArrayLike, PyTree
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values
+from .._manifold import Constraint, FirstIntegral, is_entry
+
+
+@final
+class Restructuring(eqx.Module):
+    """The components of a state in another PyTree: other nesting, other shapes, the same numbers.
+
+    Whatever is true of a state is true of the repacked one, so code that handles any PyTree gives
+    the same numbers for both.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import diffrax_conserve.testing as dct
+        from hypothesis import given, settings
+
+        kepler = dfc.systems.Kepler()
+
+        @settings(deadline=None, max_examples=5)
+        @given(packing=dct.restructurings(kepler.y0))
+        def test(packing):
+            z = packing.pack(kepler.y0)
+            energy = packing.manifold(kepler.manifold["energy"])
+            assert energy.fn(0.0, z, None) == kepler.energy(0.0, kepler.y0, None)
+
+        test()
+        ```
+    """
+
+    shapes: Any = eqx.field(static=True)
+    like: Any = eqx.field(static=True)
+    # Both are PyTrees of `jax.ShapeDtypeStruct`.
+
+    def pack(self, y: Any) -> Any:
+        """`y` in the new structure."""
+        return _fill(self.shapes, y)
+
+    def unpack(self, z: Any) -> Any:
+        """The state whose packed form is `z`."""
+        return _fill(self.like, z)
+
+    def vector_field(self, vector_field: Callable[..., Any]) -> Callable[..., Any]:
+        """The vector field `f(t, z, args)` of the packed state."""
+
+        def packed(t: RealScalarLike, z: Any, args: Args) -> Any:
+            return self.pack(vector_field(t, self.unpack(z), args))
+
+        return packed
+
+    def manifold(self, manifold: Manifold) -> Manifold:
+        """The manifold of the packed state, with the same names and conserved values."""
+
+        def repack(entry: FirstIntegral | Constraint) -> FirstIntegral | Constraint:
+            def fn(t: RealScalarLike, z: Any, args: Args) -> Values:
+                return entry.fn(t, self.unpack(z), args)
+
+            return eqx.tree_at(lambda e: e.fn, entry, fn)
+
+        return jtu.tree_map(repack, manifold, is_leaf=is_entry)
+
+    def __repr__(self) -> str:
+        return f"Restructuring({jtu.tree_map(lambda x: _Shape(x.shape), self.shapes)})"
+
+
+class _Shape(tuple):
+    """A shape that is a leaf, and prints as one."""
+
+    def __repr__(self) -> str:
+        return f"<{'×'.join(map(str, self)) or 'scalar'}>"
+
+
+def _fill(shapes: Any, y: Any) -> Any:
+    flat, _ = ravel_pytree(y)
+    leaves, treedef = jtu.tree_flatten(shapes)
+    out, start = [], 0
+    for leaf in leaves:
+        stop = start + math.prod(leaf.shape)
+        out.append(jnp.asarray(flat[start:stop], leaf.dtype).reshape(leaf.shape))
+        start = stop
+    return jtu.tree_unflatten(treedef, out)
+
+
+def restructurings(
+    like: PyTree[ArrayLike], *, max_depth: int = 2
+) -> st.SearchStrategy[Restructuring]:
+    """Ways to repack a state as another PyTree.
+
+    Each structure is compiled anew, so draw few: `@settings(max_examples=5)`.
+
+    **Arguments:**
+
+    - `like`: a PyTree of floating-point arrays, all of one dtype.
+    - `max_depth`: how deep tuples, lists and dictionaries may be nested.
+
+    **Returns:**
+
+    A strategy of [`diffrax_conserve.testing.Restructuring`][]s. It shrinks to a single vector.
+
+    **Raises:**
+
+    `ValueError` if the leaves of `like` have different dtypes, which a repacked leaf could mix.
+    """
+    dtypes = {jnp.result_type(x) for x in jtu.tree_leaves(like)}
+    if len(dtypes) != 1:
+        raise ValueError(
+            f"`like` has leaves of the dtypes {sorted(map(str, dtypes))}. `restructurings` repacks "
+            "states of one dtype."
+        )
+    (dtype,) = dtypes
+    shapes = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), dtype), like)
+    size = sum(jnp.size(x) for x in jtu.tree_leaves(like))
+    return _trees(size, max_depth, dtype).map(lambda tree: Restructuring(tree, shapes))
+
+
+def _trees(size: int, depth: int, dtype: Any) -> st.SearchStrategy[Any]:
+    leaf = st.sampled_from(_shapes(size)).map(lambda shape: jax.ShapeDtypeStruct(shape, dtype))
+    if depth == 0:
+        return leaf
+    first = st.integers(1, size - 1) if size > 1 else st.just(1)
+
+    def container(first: int) -> st.SearchStrategy[Any]:
+        sizes = [n for n in (first, size - first) if n]
+        children = st.tuples(*(_trees(n, depth - 1, dtype) for n in sizes))
+        kinds = [tuple, list, lambda x: dict(zip("ab", x, strict=False))]
+        return st.tuples(st.sampled_from(kinds), children).map(lambda drawn: drawn[0](drawn[1]))
+
+    return st.one_of(leaf, first.flatmap(container))
+
+
+def _shapes(size: int) -> list[Any]:
+    """Shapes of `size` scalars, the simplest first."""
+    matrices = [(n, size // n) for n in range(1, size + 1) if size % n == 0]
+    return [*([()] if size == 1 else []), (size,), *matrices]

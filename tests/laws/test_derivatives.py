@@ -1,0 +1,113 @@
+"""Laws of the derivative of a projection."""
+
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import pytest
+from hypothesis import given, settings
+from jax.flatten_util import ravel_pytree
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+from .common import (
+    SYSTEMS,
+    check,
+    displaced,
+    every_law_on_every_system,
+    inputs,
+    project,
+    values_at,
+    within,
+)
+
+
+def linearised(system, y, displacement, size=0.0):
+    """The derivative of the projection near `y`, as a function of flat directions."""
+    fixed = jax.tree.map(jnp.asarray, y)
+    candidate = displaced(fixed, displacement, size)
+    flat, unravel = ravel_pytree(candidate)
+
+    def run(flat):
+        out, ok = project(system.manifold, unravel(flat), fixed)
+        return ravel_pytree(out)[0], ok
+
+    _, jvp, ok = jax.linearize(run, flat, has_aux=True)
+    return jvp, flat, ok
+
+
+def direction(flat, phase):
+    return jnp.sin(1 + phase + jnp.arange(flat.size))
+
+
+def on_the_manifold_it_is_a_projector(system, y, displacement):
+    jvp, flat, ok = linearised(system, y, displacement)
+    once = jvp(direction(flat, 0))
+    return ok, 1 + jvp(once), 1 + once
+
+
+def on_the_manifold_it_is_symmetric(system, y, displacement):
+    """Orthogonal in the Euclidean metric."""
+    jvp, flat, ok = linearised(system, y, displacement)
+    a, b = direction(flat, 0), direction(flat, 5)
+    return ok, 1 + jvp(a) @ b, 1 + a @ jvp(b)
+
+
+def on_the_manifold_it_keeps_the_flow(system, y, displacement):
+    jvp, _, ok = linearised(system, y, displacement)
+    flow = ravel_pytree(system.vector_field(0.0, jax.tree.map(jnp.asarray, y), None))[0]
+    return ok, jvp(flow), flow
+
+
+def reverse_mode_is_the_transpose_of_forward_mode(system, y, displacement):
+    jvp, flat, ok = linearised(system, y, displacement, size=1e-3)
+    a, b = direction(flat, 0), direction(flat, 5)
+    (pulled,) = jax.linear_transpose(jvp, flat)(b)
+    return ok, 1 + pulled @ a, 1 + b @ jvp(a)
+
+
+@within(1e-7)
+def the_integrals_of_the_projected_state_do_not_change(system, y, displacement):
+    """Not even to first order: `∂(I ∘ project) = 0`, in reverse mode."""
+    fixed = jax.tree.map(jnp.asarray, y)
+
+    def total(candidate):
+        out, ok = project(system.manifold, candidate, fixed)
+        values = ravel_pytree([e.fn(0.0, out, None) for e in system.manifold.values()])[0]
+        own = jax.lax.stop_gradient(jnp.abs(values)) + 1e-3
+        return jnp.sum(values / own), ok
+
+    gradient, ok = jax.grad(total, has_aux=True)(displaced(fixed, displacement))
+    size = jnp.max(jnp.abs(ravel_pytree(fixed)[0]))
+    return ok, jax.tree.map(lambda g: 1 + g * size, gradient), jax.tree.map(jnp.ones_like, gradient)
+
+
+LAWS = [
+    on_the_manifold_it_is_a_projector,
+    on_the_manifold_it_is_symmetric,
+    on_the_manifold_it_keeps_the_flow,
+    reverse_mode_is_the_transpose_of_forward_mode,
+    the_integrals_of_the_projected_state_do_not_change,
+]
+
+
+@every_law_on_every_system(LAWS)
+@settings(max_examples=6)
+@given(data=st.data())
+def test_law(law, name, data):
+    system = SYSTEMS[name]
+    check(law, system, data.draw(inputs(system)))
+
+
+@pytest.mark.parametrize(
+    "name", [n if n == "kepler" else pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS]
+)
+def test_derivatives_agree_with_finite_differences(name):
+    system = SYSTEMS[name]
+    y = jax.tree.map(lambda x: x * 1.001, system.y0)
+    values = values_at(system.manifold, system.y0)
+
+    def run(y, values):
+        return dfc.project(system.manifold, y, value=values, projection=dfc.SimplifiedNewton())[0]
+
+    dct.assert_gradients(run, y, values)

@@ -1,0 +1,309 @@
+"""Laws of one projection: what must not change it, and where it must lead."""
+
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from hypothesis import given, settings
+from jax.flatten_util import ravel_pytree
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+from diffrax_conserve._manifold import scales
+
+from .common import (
+    SYSTEMS,
+    assert_close,
+    check,
+    displaced,
+    every_law_on_every_system,
+    inputs,
+    is_entry,
+    project,
+    values_at,
+    within,
+)
+
+
+def mapped(manifold, change):
+    """`manifold` with `change` applied to each of its functions."""
+    return jax.tree.map(
+        lambda entry: type(entry)(lambda t, y, args: change(entry.fn, t, y, args)),
+        manifold,
+        is_leaf=is_entry,
+    )
+
+
+def joined(manifold):
+    """All residuals as one vector, kept at its value: `Constraint`s are zero there anyway."""
+
+    def fn(t, y, args):
+        return jnp.concatenate([jnp.ravel(entry.fn(t, y, args)) for entry in manifold.values()])
+
+    return fn
+
+
+def plain(system, y, displacement):
+    candidate = displaced(y, displacement)
+    return candidate, *project(system.manifold, candidate, y)
+
+
+def idempotent(system, y, displacement):
+    _, once, ok1 = plain(system, y, displacement)
+    twice, ok2 = project(system.manifold, once, y)
+    return ok1 & ok2, twice, once
+
+
+@within(1e-13)
+def a_state_on_the_manifold_is_untouched(system, y, displacement):
+    del displacement
+    projected, ok = project(system.manifold, y, y)
+    return ok, projected, jax.tree.map(jnp.asarray, y)
+
+
+def the_order_of_the_constraints_is_free(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+    got, ok2 = project(tuple(system.manifold.values())[::-1], candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def a_duplicated_constraint_changes_nothing(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+    got, ok2 = project((system.manifold, next(iter(system.manifold.values()))), candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def splitting_a_vector_into_scalars_changes_nothing(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+    fn = joined(system.manifold)
+    count = fn(0.0, y, None).size
+    parts = [dfc.FirstIntegral(lambda t, y, args, i=i: fn(t, y, args)[i]) for i in range(count)]
+    got, ok2 = project(parts, candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def affine_functions_of_the_integrals_change_nothing(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+    fn = joined(system.manifold)
+    got, ok2 = project(dfc.FirstIntegral(lambda *a: 3.0 - 7.0 * fn(*a)), candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def linear_combinations_of_the_integrals_change_nothing(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+    fn = joined(system.manifold)
+    count = fn(0.0, y, None).size
+    matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)) + 2 * np.eye(count))
+    (scale,) = scales((dfc.FirstIntegral(fn),), (fn(0.0, y, None),), 0.0, y, None)
+    got, ok2 = project(dfc.FirstIntegral(lambda *a: matrix @ (fn(*a) / scale)), candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def a_monotone_function_of_an_integral_changes_nothing(system, y, displacement):
+    candidate, expected, ok1 = plain(system, y, displacement)
+
+    def change(fn, *args):
+        value = fn(*args)
+        return value + value**3
+
+    got, ok2 = project(mapped(system.manifold, change), candidate, y)
+    return ok1 & ok2, got, expected
+
+
+def a_constant_factor_of_the_metric_changes_nothing(system, y, displacement):
+    candidate = displaced(y, displacement)
+    metric = jax.tree.map(lambda x: jnp.exp(jnp.sin(jnp.arange(x.size))).reshape(x.shape), y)
+
+    def weighted(factor):
+        weights = jax.tree.map(lambda m: factor * m, metric)
+        return project(system.manifold, candidate, y, dfc.SimplifiedNewton(metric=weights))
+
+    (got, ok1), (expected, ok2) = weighted(1e3), weighted(1.0)
+    return ok1 & ok2, got, expected
+
+
+def seen_through(system, y, displacement, there, back):
+    """The projection in other coordinates `z = there(y)`, mapped back."""
+    candidate, expected, ok1 = plain(system, y, displacement)
+    manifold = mapped(system.manifold, lambda fn, t, z, args: fn(t, back(z), args))
+    got, ok2 = project(manifold, there(candidate), there(y))
+    return ok1 & ok2, back(got), expected
+
+
+def flat_coordinates(y):
+    _, unravel = ravel_pytree(y)
+    return lambda y: ravel_pytree(y)[0], unravel
+
+
+def the_pytree_of_the_state_is_free(system, y, displacement):
+    flat, unravel = flat_coordinates(y)
+
+    def there(y):
+        first, *rest = flat(y)
+        return {"rest": (jnp.stack(rest)[None],), "first": first}
+
+    def back(z):
+        return unravel(jnp.concatenate([z["first"][None], z["rest"][0][0]]))
+
+    return seen_through(system, y, displacement, there, back)
+
+
+def rotations_of_the_coordinates_commute(system, y, displacement):
+    """The Euclidean projection is geometric."""
+    flat, unravel = flat_coordinates(y)
+    size = flat(y).size
+    rotation = jnp.asarray(np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0])
+    return seen_through(
+        system, y, displacement, lambda y: rotation @ flat(y), lambda z: unravel(rotation.T @ z)
+    )
+
+
+def translations_of_the_coordinates_commute(system, y, displacement):
+    offset = jax.tree.map(lambda x: jnp.mean(jnp.abs(x)) * jnp.cos(jnp.arange(x.size)), y)
+    offset = jax.tree.map(lambda o, x: o.reshape(x.shape), offset, y)
+    return seen_through(
+        system,
+        y,
+        displacement,
+        lambda y: jax.tree.map(jnp.add, y, offset),
+        lambda z: jax.tree.map(jnp.subtract, z, offset),
+    )
+
+
+def the_unit_of_the_state_is_free(system, y, displacement):
+    return seen_through(
+        system,
+        y,
+        displacement,
+        lambda y: jax.tree.map(lambda x: x * 1e4, y),
+        lambda z: jax.tree.map(lambda x: x / 1e4, z),
+    )
+
+
+@within(0.0)
+def frozen_components_stay(system, y, displacement):
+    candidate = displaced(y, displacement)
+    weights, unravel = ravel_pytree(jax.tree.map(jnp.ones_like, candidate))
+    metric = unravel(weights.at[0].set(jnp.inf))
+    got, ok = project(system.manifold, candidate, y, dfc.SimplifiedNewton(metric=metric))
+    return ok, ravel_pytree(got)[0][:1], ravel_pytree(candidate)[0][:1]
+
+
+def a_lane_of_a_batch_is_that_lane_alone(system, y, displacement):
+    def run(size):
+        return project(system.manifold, displaced(y, displacement, size), y)
+
+    (got, ok1), (expected, ok2) = jax.vmap(run)(jnp.array([1e-3, 1e-5, 0.0])), run(1e-3)
+    return ok1[0] & ok2, jax.tree.map(lambda x: x[0], got), expected
+
+
+@within(1e-13)
+def newton_leads_no_further_than_to_the_state_that_was_displaced(system, y, displacement):
+    """That one is on the manifold too, so the nearest point is at most as far."""
+    candidate = displaced(y, displacement)
+    got, ok = project(system.manifold, candidate, y, dfc.Newton())
+
+    def distance(z):
+        return jnp.linalg.norm(ravel_pytree(z)[0] - ravel_pytree(candidate)[0])
+
+    size = jnp.linalg.norm(ravel_pytree(y)[0])
+    return ok, 1 + jnp.maximum(distance(got) - distance(y), 0) / size, jnp.ones(())
+
+
+def the_correction_is_orthogonal_to_the_flow(system, y, displacement):
+    """Since `∇I · f = 0`, and the correction is a combination of gradients at the candidate."""
+    candidate, got, ok = plain(system, y, displacement)
+    correction = ravel_pytree(got)[0] - ravel_pytree(candidate)[0]
+    flow = ravel_pytree(system.vector_field(0.0, candidate, None))[0]
+    size = jnp.linalg.norm(ravel_pytree(y)[0])
+    return ok, 1 + correction @ flow / (size * jnp.linalg.norm(flow)), jnp.ones(())
+
+
+@within(2e-4)
+def single_precision_agrees_with_double(system, y, displacement):
+    _, expected, ok1 = plain(system, y, displacement)
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (system, y, displacement))
+    _, got, ok2 = plain(*single)
+    got = jax.tree.map(lambda x: x.astype(jnp.float64), got)
+    return ok1 & ok2, got, expected
+
+
+LAWS = [
+    idempotent,
+    a_state_on_the_manifold_is_untouched,
+    the_order_of_the_constraints_is_free,
+    a_duplicated_constraint_changes_nothing,
+    splitting_a_vector_into_scalars_changes_nothing,
+    affine_functions_of_the_integrals_change_nothing,
+    linear_combinations_of_the_integrals_change_nothing,
+    a_monotone_function_of_an_integral_changes_nothing,
+    a_constant_factor_of_the_metric_changes_nothing,
+    the_pytree_of_the_state_is_free,
+    rotations_of_the_coordinates_commute,
+    translations_of_the_coordinates_commute,
+    the_unit_of_the_state_is_free,
+    frozen_components_stay,
+    a_lane_of_a_batch_is_that_lane_alone,
+    newton_leads_no_further_than_to_the_state_that_was_displaced,
+    the_correction_is_orthogonal_to_the_flow,
+    single_precision_agrees_with_double,
+]
+# Its energy is conserved only where its constraints hold, which the candidate does not.
+SKIP = {("the_correction_is_orthogonal_to_the_flow", "cartesian-pendulum")}
+
+
+@every_law_on_every_system(LAWS, SKIP)
+@settings(max_examples=8)
+@given(data=st.data())
+def test_law(law, name, data):
+    system = SYSTEMS[name]
+    check(law, system, data.draw(inputs(system)))
+
+
+@eqx.filter_jit
+def projected(system, y, displacement):
+    candidate = displaced(y, displacement)
+    values = values_at(system.manifold, y)
+    out, info = dfc.project(
+        system.manifold, candidate, value=values, projection=dfc.SimplifiedNewton()
+    )
+    return out, values, info
+
+
+def success_implies_that_the_residual_is_within_tolerance(system, drawn):
+    """Judged by other code than that which claims the success."""
+    out, values, info = projected(system, *drawn)
+    if info.result == optx.RESULTS.successful:
+        assert info.residual_after <= info.residual_before + 1e-15
+        dct.assert_on_manifold(system.manifold, out, value=values)
+    else:
+        assert info.residual_after > 0
+
+
+@every_law_on_every_system([success_implies_that_the_residual_is_within_tolerance])
+@settings(max_examples=8)
+@given(data=st.data())
+def test_success(law, name, data):
+    system = SYSTEMS[name]
+    law(system, data.draw(inputs(system)))
+
+
+@settings(max_examples=3)
+@given(packing=dct.restructurings(SYSTEMS["kepler"].y0))
+def test_every_pytree_of_the_state_gives_the_same(packing):
+    """Each one is compiled anew."""
+    system = SYSTEMS["kepler"]
+
+    @jax.jit
+    def both(y):
+        candidate = jax.tree.map(lambda x: x + 1e-3, y)
+        expected, ok1 = project(system.manifold, candidate, y)
+        manifold = packing.manifold(system.manifold)
+        got, ok2 = project(manifold, packing.pack(candidate), packing.pack(y))
+        return ok1 & ok2, packing.unpack(got), expected
+
+    ok, got, expected = both(system.y0)
+    assert ok
+    assert_close(got, expected, 1e-14)

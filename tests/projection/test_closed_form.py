@@ -1,0 +1,56 @@
+"""A projection that the user writes down is used as it is, and checked."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import solve
+
+SPHERE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+
+
+def rescale(t, y, args, values):
+    return y * jnp.sqrt(values["square"] / jnp.sum(y**2))
+
+
+def rotation(t, y, args):
+    return args * jnp.stack([y[1], -y[0]])
+
+
+def run(projection, y0, args, **kwargs):
+    solver = dfc.ManifoldProjection(dfc.RK4(), SPHERE, projection=projection)
+    return solve(rotation, solver, y0, args=args, **kwargs)
+
+
+def test_it_agrees_with_newton_and_so_do_its_derivatives():
+    y0 = jnp.array([3.0, 4.0])
+
+    def loss(y0, args, projection):
+        return jnp.sum(run(projection, y0, args).ys ** 3)
+
+    gradient = jax.jit(jax.value_and_grad(loss, (0, 1)), static_argnums=2)
+    closed, newton = (gradient(y0, 1.3, p) for p in (dfc.ClosedForm(rescale), dfc.Newton()))
+    for a, b in zip(jax.tree.leaves(closed), jax.tree.leaves(newton), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_dense_output_is_projected_by_it():
+    sol = run(dfc.ClosedForm(rescale), jnp.array([3.0, 4.0]), 1.0, saveat=dfx.SaveAt(dense=True))
+    for t in np.linspace(0, 1, 7):
+        np.testing.assert_allclose(jnp.sum(sol.evaluate(t) ** 2), 25.0, rtol=4e-16)
+
+
+def test_a_wrong_formula_fails():
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"manifold\['square'\]"):
+        run(dfc.ClosedForm(lambda t, y, args, values: 1.01 * y), jnp.array([3.0, 4.0]), 1.0)
+
+
+def test_wrong_input_is_explained():
+    for fn in (lambda t, y, args, values: (y,), lambda t, y, args, values: y[:1]):
+        with pytest.raises(ValueError, match="`fn` of a `ClosedForm` returned"):
+            run(dfc.ClosedForm(fn), jnp.array([3.0, 4.0]), 1.0)

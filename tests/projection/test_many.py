@@ -1,0 +1,129 @@
+"""Many constraints: the rows are never formed, and nothing else changes."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve._manifold import DENSE_MAX, estimated_norms
+from diffrax_conserve._projection import _jacobian
+
+from ..problems import solve
+
+BONDS = DENSE_MAX + 22
+
+
+def bonds(t, q, args):
+    return jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args
+
+
+CHAIN = dfc.Constraint(bonds)
+
+
+def chain(count=BONDS, noise=1e-4):
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(count, 3))
+    q = np.concatenate([np.zeros((1, 3)), np.cumsum(d / np.linalg.norm(d, axis=1)[:, None], 0)])
+    return jnp.asarray(q + noise * rng.normal(size=q.shape))
+
+
+@jax.jit
+def projected(q, length=1.0):
+    return dfc.project(CHAIN, q, args=length, projection=dfc.SimplifiedNewton())
+
+
+def test_the_rows_are_never_formed():
+    jaxpr = jax.make_jaxpr(projected)(chain())
+
+    def shapes(jaxpr):
+        for equation in jaxpr.eqns:
+            for variable in equation.outvars:
+                yield variable.aval.size
+            for sub in jax.core.jaxprs_in_params(equation.params):
+                yield from shapes(sub)
+
+    # One row is 3 (BONDS + 1) numbers; the probes of the norms are 16 states.
+    assert max(shapes(jaxpr.jaxpr)) <= 32 * 3 * (BONDS + 1) < 3 * (BONDS + 1) * BONDS
+
+
+def test_it_agrees_with_the_dense_solver(monkeypatch):
+    q = chain()
+    y, info = projected(q)
+    assert info.residual_after <= 1e-15
+    assert float(jnp.max(jnp.abs(bonds(0.0, y, 1.0)))) <= 1e-13
+    monkeypatch.setattr(_jacobian, "DENSE_MAX", 10**6)
+    dense, _ = dfc.project(CHAIN, q, args=1.0, projection=dfc.SimplifiedNewton())
+    np.testing.assert_allclose(y, dense, rtol=0, atol=1e-12)
+
+
+def test_derivatives_agree_with_finite_differences():
+    q, rng = chain(), np.random.default_rng(1)
+    d, h = jnp.asarray(rng.normal(size=q.shape)), 1e-6
+
+    @jax.jit
+    def value(q, length):
+        return jnp.sum(jnp.sin(projected(q, length)[0]))
+
+    dq, dl = jax.jit(jax.grad(value, (0, 1)))(q, 1.0)
+    difference = (value(q + h * d, 1.0 + h) - value(q - h * d, 1.0 - h)) / (2 * h)
+    np.testing.assert_allclose(jnp.sum(dq * d) + dl, difference, rtol=1e-6)
+    _, forward = jax.jvp(value, (q, 1.0), (d, 1.0))
+    np.testing.assert_allclose(forward, jnp.sum(dq * d) + dl, rtol=1e-9)
+
+
+def test_a_lane_of_a_batch_is_that_lane_alone():
+    qs = jnp.stack([chain(noise=1e-4), chain(noise=1e-3)])
+    batch, info = jax.vmap(projected)(qs)
+    assert bool(jnp.all(info.residual_after <= 1e-15))
+    for q, y in zip(qs, batch, strict=True):
+        np.testing.assert_allclose(y, projected(q)[0], rtol=0, atol=1e-12)
+
+
+def test_redundant_constraints_change_nothing():
+    twice = {"once": CHAIN, "again": CHAIN}
+    q = chain()
+    y, info = dfc.project(twice, q, args=1.0, projection=dfc.SimplifiedNewton())
+    assert info.residual_after <= 1e-15
+    np.testing.assert_allclose(y, projected(q)[0], rtol=0, atol=1e-11)
+
+
+def test_contradicting_constraints_fail():
+    other = dfc.Constraint(lambda t, q, args: bonds(t, q, 1.01 * args))
+    _, info = dfc.project([CHAIN, other], chain(), args=1.0, projection=dfc.SimplifiedNewton())
+    assert info.result != optx.RESULTS.successful
+
+
+def test_a_solve_keeps_every_constraint_at_every_saved_time():
+    def free_rotation(t, q, args):  # rigid, so that it keeps the bonds
+        return jnp.cross(jnp.array([0.0, 0.3, 1.0]), q)
+
+    y0, _ = dfc.project(CHAIN, chain(), args=1.0, projection=dfc.SimplifiedNewton())
+    sol = solve(
+        free_rotation,
+        dfc.ManifoldProjection(dfx.Heun(), CHAIN),
+        y0,
+        args=1.0,
+        t1=0.3,
+        saveat=dfx.SaveAt(ts=jnp.linspace(0, 0.3, 5)),
+    )
+    assert float(jnp.max(jnp.abs(dfc.drift(sol, CHAIN, 1.0)))) <= 2e-15
+
+
+def test_estimated_norms_are_right_to_a_factor_of_two():
+    rng = np.random.default_rng(2)
+    matrix = jnp.asarray(rng.normal(size=(300, 40)) * np.logspace(-6, 6, 300)[:, None])
+    weights = jnp.asarray(rng.uniform(0.5, 2, size=40))
+    estimate = estimated_norms(lambda y: matrix @ y, weights)
+    ratio = estimate / np.linalg.norm(matrix * weights, axis=1)
+    assert float(jnp.min(ratio)) > 0.4
+    assert float(jnp.max(ratio)) < 2
+
+
+@pytest.mark.slow
+def test_newton_copes_with_many_constraints():
+    y, info = jax.jit(lambda q: dfc.project(CHAIN, q, args=1.0))(chain(noise=1e-2))
+    assert info.residual_after <= 4e-15
+    assert float(jnp.max(jnp.abs(bonds(0.0, y, 1.0)))) <= 1e-12

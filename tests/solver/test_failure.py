@@ -1,0 +1,191 @@
+"""A failed projection says so: which constraint, how far off, and what to do."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import solve
+
+Y0 = jnp.array([1.0, 0.0])
+
+
+def rotation(t, y, args):
+    return jnp.stack([y[1], -y[0]])
+
+
+def square(t, y, args):
+    return jnp.sum(y**2)
+
+
+def run(manifold, solver=None, y0=Y0, vector_field=rotation, **kwargs):
+    options = {k: kwargs.pop(k) for k in ("projection", "max_correction") if k in kwargs}
+    wrapped = dfc.ManifoldProjection(solver or dfc.RK4(), manifold, **options)
+    return solve(vector_field, wrapped, y0, **kwargs)
+
+
+def out_of_reach(t, y, args):
+    """The square, which after t = 0.5 must be negative to be as before."""
+    return jnp.sum(y**2) + jnp.where(t > 0.5, 2.0, 0.0)
+
+
+OUT_OF_REACH = {"square": dfc.FirstIntegral(square), "jump": dfc.FirstIntegral(out_of_reach)}
+
+
+@pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()])
+def test_the_error_of_fixed_steps_names_the_constraint_its_residual_and_a_remedy(solver):
+    with pytest.raises(
+        eqx.EquinoxRuntimeError, match=r"manifold\['jump'\].*off by about 1e-1"
+    ) as e:
+        run(OUT_OF_REACH, solver)
+    assert "smaller steps" in str(e.value)
+
+
+def test_the_result_holds_the_message_if_nothing_is_raised():
+    sol = run(OUT_OF_REACH, throw=False)
+    assert sol.result != dfx.RESULTS.successful
+    assert "manifold['jump']" in dfx.RESULTS[sol.result]
+
+
+def test_each_lane_of_a_batch_has_its_own_result():
+    def lane(jump):
+        def fn(t, y, args):
+            return jnp.sum(y**2) + jnp.where(t > 0.5, args, 0.0)
+
+        return run(dfc.FirstIntegral(fn), args=jump, throw=False).result
+
+    results = jax.jit(jax.vmap(lane))(jnp.array([0.0, 2.0, jnp.nan]))
+    first, second, third = (
+        eqx.tree_at(lambda r: r._value, results, results._value[i]) for i in range(3)
+    )
+    assert first == dfx.RESULTS.successful
+    assert "off by about 1e-1" in dfx.RESULTS[second]
+    assert "not finite" in dfx.RESULTS[third]
+
+
+def test_a_state_that_is_not_finite_is_called_that():
+    with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is not finite"):
+        run(
+            dfc.FirstIntegral(square),
+            vector_field=lambda t, y, args: jnp.sqrt(0.5 - t) * y,
+        )
+
+
+def test_an_inaccurate_function_is_told_about_the_tolerance():
+    def noisy(t, y, args):
+        return jnp.sum(y**2) + jax.lax.stop_gradient(1e-12 * jnp.sin(1e15 * y[0]))
+
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"SimplifiedNewton\(rtol="):
+        run(dfc.FirstIntegral(noisy), y0=jnp.array([1.0, 0.5]))
+    sol = run(
+        dfc.FirstIntegral(noisy),
+        y0=jnp.array([1.0, 0.5]),
+        projection=dfc.SimplifiedNewton(rtol=1e-10),
+    )
+    assert sol.result == dfx.RESULTS.successful
+
+
+def test_contradicting_constraints_name_one_of_them():
+    manifold = (
+        dfc.FirstIntegral(square, value=1.0),
+        dfc.FirstIntegral(square, value=1.1),
+    )
+    with pytest.raises(eqx.EquinoxRuntimeError, match=r"`manifold\[[01]\]` .* contradict"):
+        run(manifold)
+
+
+def test_many_entries_are_not_named_one_by_one():
+    manifold = [
+        dfc.FirstIntegral(lambda t, y, args, k=k: out_of_reach(t, y[k], args)) for k in range(60)
+    ]
+    y0 = jnp.ones((60, 2))
+    with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is still off"):
+        run(manifold, y0=y0, vector_field=lambda t, y, args: y[:, ::-1] * jnp.array([1.0, -1.0]))
+
+
+def test_without_the_list_of_messages_diffrax_has_its_say(monkeypatch):
+    monkeypatch.setattr(dfx.RESULTS, "_index_to_message", tuple(dfx.RESULTS._index_to_message))
+    sol = run(dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y, args)), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+    assert "diffrax_conserve" not in dfx.RESULTS[sol.result]
+
+
+# ---- max_correction ----
+
+
+def double_well(t, y, args):
+    q, p = y
+    return jnp.stack([p, q - q**3])
+
+
+WELL = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 + y[0] ** 4 / 4 - y[0] ** 2 / 2)
+RIGHT = jnp.array([1.38, 0.0])  # the energy is negative: the two wells are not connected
+
+
+@eqx.filter_jit
+def in_the_well(solver, controller, max_correction):
+    """The solve, and whether all of it is in the right well."""
+    sol = run(
+        WELL,
+        solver,
+        RIGHT,
+        double_well,
+        projection=dfc.Newton(),
+        max_correction=max_correction,
+        t1=42.0,
+        dt0=1.4,
+        throw=False,
+        saveat=dfx.SaveAt(steps=True),
+        max_steps=300,
+        stepsize_controller=controller,
+    )
+    return sol, jnp.all(jnp.where(jnp.isfinite(sol.ts), sol.ys[:, 0], 1) > 0)
+
+
+def test_max_correction_guards_against_another_component():
+    fixed = dfx.ConstantStepSize()
+    sol, right = in_the_well(dfx.Euler(), fixed, jnp.array(1e9))
+    assert sol.result == dfx.RESULTS.successful
+    assert not right  # what it is for
+    sol, right = in_the_well(dfx.Euler(), fixed, jnp.array(0.3))
+    assert right
+    assert "max_correction" in dfx.RESULTS[sol.result]
+
+
+def test_max_correction_makes_an_adaptive_solve_take_smaller_steps():
+    careless = dfx.PIDController(rtol=1e3, atol=1e3, factormax=1.2)
+    sol, right = in_the_well(dfx.Heun(), careless, jnp.array(1e9))
+    assert sol.result == dfx.RESULTS.successful
+    assert not right
+    sol, right = in_the_well(dfx.Heun(), careless, jnp.array(0.1))
+    assert sol.result == dfx.RESULTS.successful
+    assert right
+    assert sol.stats["num_rejected_steps"] > 0
+
+
+def test_max_correction_lets_roundoff_pass():
+    """At an equilibrium the step has length zero, but the correction need not."""
+    sol = run(
+        WELL,
+        y0=jnp.array([1.0, 0.0]) + 1e-12,
+        vector_field=double_well,
+        max_correction=0.1,
+        t1=10.0,
+    )
+    assert sol.result == dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("option", ["max_correction", "threshold"])
+def test_wrong_options_are_refused(option, bad):
+    with pytest.raises(ValueError, match=option):
+        dfc.ManifoldProjection(dfc.RK4(), WELL, **{option: bad})
+
+
+@pytest.mark.parametrize("bad", [0, -1])
+def test_wrong_every_is_refused(bad):
+    with pytest.raises(ValueError, match="every"):
+        dfc.ManifoldProjection(dfc.RK4(), WELL, every=bad)

@@ -1,0 +1,161 @@
+"""Every way to save, to stop, and to choose steps that diffrax has."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body, rotational_energy, solve
+
+SOLVER = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+ENERGY = rotational_energy(0.0, OMEGA0, None)
+
+
+def run(saveat, **kwargs):
+    return solve(rigid_body, SOLVER, OMEGA0, saveat=saveat, **kwargs)
+
+
+def energies(ys):
+    return jax.vmap(lambda y: rotational_energy(0.0, y, None))(ys)
+
+
+def test_subs_and_functions_of_the_state():
+    ts = jnp.linspace(0, 1, 6)
+    saveat = dfx.SaveAt(
+        subs={
+            "end": dfx.SubSaveAt(t0=True, t1=True),
+            "energy": dfx.SubSaveAt(ts=ts, fn=rotational_energy),
+            "steps": dfx.SubSaveAt(steps=2),
+        }
+    )
+    sol = run(saveat, max_steps=16)
+    np.testing.assert_allclose(sol.ys["energy"], ENERGY, rtol=4e-16)
+    np.testing.assert_allclose(energies(sol.ys["end"]), ENERGY, rtol=4e-16)
+    finite = jnp.isfinite(sol.ts["steps"])
+    np.testing.assert_allclose(energies(sol.ys["steps"][finite]), ENERGY, rtol=4e-16)
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        dfx.ConstantStepSize(),
+        dfx.StepTo(ts=jnp.array([0.0, 0.13, 0.5, 1.0])),
+        dfx.ClipStepSizeController(
+            dfx.PIDController(rtol=1e-6, atol=1e-6),
+            step_ts=jnp.array([0.3]),
+            store_rejected_steps=5,
+        ),
+        dfx.ClipStepSizeController(
+            dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=jnp.array([0.51])
+        ),
+        dfx.PIDController(rtol=1e-6, atol=1e-6, pcoeff=0.3, icoeff=0.4, dcoeff=0.1, dtmax=0.2),
+    ],
+    ids=["constant", "step-to", "clip", "jump", "pid"],
+)
+def test_every_controller_hits_its_times_on_the_manifold(controller):
+    sol = run(
+        dfx.SaveAt(t0=True, steps=True),
+        stepsize_controller=controller,
+        dt0=None if isinstance(controller, dfx.StepTo) else 0.1,
+        max_steps=64,
+    )
+    assert largest(dfc.drift(sol, RIGID_BODY)) <= 4e-16
+    times = np.asarray(sol.ts)
+    expected = {
+        "StepTo": [0.13, 0.5],
+        "ClipStepSizeController": [0.3] if getattr(controller, "jump_ts", 0) is None else [0.51],
+    }.get(type(controller).__name__, [1.0])
+    for t in expected:
+        assert np.min(np.abs(times - t)) <= 1e-6
+
+
+@pytest.mark.parametrize("meter", [dfx.TextProgressMeter(), dfx.NoProgressMeter()])
+def test_progress_meters_and_unlimited_steps(meter, capsys):
+    sol = run(dfx.SaveAt(t1=True), progress_meter=meter, max_steps=None)
+    np.testing.assert_allclose(energies(sol.ys), ENERGY, rtol=4e-16)
+
+
+def test_continued_from_every_part_of_the_state():
+    saveat = dfx.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)
+    options = dict(
+        saveat=saveat, stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8), dt0=None
+    )
+    first = run(t1=0.6, **options)
+    second = solve(
+        rigid_body,
+        SOLVER,
+        first.ys[-1],
+        t0=0.6,
+        t1=1.2,
+        solver_state=first.solver_state,
+        controller_state=first.controller_state,
+        made_jump=first.made_jump,
+        **options,
+    )
+    np.testing.assert_allclose(energies(second.ys), ENERGY, rtol=4e-16)
+    reference = solve(
+        rigid_body,
+        dfx.Dopri8(),
+        OMEGA0,
+        t1=1.2,
+        stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
+    )
+    np.testing.assert_allclose(second.ys[-1], reference.ys[-1], rtol=0, atol=1e-7)
+
+
+def test_a_steady_state_by_the_implicit_adjoint():
+    """A damped flow on a sphere ends at the point in the direction of `args`, which is
+    differentiated by the implicit function theorem."""
+
+    def towards(t, y, args):
+        return args - jnp.sum(args * y) * y
+
+    sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+
+    def end(args):
+        sol = solve(
+            towards,
+            dfc.ManifoldProjection(dfx.Tsit5(), sphere),
+            jnp.array([1.0, 0.0, 0.0]),
+            args=args,
+            t1=jnp.inf,
+            dt0=0.1,
+            adjoint=dfx.ImplicitAdjoint(),
+            event=dfx.Event(dfx.steady_state_event(rtol=1e-9, atol=1e-9)),
+            stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+            max_steps=None,
+        )
+        return sol.ys[-1]
+
+    args = jnp.array([1.0, 2.0, 2.0])
+    np.testing.assert_allclose(end(args), args / 3, rtol=0, atol=1e-8)
+
+
+def test_vmap_of_grad_and_grad_of_vmap():
+    def loss(y0):
+        return jnp.sum(solve(rigid_body, SOLVER, y0, t1=0.3).ys ** 3)
+
+    y0s = jnp.stack([OMEGA0, 0.5 * OMEGA0 + jnp.array([0.1, 0.0, 0.0])])
+    one_by_one = jnp.stack([jax.grad(loss)(y0) for y0 in y0s])
+    np.testing.assert_allclose(jax.vmap(jax.grad(loss))(y0s), one_by_one, rtol=1e-12)
+    together = jax.grad(lambda y0s: jnp.sum(jax.vmap(loss)(y0s)))(y0s)
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-12)
+
+
+def test_an_event_in_a_backward_solve_lands_on_the_manifold():
+    sol = solve(
+        rigid_body,
+        SOLVER,
+        OMEGA0,
+        t1=-5.0,
+        dt0=-0.1,
+        event=dfx.Event(lambda t, y, args, **_: y[0] - 0.5, optx.Newton(1e-10, 1e-10)),
+        saveat=dfx.SaveAt(t1=True),
+    )
+    assert sol.result == dfx.RESULTS.event_occurred
+    np.testing.assert_allclose(sol.ys[-1, 0], 0.5, rtol=1e-8)
+    np.testing.assert_allclose(energies(sol.ys), ENERGY, rtol=4e-16)

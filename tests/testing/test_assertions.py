@@ -1,0 +1,247 @@
+"""Each assertion passes what is right, and says what is wrong with a planted defect."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+from ..problems import OMEGA0, RIGID_BODY, rigid_body
+
+TERM = dfx.ODETerm(rigid_body)
+PROJECTED = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+STEPS = dfx.SaveAt(t0=True, steps=True)
+DENSE = dfx.SaveAt(t0=True, t1=True, dense=True)
+
+
+@eqx.filter_jit
+def solve(solver, saveat, y0=OMEGA0, t1=2.0, max_steps=32):
+    return dfx.diffeqsolve(
+        TERM, solver, 0.0, t1, 0.1, y0, saveat=saveat, max_steps=max_steps, throw=False
+    )
+
+
+@eqx.filter_jit
+def solve_batch(solver, y0s):
+    return jax.vmap(lambda y0: solve(solver, STEPS, y0))(y0s)
+
+
+def message(exception, function, *args, **kwargs):
+    with pytest.raises(exception) as caught:
+        function(*args, **kwargs)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("saveat", [STEPS, DENSE], ids=["steps", "dense"])
+def test_a_projected_solution_is_conserved(saveat):
+    """With rows that diffrax padded."""
+    sol = solve(PROJECTED, saveat)
+    dct.assert_conserved(sol, RIGID_BODY)
+    dct.assert_conserved(sol, RIGID_BODY, y0=OMEGA0)
+
+
+def test_a_plain_solution_is_not_and_the_message_says_where():
+    sol = solve(dfx.Tsit5(), STEPS)
+    text = message(AssertionError, dct.assert_conserved, sol, RIGID_BODY)
+    assert "`manifold['energy']` first at time 0.1 (saved state, row 1 of 21)" in text
+    assert "must stay 0.3" in text
+    assert "units of roundoff (float64)" in text
+    assert "violated in 20 of 21 rows" in text
+    assert "is the solver wrapped" in text
+    dct.assert_conserved(sol, RIGID_BODY, rtol=1e-6)
+    dct.assert_conserved(sol, RIGID_BODY, rtol=0, atol=1e-6)
+
+
+def test_every_violated_constraint_is_named_and_no_other():
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY["energy"])
+    text = message(AssertionError, dct.assert_conserved, solve(solver, STEPS), RIGID_BODY)
+    assert "`manifold['momentum']`" in text
+    assert "`manifold['energy']`" not in text
+
+
+def test_an_element_of_a_vector_is_named():
+    manifold = [dfc.FirstIntegral(lambda t, y, args: {"both": jnp.stack([y[0] * 0, y[1]])})]
+    text = message(AssertionError, dct.assert_conserved, solve(PROJECTED, STEPS), manifold)
+    assert "`manifold[0]['both'][1]`" in text
+    assert "[0]`" not in text
+
+
+def test_an_interpolation_that_is_not_projected_is_found():
+    """The nodes lie on the manifold; this is the defect of a naive wrapper."""
+    sol = solve(PROJECTED, DENSE)
+    plain = solve(dfx.Tsit5(), DENSE)
+    broken = eqx.tree_at(lambda s: s.interpolation, sol, plain.interpolation)
+    text = message(AssertionError, dct.assert_conserved, broken, RIGID_BODY)
+    assert "dense output, row" in text
+    assert "the solver's interpolation is not projected" in text
+
+
+def test_a_drift_before_the_first_saved_state_is_found_if_the_initial_one_is_given():
+    sol = solve(dfx.Tsit5(), dfx.SaveAt(t1=True))
+    assert "first at time 2" in message(
+        AssertionError, dct.assert_conserved, sol, RIGID_BODY, y0=OMEGA0
+    )
+    assert "`y0=...`" in message(ValueError, dct.assert_conserved, sol, RIGID_BODY)
+
+
+def test_a_little_drift_is_said_to_look_like_roundoff():
+    sol = solve(PROJECTED, STEPS)
+    sol = eqx.tree_at(lambda s: s.ys, sol, sol.ys * (1 + 1e-14 * jnp.arange(33)[:, None]))
+    text = message(AssertionError, dct.assert_conserved, sol, RIGID_BODY)
+    assert "can be roundoff that adds up" in text
+    assert "largest at time 2 " in text
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_state_that_is_not_finite_never_passes(bad):
+    """Not even in a component that no integral depends on."""
+    sol = solve(PROJECTED, STEPS)
+    sol = eqx.tree_at(lambda s: s.ys, sol, sol.ys.at[3, 2].set(bad))
+    first = dfc.FirstIntegral(lambda t, y, args: 0 * y[0])
+    text = message(AssertionError, dct.assert_conserved, sol, first, rtol=1e300, atol=1e300)
+    assert "not finite at time 0.3 (saved state, row 3 of 21)" in text
+    assert "not finite" in message(
+        AssertionError, dct.assert_on_manifold, first, sol.ys[3], value=0.0
+    )
+
+
+def test_a_constraint_that_returns_nan_never_passes():
+    bad = dfc.Constraint(lambda t, y, args: jnp.log(y[0] - 2))
+    sol = solve(PROJECTED, STEPS)
+    assert "it is nan" in message(AssertionError, dct.assert_conserved, sol, bad, atol=np.inf)
+
+
+def test_an_unsuccessful_solve_is_reported_as_that():
+    sol = solve(PROJECTED, STEPS, max_steps=7)
+    text = message(AssertionError, dct.assert_conserved, sol, RIGID_BODY)
+    assert "did not succeed" in text
+    assert "maximum number of solver steps" in text
+
+
+def test_lanes_of_a_batch_are_all_checked():
+    y0s = jnp.stack([OMEGA0, 2 * OMEGA0, 3 * OMEGA0])
+    sol = solve_batch(PROJECTED, y0s)
+    dct.assert_conserved(sol, RIGID_BODY, y0=y0s)
+    moved = eqx.tree_at(lambda s: s.ys, sol, sol.ys.at[2, 5].multiply(1.001))
+    text = message(AssertionError, dct.assert_conserved, moved, RIGID_BODY)
+    assert "first at time 0.5 (saved state, row 5 of 21, lane (2,))" in text
+    assert "violated in 1 of 63 rows" in text
+    failed = solve_batch(PROJECTED, y0s.at[1].set(jnp.nan))
+    text = message(AssertionError, dct.assert_conserved, failed, RIGID_BODY)
+    assert "in 1 of 3 lanes, first in lane (1,)" in text
+
+
+def test_single_precision_is_judged_by_its_own_roundoff():
+    single = jnp.float32
+    sol = solve(PROJECTED, STEPS, OMEGA0.astype(single), single(2.0))
+    dct.assert_conserved(sol, RIGID_BODY)
+    plain = solve(dfx.Euler(), STEPS, OMEGA0.astype(single), single(2.0))
+    text = message(AssertionError, dct.assert_conserved, plain, RIGID_BODY)
+    assert "a unit of roundoff of 1.2e-07" in text
+
+
+def test_nothing_to_check_is_an_error():
+    assert "holds no states" in message(
+        ValueError, dct.assert_conserved, solve(PROJECTED, dfx.SaveAt()), RIGID_BODY
+    )
+    subs = dfx.SaveAt(subs=[dfx.SubSaveAt(t1=True), dfx.SubSaveAt(t0=True)])
+    assert "SubSaveAt" in message(
+        ValueError, dct.assert_conserved, solve(PROJECTED, subs), RIGID_BODY
+    )
+
+
+CIRCLE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - args)
+
+
+def test_a_state_on_the_manifold():
+    dct.assert_on_manifold(CIRCLE, np.array([0.6, 0.8]), args=1.0)
+    text = message(
+        AssertionError, dct.assert_on_manifold, CIRCLE, np.array([0.6, 0.8]), t=3.0, args=2.0
+    )
+    assert "`manifold` first at time 3" in text
+    assert "it is -1.0, but must be 0" in text
+    assert "was the state projected" in text
+
+
+def test_a_state_and_given_conserved_values():
+    values = {name: entry.fn(0.0, OMEGA0, None) for name, entry in RIGID_BODY.items()}
+    dct.assert_on_manifold(RIGID_BODY, OMEGA0, value=values)
+    text = message(
+        AssertionError, dct.assert_on_manifold, RIGID_BODY, OMEGA0 * (1 + 1e-13), value=values
+    )
+    assert "must stay 0.3" in text
+    assert "`value=...`" in message(ValueError, dct.assert_on_manifold, RIGID_BODY, OMEGA0)
+
+
+def test_order():
+    dct.assert_order(dfx.Heun(), TERM, OMEGA0, t1=2.0, dt0=0.1)
+    text = message(
+        AssertionError, dct.assert_order, dfx.Heun(), TERM, OMEGA0, t1=2.0, dt0=0.1, order=3
+    )
+    assert "measured order is 1.9" in text or "measured order is 2.0" in text
+    assert "but 3 is claimed" in text
+    assert "0.05 " in text
+
+
+def test_order_of_a_defect():
+    """A reference in error by 1e-4 shows as no order at all."""
+    final = solve(dfx.Dopri8(), dfx.SaveAt(t1=True)).ys[-1]
+    text = message(
+        AssertionError,
+        dct.assert_order,
+        dfx.Heun(),
+        TERM,
+        OMEGA0,
+        t1=2.0,
+        dt0=0.1,
+        reference=final + 1e-2,
+    )
+    assert "measured order is" in text
+
+
+def test_order_that_cannot_be_measured():
+    text = message(ValueError, dct.assert_order, dfx.Dopri8(), TERM, OMEGA0, t1=0.01, dt0=0.005)
+    assert "lost in roundoff" in text
+
+
+def test_order_of_two_terms_backwards():
+    """The solver is its own reference, where there is no single `ODETerm`."""
+    terms = (dfx.ODETerm(lambda t, p, args: p), dfx.ODETerm(lambda t, q, args: -jnp.sin(q)))
+    y0 = (jnp.array(1.0), jnp.array(0.5))
+    dct.assert_order(dfx.SemiImplicitEuler(), terms, y0, t0=1.0, t1=0.0, dt0=0.05)
+
+
+def test_gradients():
+    def f(y, system, power):
+        return system.energy(0.0, y["w"], None) ** power, y["w"] * y["scale"]
+
+    y = {"w": OMEGA0, "scale": jnp.array(2.0)}
+    dct.assert_gradients(f, y, dfc.systems.RigidBody(), 3)
+
+
+def test_wrong_gradients_are_found_and_the_argument_is_named():
+    def f(y):
+        return jnp.sum(y["good"] ** 2) + jnp.sum(jax.lax.stop_gradient(y["bad"]) ** 2)
+
+    y = {"good": OMEGA0, "bad": OMEGA0}
+    text = message(AssertionError, dct.assert_gradients, f, y)
+    assert "`args[0]['bad']`, forward mode gives 0" in text
+    assert "`args[0]['bad']`, reverse mode gives 0" in text
+    assert "good" not in text
+    text = message(AssertionError, dct.assert_gradients, f, y, forward=False)
+    assert "forward mode" not in text
+
+
+def test_nan_gradients_are_found():
+    def f(y):
+        return jnp.where(y > 0, y, jnp.sqrt(jnp.where(y > 0, -y, y) * 0))
+
+    assert "nan" in message(AssertionError, dct.assert_gradients, f, jnp.ones(2))
+
+
+def test_gradients_need_something_to_vary():
+    assert "nothing to vary" in message(ValueError, dct.assert_gradients, lambda n: n, 3)

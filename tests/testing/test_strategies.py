@@ -1,0 +1,142 @@
+"""What the strategies draw is what they say, and it shrinks to what they say."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import Phase, find, given, settings
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+SHRINK = settings(deadline=None, database=None, phases=(Phase.generate, Phase.shrink))
+KEPLER = dfc.systems.Kepler()
+
+
+def simplest(strategy, condition=lambda x: True):
+    return find(strategy, condition, settings=SHRINK)
+
+
+@given(y=dct.states({"a": np.zeros((2, 3), np.float32), "b": (np.zeros(()),)}, magnitude=0.3))
+def test_states_are_like_the_given_one_and_bounded(y):
+    assert y["a"].shape == (2, 3)
+    assert y["a"].dtype == np.float32
+    assert y["b"][0].dtype == np.float64
+    for x in jax.tree.leaves(y):
+        assert np.all(np.abs(x) <= np.asarray(0.3, x.dtype))
+        assert np.all((x == 0) | (x.astype(np.float32) ** 2 > 0))
+
+
+def test_states_shrink_to_readable_ones():
+    assert np.all(simplest(dct.states(np.zeros(3))) == 0)
+    y = simplest(dct.states(np.zeros(3), magnitude=10.0), lambda y: np.sum(y**2) > 20)
+    assert np.all(y == np.round(y))
+
+
+def test_wrong_arguments_are_explained():
+    with pytest.raises(TypeError, match="floating-point"):
+        dct.states(np.zeros(3, int))
+    with pytest.raises(ValueError, match="`magnitude`"):
+        dct.states(np.zeros(3), magnitude=0.0)
+    with pytest.raises(ValueError, match="smallest"):
+        dct.step_sizes(-0.1)
+    with pytest.raises(ValueError, match="finite"):
+        dct.times(0.0, np.inf)
+    with pytest.raises(ValueError, match="dtypes"):
+        dct.restructurings((np.zeros(2), np.zeros(2, np.float32)))
+    with pytest.raises(ValueError, match="1 or 2 integrals"):
+        dct.quadratic_systems(2, integrals=2)
+
+
+@given(step=dct.step_sizes(0.5, smallest=0.001))
+def test_step_sizes(step):
+    assert 0.001 <= step <= 0.5
+    assert isinstance(step, np.float64)
+
+
+def test_step_sizes_shrink_to_the_largest():
+    assert simplest(dct.step_sizes(0.5)) == 0.5
+    assert simplest(dct.step_sizes(0.5), lambda h: h < 0.4) >= 0.3
+
+
+@pytest.mark.parametrize(("t0", "t1"), [(0.0, 0.3), (2.0, -1.0)])
+def test_times(t0, t1):
+    @given(ts=dct.times(t0, t1, size=7))
+    def run(ts):
+        assert ts.shape == (7,)
+        assert np.all(np.sign(t1 - t0) * np.diff(ts) >= 0)
+        assert np.all((min(t0, t1) <= ts) & (ts <= max(t0, t1)))
+
+    run()
+    assert np.all(simplest(dct.times(t0, t1)) == t0)
+
+
+@given(y=dct.system_states(dfc.systems.CartesianPendulum(), dtype=np.float32))
+def test_system_states_lie_on_the_constraints(y):
+    manifold = dfc.systems.CartesianPendulum().manifold
+    dct.assert_on_manifold({k: manifold[k] for k in ("rod length", "velocity constraint")}, y)
+    assert y[0].dtype == np.float32
+
+
+def test_system_states_shrink_to_the_own_one_and_are_many():
+    states = dct.system_states(KEPLER)
+    assert np.array_equal(simplest(states)[0], KEPLER.y0[0])
+    seen = set()
+
+    @settings(max_examples=50)
+    @given(y=states)
+    def collect(y):
+        seen.add(float(y[0][0]))
+        y[0][:] = 0  # what is drawn is not shared
+
+    collect()
+    assert len(seen) > 10
+    assert np.array_equal(simplest(states)[0], KEPLER.y0[0])
+
+
+def test_catalogue_systems():
+    assert simplest(dct.catalogue_systems()).name == dfc.systems.names()[0]
+    assert simplest(dct.catalogue_systems(["kepler"])).name == "kepler"
+
+
+@given(packing=dct.restructurings(KEPLER.y0, max_depth=3))
+def test_restructurings_keep_the_numbers(packing):
+    z = packing.pack(KEPLER.y0)
+    assert sum(np.size(x) for x in jax.tree.leaves(z)) == 4
+    back = packing.unpack(z)
+    assert all(np.array_equal(a, b) for a, b in zip(back, KEPLER.y0, strict=True))
+    assert packing.manifold(KEPLER.manifold)["energy"].fn(0.0, z, None) == pytest.approx(-0.5)
+    slope = packing.unpack(packing.vector_field(KEPLER.vector_field)(0.0, z, None))
+    assert np.array_equal(slope[0], KEPLER.y0[1])
+    assert repr(packing).startswith("Restructuring(")
+
+
+def test_restructurings_vary_and_shrink_to_one_vector():
+    strategy = dct.restructurings(KEPLER.y0)
+    assert simplest(strategy).pack(KEPLER.y0).shape == (4,)
+    nested = simplest(strategy, lambda p: isinstance(p.pack(KEPLER.y0), dict))
+    assert len(jax.tree.leaves(nested.pack(KEPLER.y0))) == 2
+    assert "{'a': <" in repr(nested)
+
+
+@pytest.mark.parametrize(("dimension", "integrals"), [(2, 1), (3, 2), (5, 2)])
+def test_quadratic_systems_conserve_their_integrals(dimension, integrals):
+    @jax.jit
+    def slope(system):
+        f = system.vector_field(0.0, jnp.asarray(system.y0), None)
+        rates = jax.jvp(lambda y: system.quadratic(0.0, y, None), (system.y0,), (f,))[1]
+        return rates, f
+
+    moving = []
+
+    @given(system=dct.quadratic_systems(dimension, integrals=integrals))
+    def run(system):
+        rates, f = slope(system)
+        assert rates.shape == (integrals,)
+        assert np.max(np.abs(rates)) <= 1e-12 * (1 + np.max(np.abs(f)))
+        assert np.all(np.linalg.eigvalsh(system.forms) > 0)
+        moving.append(bool(np.max(np.abs(f)) > 1e-3))
+        assert "forms=[[[" in repr(system)
+
+    run()
+    assert any(moving)
