@@ -27,12 +27,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         system = systems.get(options.name)
     except ValueError as error:
         parser.error(str(error))
+    if not options.train and (options.seed is not None or options.epochs is not None):
+        parser.error("--seed and --epochs are those of a training: give --train too")
     t1 = system.t1 if options.t1 is None else options.t1
     dt = system.dt if options.dt is None else options.dt
     out = Path("out", options.name) if options.out is None else options.out
     try:
         ok = _reproduce.reproduce(
-            system, out, t1=t1, dt=dt, anew=options.train, seed=options.seed, epochs=options.epochs
+            system,
+            out,
+            t1=t1,
+            dt=dt,
+            anew=options.train,
+            seed=options.seed or 0,
+            epochs=options.epochs or 5000,
         )
     except _reproduce.SetupError as error:
         parser.error(str(error))
@@ -68,9 +76,9 @@ def _parser() -> argparse.ArgumentParser:
     reproduce.add_argument(
         "--train", action="store_true", help="train the networks anew, for some minutes"
     )
-    reproduce.add_argument("--seed", type=int, default=0, metavar="N", help="seed of --train")
+    reproduce.add_argument("--seed", type=int, metavar="N", help="seed of --train (default: 0)")
     reproduce.add_argument(
-        "--epochs", type=_count, default=5000, metavar="N", help="epochs of --train"
+        "--epochs", type=_count, metavar="N", help="epochs of --train (default: 5000)"
     )
     return parser
 

@@ -246,6 +246,15 @@ def test_more_steps_than_memory_holds(capsys, tmp_path):
     assert "larger dt" in message
 
 
+def test_training_what_cannot_be_trained(capsys, tmp_path):
+    message = refused(capsys, "reproduce", "kepler", "--train", "--out", str(tmp_path / "out"))
+    assert "no learned solvers for kepler" in message
+    assert "--train" in refused(capsys, "reproduce", "rigid-body", "--epochs", "3")
+    for epochs in ("0", "-1", "many"):
+        message = refused(capsys, "reproduce", "rigid-body", "--train", f"--epochs={epochs}")
+        assert "positive whole number" in message
+
+
 def test_a_folder_that_cannot_be_written(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     message = refused(capsys, "reproduce", "kepler", "--out", str(tmp_path / "file" / "out"))

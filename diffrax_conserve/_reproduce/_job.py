@@ -11,7 +11,7 @@ from .._files import replace_file
 from .._serialisation import save
 from .._solver import RK4, ManifoldProjection
 from ..systems import AbstractSystem
-from ._check import check_times, import_plot, make_writable
+from ._check import SetupError, check_times, import_plot, make_writable
 from ._compare import compare
 from ._learned import (
     KINDS,
@@ -56,6 +56,11 @@ def reproduce(
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]
     check_times(system, t1, dt, states)
+    if anew and not is_learned(system):
+        raise SetupError(
+            f"--train: there are no learned solvers for {system.name}. The paper has them for the "
+            "first five systems that `list` names."
+        )
     plot = import_plot()
     make_writable(out)
     networks: dict[str, Learned] = {}

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._network import PINN, ConservativeLayer
+from .._network import PINN, ConservativeLayer, DeepONet
 from .._tree import tree_sub
 from ._sampling import Times
 
@@ -125,6 +125,6 @@ def trainable(model: Any) -> Any:
 def _weights(model: Any) -> Callable[[Any], Any] | None:
     if isinstance(model, PINN):
         return lambda m: m.net
-    if hasattr(model, "branch") and hasattr(model, "trunk"):
+    if isinstance(model, DeepONet):
         return lambda m: (m.branch, m.trunk)
     return None
