@@ -143,23 +143,27 @@ def conserving(t, y, args):
     return y[0] ** 2 / 2 - args * y[2]
 
 
-def loss(network, y0, args, adjoint, projected=True):
+def loss(network, y0, args, adjoint, projection=None):
     """Of a rollout that saves between the steps, and is projected to a manifold with `args`."""
     solver = dfc.DeepONetSolver(network)
-    if projected:
-        solver = dfc.ManifoldProjection(
-            solver, dfc.FirstIntegral(conserving), projection=dfc.Newton()
-        )
+    if projection is not None:
+        integral = dfc.FirstIntegral(conserving)
+        solver = dfc.ManifoldProjection(solver, integral, projection=projection)
     saveat = dfx.SaveAt(ts=jnp.array([0.3, 1.0]))
     ys = solve(solver, y0, args=args, saveat=saveat, adjoint=adjoint, max_steps=8).ys
     return jnp.sum(jnp.sin(ys))
 
 
 @pytest.mark.parametrize(
-    "layer",
-    [pytest.param(None, marks=pytest.mark.slow), dfc.ConservativeLayer(LORENZ.manifold, steps=8)],
+    ("layer", "projection"),
+    [
+        (None, dfc.SimplifiedNewton()),
+        pytest.param(
+            dfc.ConservativeLayer(LORENZ.manifold, steps=8), dfc.Newton(), marks=pytest.mark.slow
+        ),
+    ],
 )
-def test_gradients_of_a_rollout(layer):
+def test_gradients_of_a_rollout(layer, projection):
     """With respect to the initial state, args and every weight, against finite differences."""
     network = flow_map(layer=layer)
     weights, static = eqx.partition(network, eqx.is_inexact_array)
@@ -171,7 +175,7 @@ def test_gradients_of_a_rollout(layer):
     def f(point):
         weights, y0, args = point
         network = eqx.combine(weights, static)
-        return loss(network, y0, args, dfx.RecursiveCheckpointAdjoint())
+        return loss(network, y0, args, dfx.RecursiveCheckpointAdjoint(), projection)
 
     gradient = jax.jit(jax.grad(f))(start)
     for i in range(3):
@@ -188,7 +192,7 @@ def test_gradients_of_a_rollout(layer):
 
 def test_adjoints_agree():
     def f(y0, adjoint):
-        return loss(DEEPONET, y0, 1.0, adjoint, projected=False)
+        return loss(DEEPONET, y0, 1.0, adjoint)
 
     direction = jnp.array([0.3, -1.0, 0.5])
     expected = jax.grad(f)(LORENZ.y0, dfx.RecursiveCheckpointAdjoint()) @ direction

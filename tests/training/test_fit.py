@@ -70,8 +70,14 @@ def test_a_pinn_learns_a_solution(layer):
     assert log.best < log.criteria[0] / 100
 
 
-def test_a_deeponet_learns_a_flow_map():
-    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=2)
+@pytest.mark.parametrize(
+    "layer",
+    [
+        None,
+        pytest.param(dfc.ConservativeLayer(LORENZ.manifold, steps=2), marks=pytest.mark.slow),
+    ],
+)
+def test_a_deeponet_learns_a_flow_map(layer):
     before = flow_map(layer=layer)
     after, log = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=150, points=200)
     y0s = jax.vmap(LORENZ.sample)(jr.split(jr.key(9), 10))  # not those of the training
