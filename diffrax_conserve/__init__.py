@@ -14,6 +14,7 @@ from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
 from ._projection import project as project
 from ._solver import RK4 as RK4
+from ._solver import CountRejections as CountRejections
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import ProjectionStatistics as ProjectionStatistics
 from ._solver import statistics as statistics

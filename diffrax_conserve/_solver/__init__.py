@@ -1,3 +1,4 @@
+from ._count_rejections import CountRejections as CountRejections
 from ._manifold_projection import ManifoldProjection as ManifoldProjection
 from ._rk4 import RK4 as RK4
 from ._statistics import ProjectionStatistics as ProjectionStatistics

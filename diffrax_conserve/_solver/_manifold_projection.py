@@ -34,6 +34,7 @@ from .._projection import (
     tangential,
 )
 from .._tree import tree_dot, tree_sub, working_dtype
+from ._count_rejections import FAILED_PROJECTION
 from ._failure import failure
 from ._initial import refuse_violated_constraints
 from ._statistics import ProjectionStatistics
@@ -275,7 +276,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 target.args,
                 error,
             )
-        return jtu.tree_map(lambda e: jnp.where(success, e, jnp.inf), error)
+        return jtu.tree_map(lambda e: jnp.where(success, e, FAILED_PROJECTION), error)
 
 
 class _State(eqx.Module):
