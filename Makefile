@@ -91,10 +91,12 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 bench: $(PLOTS) ## measure the overhead of the projection
 	$(BIN)/python benchmarks/overhead.py
+	$(BIN)/python benchmarks/gradients.py
 	$(BIN)/python benchmarks/many_constraints.py --out benchmarks/results/many_constraints.json
 
 bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/overhead.py --smoke
+	$(BIN)/python benchmarks/gradients.py --smoke
 	$(BIN)/python benchmarks/many_constraints.py --smoke
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.
