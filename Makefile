@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow soak lint format types docs examples bench bench-smoke bench-learned build clean distclean
+.PHONY: help demo test slow soak mutants lint format types docs examples bench bench-smoke bench-learned build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -67,6 +67,9 @@ SEED ?= 0
 soak: $(TEST) ## try COUNT random combinations of everything, in search of a wrong one
 	$(BIN)/python tests/soak.py --count $(COUNT) --seed $(SEED)
 
+mutants: $(TEST) ## plant defects, and see that the tests notice each
+	$(BIN)/python tests/mutants.py
+
 lint: $(DEV) ## check style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -88,9 +91,13 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 bench: $(PLOTS) ## measure the overhead of the projection
 	$(BIN)/python benchmarks/overhead.py
+	$(BIN)/python benchmarks/gradients.py
+	$(BIN)/python benchmarks/many_constraints.py --out benchmarks/results/many_constraints.json
 
 bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/overhead.py --smoke
+	$(BIN)/python benchmarks/gradients.py --smoke
+	$(BIN)/python benchmarks/many_constraints.py --smoke
 
 bench-learned: $(PLOTS) ## measure what learned solvers cost
 	$(BIN)/python benchmarks/learned.py

@@ -22,6 +22,7 @@ from ._serialisation import pretrained_path as pretrained_path
 from ._serialisation import read_info as read_info
 from ._serialisation import save as save
 from ._solver import RK4 as RK4
+from ._solver import CountRejections as CountRejections
 from ._solver import DeepONetSolver as DeepONetSolver
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver

@@ -164,3 +164,8 @@ def test_a_closed_form_needs_a_function():
 def test_every_is_an_integer(bad):
     with pytest.raises(ValueError, match="`every`"):
         wrap(dfc.FirstIntegral(lambda t, y, args: y), every=bad)
+
+
+def test_rejections_are_counted_for_adaptive_controllers():
+    with pytest.raises(TypeError, match="adaptive"):
+        dfc.CountRejections(dfx.ConstantStepSize())  # pyright: ignore

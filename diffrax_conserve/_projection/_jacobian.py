@@ -10,7 +10,7 @@ the rows are never formed.
 import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -27,13 +27,18 @@ from ._elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
 Residual = Callable[[Y], Vector]
 
-# Up to this many constraints are unrolled: work and compile time grow as m², against a call into
-# LAPACK that costs some microseconds however small the matrix.
+# Up to this many constraints are unrolled: the ten integrals of gravitating bodies. Compile time
+# grows as m³, against a loop that costs some microseconds however small the matrix.
 UNROLLED_MAX = 10
 
 
 class AbstractJacobian(eqx.Module):
     """The rows `∂g_i/∂y` at one state, each shaped like the state."""
+
+    # How many iterations to make before asking whether they are needed. Enough for nearly every
+    # step of an integrator where they are cheap: so in a batch no lane waits for a loop that it
+    # does not need.
+    inline_steps: ClassVar[int] = 2
 
     @abc.abstractmethod
     def pullback(self, multiplier: Vector) -> Y:
@@ -192,6 +197,7 @@ class _MatrixFree(AbstractJacobian):
 
     forward: Callable[[Y], Vector]
     backward: Callable[[Vector], Y]
+    inline_steps: ClassVar[int] = 0
 
     def pullback(self, multiplier: Vector) -> Y:
         return self.backward(multiplier)

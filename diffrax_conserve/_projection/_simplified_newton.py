@@ -27,10 +27,6 @@ from ._base import (
 from ._elimination import GramSolver, Vector
 from ._jacobian import AbstractJacobian, Residual, linearise
 
-# Iterations that are written out before the loop: enough for nearly every step of an integrator,
-# so that in a batch no lane waits for a loop that it does not need.
-INLINE_STEPS = 2
-
 _Iterate = tuple[Y, Vector, Vector, Int[Array, ""]]
 
 
@@ -172,7 +168,7 @@ def _solve(
     iteration = _Iteration(residual, candidate, weights, magnitude, rtol, atol)
     before, jacobian, gram_solver = iteration.stepper()
     iterate = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
-    for _ in range(min(INLINE_STEPS, max_steps)):
+    for _ in range(min(jacobian.inline_steps, max_steps)):
         iterate = iteration.step(jacobian, gram_solver, iterate)
     done, success, scale = iteration.judge(jacobian, iterate, stalled=False)
     # Few steps need more, so the loop recomputes what it needs: if it shared the Jacobian, that

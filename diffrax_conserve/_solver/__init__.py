@@ -1,3 +1,4 @@
+from ._count_rejections import CountRejections as CountRejections
 from ._deeponet import DeepONetSolver as DeepONetSolver
 from ._manifold_projection import ManifoldProjection as ManifoldProjection
 from ._pinn import PINNSolver as PINNSolver

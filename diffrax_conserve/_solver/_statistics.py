@@ -1,5 +1,6 @@
 """What the projections of a solve did, carried in the solver state."""
 
+import dataclasses
 from typing import Any, final
 
 import diffrax as dfx
@@ -9,6 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
 from .._projection import ProjectionInfo
+from ._count_rejections import RejectionCount
 
 
 @final
@@ -23,6 +25,8 @@ class ProjectionStatistics(eqx.Module):
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.
     - `rank`: the smallest numerical rank of the constraints.
+    - `num_rejected`: how many steps were rejected because their projection failed, if they were
+        counted by a [`diffrax_conserve.CountRejections`][]; otherwise `None`.
     """
 
     num_projections: Int[Array, "..."]
@@ -32,6 +36,7 @@ class ProjectionStatistics(eqx.Module):
     residual_after: Float[Array, "..."]
     correction: Float[Array, "..."]
     rank: Int[Array, "..."]
+    num_rejected: Int[Array, "..."] | None = None
 
     @classmethod
     def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
@@ -58,7 +63,9 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
     by `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
 
     diffrax discards the solver state of a rejected step, so rejected steps count only in
-    `sol.stats["num_rejected_steps"]`.
+    `sol.stats["num_rejected_steps"]`. Those that a failed projection caused can be counted by a
+    [`diffrax_conserve.CountRejections`][] around the step-size controller, with
+    `SaveAt(controller_state=True)`.
 
     **Arguments:**
 
@@ -94,18 +101,18 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         print(dfc.statistics(sol).max_iterations)
         ```
     """
-    found = [
-        x
-        for x in jtu.tree_leaves(sol.solver_state, is_leaf=_is_statistics)
-        if isinstance(x, ProjectionStatistics)
-    ]
+    found = _instances(sol.solver_state, ProjectionStatistics)
     if not found:
         raise ValueError(
             "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
             "and with `saveat=SaveAt(..., solver_state=True)`."
         )
+    counts = _instances(sol.controller_state, RejectionCount)
+    if counts:
+        return dataclasses.replace(found[0], num_rejected=counts[0].count)
     return found[0]
 
 
-def _is_statistics(x: Any) -> bool:
-    return isinstance(x, ProjectionStatistics)
+def _instances(tree: Any, kind: type) -> list[Any]:
+    leaves = jtu.tree_leaves(tree, is_leaf=lambda x: isinstance(x, kind))
+    return [x for x in leaves if isinstance(x, kind)]

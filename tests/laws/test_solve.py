@@ -241,10 +241,12 @@ def test_random_quadratic_integrals_are_conserved(dimension, integrals, data):
 )
 def test_the_order_survives_the_projection(name):
     system = SYSTEMS[name]
+    # The paper's steps for the rigid body are so short that the errors would be roundoff.
+    dt = 8 * system.dt if name == "rigid-body" else system.dt
     dct.assert_order(
         dfc.ManifoldProjection(dfc.RK4(), system.manifold),
         dfx.ODETerm(system.vector_field),
         system.y0,
-        t1=2 * system.dt,
-        dt0=system.dt / 8,
+        t1=2 * dt,
+        dt0=dt / 8,
     )

@@ -179,3 +179,37 @@ def test_statistics_need_the_solver_state():
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     with pytest.raises(ValueError, match="ManifoldProjection"):
         dfc.statistics(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=saveat))
+
+
+@pytest.mark.parametrize("t1", [0.4, -0.4])
+def test_rejections_because_of_projection_are_counted(t1):
+    """Four iterations are too few for a long step with the first-order method."""
+
+    def adaptive(controller):
+        projection = dfc.SimplifiedNewton(max_steps=4)
+        return solve(
+            rigid_body,
+            dfc.ManifoldProjection(dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=projection),
+            OMEGA0,
+            t1=t1,
+            dt0=t1 / 2,
+            stepsize_controller=controller,
+            saveat=dfx.SaveAt(t1=True, solver_state=True, controller_state=True),
+        )
+
+    careless = dfx.PIDController(rtol=1e9, atol=1e9)  # accepts any error estimate
+    plain, counted = adaptive(careless), adaptive(dfc.CountRejections(careless))
+    np.testing.assert_array_equal(plain.ys, counted.ys)
+    assert dfc.statistics(plain).num_rejected is None
+    assert dfc.statistics(counted).num_rejected == counted.stats["num_rejected_steps"] > 0
+    # And not those because of the error.
+    careful = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    sol = adaptive(dfc.CountRejections(careful))
+    assert dfc.statistics(sol).num_rejected < sol.stats["num_rejected_steps"]
+
+
+def test_implicit_solvers_take_the_tolerances_through_the_counting_controller():
+    controller = dfc.CountRejections(dfx.PIDController(rtol=1e-6, atol=1e-6))
+    solver = dfc.ManifoldProjection(dfx.Kvaerno3(), RIGID_BODY)
+    sol = solve(rigid_body, solver, OMEGA0, stepsize_controller=controller)
+    assert sol.result == dfx.RESULTS.successful
