@@ -1,6 +1,7 @@
 """Double precision, run-time shape checks, and hypothesis profiles for the whole suite."""
 
 import os
+from pathlib import Path
 
 import jax
 from hypothesis import HealthCheck, settings
@@ -16,3 +17,14 @@ settings.register_profile(
 )
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+
+# Each compiled function holds some memory maps, of which Linux allows a process 65,530. A worker
+# that runs half of this suite would need more, and be killed.
+_MAPS = Path("/proc/self/maps")
+_MAPS_MAX = 30_000
+
+
+def pytest_runtest_teardown():
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MAPS_MAX:
+        jax.clear_caches()
