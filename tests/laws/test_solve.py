@@ -200,7 +200,7 @@ def saved(system, y0, step, fractions, solver):
 
 @pytest.mark.parametrize(
     "name",
-    [n if i % 6 == 0 else pytest.param(n, marks=pytest.mark.slow) for i, n in enumerate(SYSTEMS)],
+    [n if i % 7 == 0 else pytest.param(n, marks=pytest.mark.slow) for i, n in enumerate(SYSTEMS)],
 )
 @settings(max_examples=6)
 @given(data=st.data())
