@@ -49,8 +49,8 @@ def main():
         "projected": dfc.ManifoldProjection(dfx.Tsit5(), SYSTEM.manifold),
     }
     print("gradient, s of CPU: plain, projected, ratio; compile time, s: plain, projected")
-    for adaptive in (False, True):
-        for batch in (1, 100):
+    for adaptive in (True,) if smoke else (False, True):
+        for batch in (8,) if smoke else (1, 100):
             y0 = jax.tree.map(lambda y, n=batch: jnp.tile(y, (n,) + (1,) * y.ndim), SYSTEM.y0)
             compiled, compile_seconds, best = {}, {}, {}
             for name, solver in solvers.items():
