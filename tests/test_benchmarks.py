@@ -64,6 +64,12 @@ def test_another_answer_from_c_is_refused(overhead):
 
 
 @pytest.mark.slow
+def test_c_leaves_the_arithmetic_of_the_process_alone(overhead):
+    problem = overhead.PROBLEMS["rigid-body"]
+    overhead.hand_written_c(problem, overhead.initial_states(problem, 1))
+    assert np.finfo(np.float64).tiny / np.array(2.0) > 0  # subnormal
+
+
 def test_a_smoke_run_of_the_cost_of_learning(capsys):
     found = benchmark("learned").main(["--smoke"])
     assert found["epochs"]["rigid-body"]["ratio"] > 0
