@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
+from ._tree import tree_shapes
 
 # Above this many scalar constraints their gradients are never formed: what is needed of them is
 # computed from products with them.
@@ -236,10 +237,10 @@ def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, ar
         ) from error
     for (name, entry), value in zip(entries, flat, strict=True):
         output = eqx.filter_eval_shape(entry.fn, t, y, args)
-        if isinstance(entry, FirstIntegral) and _shapes(output) != _shapes(value):
+        if isinstance(entry, FirstIntegral) and tree_shapes(output) != tree_shapes(value):
             raise ValueError(
-                f"The conserved value of `{name}` has the structure {_shapes(value)}, but its "
-                f"`fn(t, y, args)` returns {_shapes(output)}. Both must be the same."
+                f"The conserved value of `{name}` has the structure {tree_shapes(value)}, but its "
+                f"`fn(t, y, args)` returns {tree_shapes(output)}. Both must be the same."
             )
 
 
@@ -257,7 +258,3 @@ def _check_output(name: str, leaf: Any) -> None:
         f"{got}. Convert it, for example by `jnp.asarray(..., dtype=float)`, or split a complex "
         "value into its real and its imaginary part."
     )
-
-
-def _shapes(tree: Any) -> Any:
-    return jtu.tree_map(jnp.shape, tree)

@@ -1,8 +1,11 @@
 """PyTree arithmetic: states as vectors, with real dtypes kept leaf by leaf."""
 
 import functools as ft
+from typing import Any
 
+import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
@@ -55,3 +58,13 @@ def working_dtype(y: Y) -> jnp.dtype:
 def tree_size(a: PyTree[Array]) -> int:
     """The number of scalars in `a`."""
     return sum(jnp.size(x) for x in jtu.tree_leaves(a))
+
+
+def tree_shapes(a: Any) -> Any:
+    """`a` with each leaf replaced by its shape."""
+    return jtu.tree_map(jnp.shape, a)
+
+
+def tree_stop_gradient(a: Any) -> Any:
+    """`a`, whose arrays count as constants for every derivative."""
+    return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, a)

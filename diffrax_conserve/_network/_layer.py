@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import check_manifold, conserved_values, evaluate
 from .._projection._jacobian import UNROLLED_MAX, Residual, Vector, linearise
-from .._tree import tree_add, tree_dot, tree_scale, tree_sub, working_dtype
+from .._tree import tree_add, tree_dot, tree_scale, tree_stop_gradient, tree_sub, working_dtype
 from ._mlp import check_sizes
 
 
@@ -170,8 +170,8 @@ def _conserve_jvp(primals, tangents, *, steps):
         return state, residual(state)
 
     _, (t_y, t_g) = eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
-    _, at_candidate = linearise(*_stop_gradient((residual, candidate)))
-    _, at_y = linearise(*_stop_gradient((residual, y)))
+    _, at_candidate = linearise(*tree_stop_gradient((residual, candidate)))
+    _, at_y = linearise(*tree_stop_gradient((residual, y)))
     weights = jtu.tree_map(jnp.ones_like, candidate)
     _, vjp = eqx.filter_vjp(residual, candidate)
 
@@ -189,10 +189,6 @@ def _conserve_jvp(primals, tangents, *, steps):
     t_multipliers = jtu.tree_map(lambda x: -share * x, t_multipliers)
     (direction,) = vjp(t_multipliers)
     return (y, multipliers), (tree_add(t_y, direction), t_multipliers)
-
-
-def _stop_gradient(tree: Any) -> Any:
-    return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def _relative_square(g: Vector, scale: Vector) -> Array:

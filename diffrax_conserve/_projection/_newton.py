@@ -1,6 +1,6 @@
 """Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
 
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax.lax as lax
@@ -11,7 +11,15 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PyTree, Real
 
 from .._custom_types import Y
-from .._tree import tree_add, tree_mul, tree_scale, tree_size, tree_sub, working_dtype
+from .._tree import (
+    tree_add,
+    tree_mul,
+    tree_scale,
+    tree_size,
+    tree_stop_gradient,
+    tree_sub,
+    working_dtype,
+)
 from ._base import (
     AbstractProjection,
     Failure,
@@ -84,7 +92,7 @@ class Newton(AbstractProjection):
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         residual, magnitude, weights = problem.residual, problem.magnitude, problem.weights
         # The iterations are not differentiated: the optimality system is.
-        fixed = _stop_gradient((residual, magnitude, candidate, weights))
+        fixed = tree_stop_gradient((residual, magnitude, candidate, weights))
         start, count = _reach(*fixed, projection=self)
         y, nearest = _nearest(residual, candidate, weights, start, self.max_steps)
 
@@ -100,7 +108,7 @@ class Newton(AbstractProjection):
         before = residual(candidate)
         failure = Failure.of(before, scales(candidate)[0], after, scale).unless(success)
         info = report(success, count, candidate, y, before, after, scale, rank, failure)
-        return y, _stop_gradient(info)
+        return y, tree_stop_gradient(info)
 
 
 Newton.__init__.__doc__ = r"""**Arguments:**
@@ -170,10 +178,6 @@ def _reach(
     return y, count
 
 
-def _stop_gradient(tree: PyTree[Any]) -> Any:
-    return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
-
-
 def _state_norm(unknowns: tuple[Y, Vector]) -> Array:
     # Where gradients are nearly parallel the state is well determined, the multipliers are not.
     y, _ = unknowns
@@ -190,7 +194,7 @@ def _nearest(
 ) -> tuple[Y, optx.Solution]:
     """Newton's method on `y = ŷ + M⁻¹ G(y)ᵀ λ`, `g(y) = 0`, from a point of the manifold and the
     multipliers that suit the candidate best there."""
-    fixed = _stop_gradient((residual, candidate, weights))
+    fixed = tree_stop_gradient((residual, candidate, weights))
     _, jacobian = linearise(fixed[0], start)
     offset = jacobian.pushforward(tree_sub(start, fixed[1]))
     multiplier = jacobian.gram_solver(fixed[2]).solve(offset)

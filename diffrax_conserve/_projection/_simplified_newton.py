@@ -142,14 +142,18 @@ class _Iteration(eqx.Module):
         y = _displaced(jacobian, change, y, self.weights)
         return y, jtu.tree_map(jnp.add, multiplier, change), self.residual(y), count + 1
 
+    def scales(self, jacobian: AbstractJacobian, y: Y) -> tuple[Vector, Vector]:
+        """The scales of the constraints at `y`, and their tolerances."""
+        return tolerances(
+            jacobian, y, self.candidate, self.weights, self.magnitude, self.rtol, self.atol
+        )
+
     def judge(
         self, jacobian: AbstractJacobian, iterate: _Iterate, stalled: BoolScalarLike
     ) -> tuple[Bool[Array, ""], Bool[Array, ""], Vector]:
         """Whether it is done, whether it has succeeded, and the scales of the constraints."""
         y, _, g, _ = iterate
-        scale, tolerance = tolerances(
-            jacobian, y, self.candidate, self.weights, self.magnitude, self.rtol, self.atol
-        )
+        scale, tolerance = self.scales(jacobian, y)
         success = within(g, tolerance)
         return success & (within(g, tree_scale(0.25, tolerance)) | stalled), success, scale
 
@@ -201,7 +205,7 @@ def _loop(
     def body(carry: tuple[Array, _Iterate, Array, Vector]) -> tuple[Array, _Iterate, Array, Vector]:
         _, old, _, _ = carry
         new = iteration.step(jacobian, gram_solver, old)
-        _, _, scale = iteration.judge(jacobian, new, stalled=False)
+        scale, _ = iteration.scales(jacobian, new[0])
         stalled = largest_relative(new[2], scale) > 0.5 * largest_relative(old[2], scale)
         done, success, scale = iteration.judge(jacobian, new, stalled)
         return ~done & hopeful(new), new, success, scale
@@ -209,8 +213,7 @@ def _loop(
     iterate, success, scale, _ = state
     start = (unfinished & hopeful(iterate), iterate, success, scale)
     _, iterate, success, scale = lax.while_loop(lambda carry: carry[0], body, start)
-    at_candidate = (iteration.candidate, iterate[1], before, iterate[3])
-    _, _, scale_before = iteration.judge(jacobian, at_candidate, stalled=False)
+    scale_before, _ = iteration.scales(jacobian, iteration.candidate)
     failure = Failure.of(before, scale_before, iterate[2], scale).unless(success)
     return iterate, success, scale, failure
 

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .._custom_types import Y
+from .._tree import tree_shapes
 from ._terms import is_backsolve
 
 
@@ -33,12 +34,9 @@ def check_output(function: Callable[..., Any], arguments: tuple, y0: Y, name: st
     """Raises unless `function(*arguments)` is shaped like the state."""
     arguments = jtu.tree_map(jnp.asarray, arguments)
     output = eqx.filter_eval_shape(function, *arguments)
-    if _shapes(output) != _shapes(y0):
+    got, expected = tree_shapes(output), tree_shapes(y0)
+    if got != expected:
         raise ValueError(
-            f"`{name}` returns the structure {_shapes(output)}, but the state has {_shapes(y0)}. "
+            f"`{name}` returns the structure {got}, but the state has {expected}. "
             "Both must be the same."
         )
-
-
-def _shapes(tree: Any) -> Any:
-    return jtu.tree_map(jnp.shape, tree)
