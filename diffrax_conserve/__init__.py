@@ -6,8 +6,10 @@ from ._diagnostics import drift as drift
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._network import PINN as PINN
+from ._network import Box as Box
 from ._network import ConservativeLayer as ConservativeLayer
 from ._network import DeepONet as DeepONet
+from ._network import Taylor as Taylor
 from ._projection import AbstractProjection as AbstractProjection
 from ._projection import ClosedForm as ClosedForm
 from ._projection import Failure as Failure
@@ -28,17 +30,22 @@ from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
 from ._solver import ProjectionStatistics as ProjectionStatistics
 from ._solver import statistics as statistics
+from ._training import SPRING as SPRING
 from ._training import FitLog as FitLog
+from ._training import LevenbergMarquardt as LevenbergMarquardt
 from ._training import Recipe as Recipe
 from ._training import bounded as bounded
 from ._training import constant_weight as constant_weight
 from ._training import every_iteration as every_iteration
 from ._training import fit as fit
+from ._training import from_states as from_states
 from ._training import grid_times as grid_times
 from ._training import linear_weight as linear_weight
 from ._training import mean_square as mean_square
 from ._training import paper as paper
 from ._training import ramped_weight as ramped_weight
+from ._training import reachable_states as reachable_states
+from ._training import second_order as second_order
 from ._training import staged_iterations as staged_iterations
 from ._training import uniform_times as uniform_times
 

@@ -8,8 +8,10 @@ diffrax-conserve network <version of the format> <SHA-256 of all that follows>
 import hashlib
 import json
 import math
+import operator
 import os
 import zlib
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,11 +26,21 @@ import numpy as np
 from . import systems
 from ._files import replace_file
 from ._manifold import is_entry
-from ._network import PINN, ConservativeLayer, DeepONet, activation_name
+from ._network import (
+    PINN,
+    Concatenated,
+    ConservativeLayer,
+    DeepONet,
+    Gated,
+    Product,
+    Taylor,
+    activation_name,
+    output_layer,
+)
 from .systems import AbstractSystem
 
 _MAGIC = b"diffrax-conserve network"
-_VERSION = 1
+_VERSION = 2
 _SUFFIX = ".network"
 
 _PathLike = str | os.PathLike[str]
@@ -43,9 +55,9 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
 
     - `path`: where to write.
     - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. Of a conservative
-        layer whose manifold is that of a system of the catalogue, the system is written; other
-        manifolds are functions, which no file can hold: give the layer again to
-        [`diffrax_conserve.load`][].
+        layer whose manifold is that of a system of the catalogue, the system is written, and
+        likewise of a Taylor polynomial; other manifolds and vector fields are functions, which no
+        file can hold: give the layer or the polynomial again to [`diffrax_conserve.load`][].
     - `info`: what else to note, such as the system, the sampling domain, the recipe and the
         measured errors: anything that JSON can express. [`diffrax_conserve.read_info`][] reads it.
 
@@ -82,7 +94,9 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
     replace_file(Path(path), lambda temporary: temporary.write_bytes(first + rest))
 
 
-def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | DeepONet:
+def load(
+    path: _PathLike, *, layer: ConservativeLayer | None = None, taylor: Taylor | None = None
+) -> PINN | DeepONet:
     """Reads a network that [`diffrax_conserve.save`][] wrote.
 
     **Arguments:**
@@ -90,6 +104,7 @@ def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | D
     - `path`: the file.
     - `layer`: the conservative layer, where the file cannot hold it: see
         [`diffrax_conserve.save`][].
+    - `taylor`: likewise the Taylor polynomial.
 
     **Returns:**
 
@@ -97,33 +112,51 @@ def load(path: _PathLike, *, layer: ConservativeLayer | None = None) -> PINN | D
 
     **Raises:**
 
-    `ValueError` if the file is not one of ours, is truncated or damaged, was written by a newer
-    version, or needs a `layer`; `OSError` if it cannot be read.
+    `ValueError` if the file is not one of ours, is truncated or damaged, was written by another
+    version, or needs a `layer` or `taylor`; `OSError` if it cannot be read.
     """
     header, raw = _read(Path(path))
     arrays = _split(header["arrays"], raw)
-    model = _skeleton(header)
-    own, static = eqx.partition(model, eqx.is_array)
+    own, static = eqx.partition(_skeleton(header), eqx.is_array)
     leaves, treedef = jtu.tree_flatten(own)
-    count = len(leaves)
-    model = eqx.combine(jtu.tree_unflatten(treedef, arrays[:count]), static)
-    found = header["layer"]
+    model = eqx.combine(jtu.tree_unflatten(treedef, arrays[: len(leaves)]), static)
+    rest = iter(arrays[len(leaves) :])
+    for part, given in {"layer": layer, "taylor": taylor}.items():
+        built = _part(path, part, header[part], given, rest)
+        if built is not None:
+            where = operator.attrgetter(part)
+            model = eqx.tree_at(where, model, built, is_leaf=lambda x: x is None)
+    return model
+
+
+def _part(path: _PathLike, name: str, found: Any, given: Any, arrays: Iterator[jax.Array]) -> Any:
+    """The layer or the Taylor polynomial: the one that was given, or that of a system."""
+    what, example = _PARTS[name]
     if found is None:
-        if layer is not None:
-            raise ValueError(f"The network in {path} has no conservative layer: leave `layer` out.")
-        return model
-    if layer is None:
-        if found["system"] is None:
+        if given is not None:
+            raise ValueError(f"The network in {path} has no {what}: leave `{name}` out.")
+        return None
+    if found["system"] is None:
+        if given is None:
             raise ValueError(
-                f"The network in {path} has a conservative layer, whose functions no file can "
-                f"hold. Give it again: `load(path, layer=ConservativeLayer(manifold, "
-                f"steps={found['steps']}))`."
+                f"The network in {path} has a {what}, whose functions no file can hold. Give it "
+                f"again: `load(path, {name}={example.format(**found)})`."
             )
-        system = systems.get(found["system"])
-        treedef = jtu.tree_structure(system)
-        system = jtu.tree_unflatten(treedef, arrays[count:])
-        layer = ConservativeLayer(system.manifold, steps=found["steps"])
-    return eqx.tree_at(lambda m: m.layer, model, layer, is_leaf=lambda x: x is None)
+        return given
+    leaves, treedef = jtu.tree_flatten(systems.get(found["system"]))
+    system = jtu.tree_unflatten(treedef, [next(arrays) for _ in leaves])
+    if given is not None:
+        return given
+    if name == "layer":
+        return ConservativeLayer(system.manifold, steps=found["steps"])
+    return Taylor(system.vector_field, found["order"])
+
+
+# What the parts that hold functions are called, and how to build them again.
+_PARTS = {
+    "layer": ("conservative layer", "ConservativeLayer(manifold, steps={steps})"),
+    "taylor": ("Taylor polynomial", "Taylor(vector_field, {order})"),
+}
 
 
 def read_info(path: _PathLike) -> dict[str, Any]:
@@ -208,20 +241,21 @@ def load_pretrained(name: str) -> PINN | DeepONet:
 
 def _describe(model: PINN | DeepONet) -> dict[str, Any]:
     if isinstance(model, PINN):
-        net = model.net
+        net = model.window(0).net
         config = {
             "t0": model.t0,
             "t1": model.t1,
             "state": _describe_state(model.y0),
+            "windows": model.windows,
             "width": net.weights[0].shape[1],
+            "depth": len(net.weights) - 1,
         }
     elif isinstance(model, DeepONet):
-        net = model.branch
+        net = output_layer(model.core)
         config = {
             "max_step": model.max_step,
-            "unknowns": model.scale.size,
-            "width": net.weights[0].shape[1],
-            "latent": net.weights[-1].shape[1] // model.scale.size,
+            "state": _describe_state(model.domain.lower),
+            **_describe_core(model),
         }
     else:
         raise TypeError(
@@ -234,9 +268,34 @@ def _describe(model: PINN | DeepONet) -> dict[str, Any]:
             "The activation function of this network has no name that a file could hold. Build the "
             'network with a named one, for example `activation="tanh"`.'
         )
-    depth = len(net.weights) - 1
-    config |= {"depth": depth, "activation": activation, "normalise": model.normalise}
-    return {"kind": type(model).__name__, "config": config, "layer": _describe_layer(model.layer)}
+    config |= {"activation": activation, "normalise": model.normalise}
+    return {
+        "kind": type(model).__name__,
+        "config": config,
+        "layer": _describe_layer(model.layer),
+        "taylor": _describe_taylor(getattr(model, "taylor", None)),
+    }
+
+
+def _describe_core(model: DeepONet) -> dict[str, Any]:
+    match model.core:
+        case Product(branch=net):
+            latent = net.weights[-1].shape[1] // model.scale.size
+            sizes = {"inputs": "product", "depth": len(net.weights) - 1, "latent": latent}
+        case Concatenated(net=net):
+            sizes = {"inputs": "concatenated", "depth": len(net.weights) - 1}
+        case Gated(hidden=hidden):
+            net = hidden[0]
+            sizes = {"inputs": "gated", "depth": len(hidden)}
+    return {"width": net.weights[0].shape[1], **sizes}
+
+
+def _describe_taylor(taylor: Taylor | None) -> dict[str, Any] | None:
+    if taylor is None:
+        return None
+    system = _owner(taylor.vector_field)
+    known = system is not None and taylor.args is None
+    return {"order": taylor.order, "system": system.name if known else None}
 
 
 def _describe_layer(layer: ConservativeLayer | None) -> dict[str, Any] | None:
@@ -249,13 +308,20 @@ def _describe_layer(layer: ConservativeLayer | None) -> dict[str, Any] | None:
 def _system_of(layer: ConservativeLayer) -> AbstractSystem | None:
     """The system of the catalogue whose manifold the layer has."""
     entries = jtu.tree_leaves(layer.manifold, is_leaf=is_entry)
-    owner = getattr(entries[0].fn, "__self__", None)
-    if not isinstance(owner, AbstractSystem) or layer.args is not None:
+    owner = _owner(entries[0].fn)
+    if owner is None or layer.args is not None:
         return None
-    same = eqx.tree_equal(layer.manifold, owner.manifold)
+    return owner if bool(eqx.tree_equal(layer.manifold, owner.manifold)) else None
+
+
+def _owner(function: Any) -> AbstractSystem | None:
+    """The system of the catalogue that `function` is a method of."""
+    owner = getattr(function, "__self__", None)
+    if not isinstance(owner, AbstractSystem):
+        return None
     # Only what `systems.get` builds again.
     known = owner.name in systems.names() and type(systems.get(owner.name)) is type(owner)
-    return owner if known and bool(same) else None
+    return owner if known else None
 
 
 def _describe_state(y: Any) -> Any:
@@ -298,7 +364,7 @@ def _skeleton(header: dict[str, Any]) -> PINN | DeepONet:
         y0, t0, t1 = _build_state(config.pop("state")), config.pop("t0"), config.pop("t1")
         return PINN(y0, t0, t1, key=key, **config)
     if header["kind"] == "DeepONet":
-        states = jnp.zeros((1, config.pop("unknowns")))
+        states = jtu.tree_map(lambda x: x[None], _build_state(config.pop("state")))
         return DeepONet(states, config.pop("max_step"), key=key, **config)
     raise ValueError(f"The file holds a network of the unknown kind {header['kind']!r}.")
 
@@ -320,10 +386,23 @@ def _version(name: str) -> str:
 
 
 def _arrays(model: PINN | DeepONet) -> list[Any]:
-    """Those of the network itself, then the parameters of the system of its layer."""
-    plain = eqx.tree_at(lambda m: m.layer, model, None, is_leaf=lambda x: x is None)
-    system = None if model.layer is None else _system_of(model.layer)
-    return [*jtu.tree_leaves(eqx.filter(plain, eqx.is_array)), *jtu.tree_leaves(system)]
+    """Those of the network itself, then the parameters of the system of its layer and of that of
+    its Taylor polynomial."""
+    layer, taylor = model.layer, getattr(model, "taylor", None)
+    own = jtu.tree_leaves(eqx.filter(_without(model), eqx.is_array))
+    of_layer = None if layer is None else _system_of(layer)
+    of_taylor = None if taylor is None or taylor.args is not None else _owner(taylor.vector_field)
+    return [*own, *jtu.tree_leaves(of_layer), *jtu.tree_leaves(of_taylor)]
+
+
+def _without(model: PINN | DeepONet) -> Any:
+    """The network without those parts that hold functions."""
+    parts = ["layer", "taylor"] if isinstance(model, DeepONet) else ["layer"]
+
+    def where(model: Any) -> list[Any]:
+        return [getattr(model, part) for part in parts]
+
+    return eqx.tree_at(where, model, [None] * len(parts), is_leaf=lambda x: x is None)
 
 
 class _Entry(NamedTuple):
@@ -363,6 +442,11 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes]:
         raise ValueError(
             f"The file {path} was written by a newer version of diffrax-conserve: its format is "
             f"{version}, and this version reads up to {_VERSION}. Upgrade diffrax-conserve."
+        )
+    if version < _VERSION:
+        raise ValueError(
+            f"The file {path} was written by a version of diffrax-conserve before the first "
+            "release, which this version does not read. Train the network again."
         )
     if hashlib.sha256(rest).hexdigest() != digest:
         raise ValueError(

@@ -1,19 +1,24 @@
 """A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
 
-from typing import final
+from typing import Literal, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import RealScalarLike, Y
 from .._tree import working_dtype
+from ._cores import Concatenated, Core, Gated, Product
+from ._domain import Box
 from ._flat import as_state, flatten, unflatten
 from ._layer import ConservativeLayer
-from ._mlp import MLP, Activation, check_sizes
+from ._mlp import Activation, check_sizes
+from ._taylor import Taylor
+
+Inputs = Literal["product", "concatenated", "gated"]
+_CORES = {"concatenated": Concatenated, "gated": Gated}
 
 
 @final
@@ -26,6 +31,11 @@ class DeepONet(eqx.Module):
     with a branch network $b$ and a trunk network $\tau$, both fully connected, and steps $h$ up to
     $\Delta$ = `max_step`; $u(0) = u_0$ whatever the weights. Longer times are made of several
     steps. With a `layer`, the output is moved to the manifold of the values at $u_0$.
+
+    Other networks than this product take the state and the step together: `inputs="concatenated"`
+    is a fully connected one, `inputs="gated"` has the input in each of its layers. They are more
+    accurate at the same size. With `taylor` it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see
+    [`diffrax_conserve.Taylor`][].
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -48,13 +58,14 @@ class DeepONet(eqx.Module):
         (2021); S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023) for the flow map.
     """
 
-    branch: MLP
-    trunk: MLP
+    core: Core
     layer: ConservativeLayer | None
     max_step: float = eqx.field(static=True)
     shift: Float[Array, " n"]
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
+    taylor: Taylor | None
+    domain: Box
 
     def __init__(
         self,
@@ -65,8 +76,10 @@ class DeepONet(eqx.Module):
         width: int = 40,
         depth: int = 4,
         latent: int = 20,
+        inputs: Inputs = "product",
         activation: str | Activation = "tanh",
         normalise: bool = True,
+        taylor: Taylor | None = None,
         layer: ConservativeLayer | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
@@ -74,10 +87,17 @@ class DeepONet(eqx.Module):
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
         vectors = _vectors(states)
         dtype, n = vectors.dtype, vectors.shape[1]
-        branch_key, trunk_key = jr.split(key)
-        self.branch = MLP(n, n * latent, width, depth, activation, dtype, key=branch_key)
-        self.trunk = MLP(1, n * latent, width, depth, activation, dtype, key=trunk_key)
+        if inputs == "product":
+            self.core = Product(n, width, depth, latent, activation, dtype, key=key)
+        elif inputs in _CORES:
+            self.core = _CORES[inputs](n, width, depth, activation, dtype, key=key)
+        else:
+            raise ValueError(
+                f'`inputs` is {inputs!r}, but must be "product", "concatenated" or "gated".'
+            )
         self.layer = layer
+        self.taylor = taylor
+        self.domain = Box.around(states)
         self.max_step = float(max_step)
         self.normalise = normalise
         if normalise:
@@ -106,10 +126,15 @@ class DeepONet(eqx.Module):
         h = jnp.asarray(h).astype(self.scale.dtype)
         fraction = h / self.max_step
         inputs = (start - self.shift) / self.scale
-        b = self.branch(inputs).reshape(self.scale.size, -1)
-        tau = self.trunk((2 * fraction - 1 if self.normalise else h)[None])
-        products = jnp.sum(b * tau.reshape(b.shape), axis=1) / b.shape[1] ** 0.5
-        return unflatten(start + fraction * self.scale * products, y0)
+        learned = self.scale * self.core(inputs, 2 * fraction - 1 if self.normalise else h)
+        if self.taylor is not None:
+            start = flatten(self.taylor(y0, h)).astype(self.scale.dtype)
+        return unflatten(start + fraction ** (self.order + 1) * learned, y0)
+
+    @property
+    def order(self) -> int:
+        """The order that it has whatever its weights: that of its Taylor polynomial."""
+        return 0 if self.taylor is None else self.taylor.order
 
     def radius(self) -> Float[Array, ""]:
         """How far the conservative layer may move a state in one iteration."""
@@ -120,15 +145,17 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 - `states`: initial states as they will occur, stacked along a leading axis: any PyTree of real
     arrays. Their structure is that of the states to come, their mean and their standard deviation
-    normalise the inputs.
+    normalise the inputs, and the box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: units in each hidden layer, and hidden layers, of both networks.
 - `latent`: the number $L$ of products in each component.
+- `inputs`: `"product"`, `"concatenated"` or `"gated"`. The last two have no `latent`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
     `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
+- `taylor`: a [`diffrax_conserve.Taylor`][].
 - `layer`: a [`diffrax_conserve.ConservativeLayer`][].
 
 **Raises:**

@@ -59,6 +59,7 @@ class MLP(eqx.Module):
         dtype: jnp.dtype,
         *,
         key: PRNGKeyArray,
+        slope: float | None = None,
     ):
         sizes = [in_size, *([width] * depth), out_size]
         keys = jr.split(key, len(sizes) - 1)
@@ -67,6 +68,10 @@ class MLP(eqx.Module):
         shapes = itertools.pairwise(sizes)
         self.weights = tuple(initialise(k, s, dtype) for k, s in zip(keys, shapes, strict=True))
         self.biases = tuple(jnp.zeros(size, dtype) for size in sizes[1:])
+        if slope is not None:
+            weight, bias = _spread(slope, in_size, width, dtype, keys[0])
+            self.weights = (weight, *self.weights[1:])
+            self.biases = (bias, *self.biases[1:])
         self.activation = find_activation(activation)
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
@@ -75,6 +80,16 @@ class MLP(eqx.Module):
             x = self.activation(x @ weight + bias)
         weight, bias = last
         return x @ weight + bias
+
+
+def _spread(
+    slope: float, in_size: int, width: int, dtype: jnp.dtype, key: PRNGKeyArray
+) -> tuple[Float[Array, "in width"], Float[Array, " width"]]:
+    """A first layer whose units are centred everywhere in [-1, 1], with random slopes."""
+    slope_key, centre_key = jr.split(key)
+    weight = slope * jr.normal(slope_key, (in_size, width), dtype)
+    centres = jr.uniform(centre_key, (in_size, width), dtype, minval=-1, maxval=1)
+    return weight, -jnp.sum(weight * centres, axis=0)
 
 
 def check_sizes(**sizes: int) -> None:

@@ -2,8 +2,11 @@ from ._fit import FitLog as FitLog
 from ._fit import fit as fit
 from ._loss import bounded as bounded
 from ._loss import mean_square as mean_square
+from ._reachable import from_states as from_states
+from ._reachable import reachable_states as reachable_states
 from ._recipe import Recipe as Recipe
 from ._recipe import paper as paper
+from ._recipe import second_order as second_order
 from ._sampling import grid_times as grid_times
 from ._sampling import uniform_times as uniform_times
 from ._schedule import constant_weight as constant_weight
@@ -11,3 +14,5 @@ from ._schedule import every_iteration as every_iteration
 from ._schedule import linear_weight as linear_weight
 from ._schedule import ramped_weight as ramped_weight
 from ._schedule import staged_iterations as staged_iterations
+from ._second_order import SPRING as SPRING
+from ._second_order import LevenbergMarquardt as LevenbergMarquardt

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._network import PINN, ConservativeLayer, DeepONet
+from .._network import ConservativeLayer, DeepONet, Window, output_layer
 from .._tree import tree_sub
 from ._sampling import Times
 
@@ -29,8 +29,8 @@ class Points(NamedTuple):
 def draw(model: Any, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
     """`count` random points for `model`."""
     times_key, states_key = jr.split(key)
-    if isinstance(model, PINN):
-        return Points(times(times_key, count, model.t0, model.t1), None)
+    if isinstance(model, Window):
+        return Points(model.start + times(times_key, count, 0.0, model.length), None)
     assert sample is not None
     y0s = jax.vmap(sample)(jr.split(states_key, count))
     return Points(times(times_key, count, 0.0, float(model.max_step)), y0s)
@@ -48,17 +48,17 @@ def path(model: Any, points: Points, p: Int[Array, ""], s: Array) -> Callable[[A
     # A flow map of the user's own has no separate last layer.
     candidate = model if layer is None else model.candidate
 
-    def values(y0: Y, t0: float) -> Any:
+    def values(y0: Y, t0: RealScalarLike) -> Any:
         return None if layer is None else layer.values(t0, y0)
 
-    if isinstance(model, PINN):
-        start = values(model.y0, model.t0)
+    if isinstance(model, Window):
+        start = values(model.y0, model.start)
         targets = jtu.tree_map(lambda v: jnp.broadcast_to(v, points.ts.shape + v.shape), start)
     else:
         targets = jax.vmap(values, in_axes=(0, None))(points.y0s, 0.0)
 
     def states(ts: Array) -> Y:
-        if isinstance(model, PINN):
+        if isinstance(model, Window):
             out = jax.vmap(candidate)(ts)
         else:
             out = jax.vmap(candidate)(points.y0s, ts)
@@ -71,15 +71,15 @@ def path(model: Any, points: Points, p: Int[Array, ""], s: Array) -> Callable[[A
     return states
 
 
-def squared_defects(
+def defects(
     model: Any,
     vector_field: VectorField,
     args: Args,
     points: Points,
     p: Int[Array, ""],
     s: Array,
-) -> Float[Array, " points"]:
-    """`|du/dt - f(t, u)|²` at every point.
+) -> Float[Array, "points n"]:
+    """`du/dt - f(t, u)` at every point, as vectors.
 
     The time derivative is one forward-mode pass over the whole batch: half the time of a `vmap` of
     forward passes, and a sixth of that of reverse mode.
@@ -87,16 +87,17 @@ def squared_defects(
     states = path(model, points, p, s)
     y, derivative = jax.jvp(states, (points.ts,), (jnp.ones_like(points.ts),))
     defect = tree_sub(derivative, _field(vector_field, args, points.ts, y))
-    return _squared_norms(defect)
+    leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(defect)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)
 
 
 def typical_square(
     model: Any, vector_field: VectorField, args: Args, points: Points
 ) -> Float[Array, ""]:
     """The median of `|f|²` over the initial states."""
-    if isinstance(model, PINN):
+    if isinstance(model, Window):
         y0s = jtu.tree_map(lambda x: x[None], model.y0)
-        return _squared_norms(_field(vector_field, args, jnp.array([model.t0]), y0s))[0]
+        return _squared_norms(_field(vector_field, args, model.start[None], y0s))[0]
     ts = jnp.zeros_like(points.ts)
     return jnp.median(_squared_norms(_field(vector_field, args, ts, points.y0s)))
 
@@ -123,8 +124,20 @@ def trainable(model: Any) -> Any:
 
 
 def _weights(model: Any) -> Callable[[Any], Any] | None:
-    if isinstance(model, PINN):
+    if isinstance(model, Window):
         return lambda m: m.net
     if isinstance(model, DeepONet):
-        return lambda m: (m.branch, m.trunk)
+        return lambda m: m.core
     return None
+
+
+def linear_weights(model: Any) -> Any:
+    """`model` with `True` in the place of every weight that its output is linear in."""
+
+    def last_layer(model: Any) -> tuple[Array, Array]:
+        net = model.net if isinstance(model, Window) else output_layer(model.core)
+        return net.weights[-1], net.biases[-1]
+
+    nothing = jtu.tree_map(lambda _: False, model)
+    known = isinstance(model, Window | DeepONet)
+    return eqx.tree_at(last_layer, nothing, (True, True)) if known else nothing

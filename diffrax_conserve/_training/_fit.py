@@ -6,28 +6,37 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, final
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 import optax
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from .._custom_types import Args
-from .._network import PINN
+from .._custom_types import Args, Manifold
+from .._manifold import check_manifold, conserved_values
+from .._network import PINN, Window
+from .._projection import project
 from .._tree import tree_all_finite
 from ._defect import (
     Points,
     Sampler,
     VectorField,
     draw,
+    defects,
     layer_of,
-    squared_defects,
+    linear_weights,
     trainable,
     typical_square,
 )
-from ._recipe import Recipe, paper
+from ._recipe import Recipe, second_order
+from ._second_order import LeastSquares, SecondOrder
+
+_project = eqx.filter_jit(project)
 
 _Model = TypeVar("_Model", bound=eqx.Module)
 # Called with the epochs that are done, all epochs, the last loss and the best criterion.
@@ -80,15 +89,19 @@ class _Problem(eqx.Module):
     args: Args
     sample: Sampler | None
     recipe: Recipe
-    optimiser: optax.GradientTransformation
+    optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
     typical: Float[Array, ""]
+    linear: Bool[Array, " weights"]  # of all weights in one vector, those of the last layer
     key: PRNGKeyArray
 
-    def loss(self, weights: Any, points: Points, p: Array, s: Array) -> Float[Array, ""]:
+    def defects(self, weights: Any, points: Points, p: Array, s: Array) -> Array:
         model = eqx.combine(weights, self.static)
-        squares = squared_defects(model, self.vector_field, self.args, points, p, s)
-        return self.recipe.loss(squares, self.typical)
+        return defects(model, self.vector_field, self.args, points, p, s)
+
+    def loss(self, weights: Any, points: Points, p: Array, s: Array) -> Float[Array, ""]:
+        vectors = self.defects(weights, points, p, s)
+        return self.recipe.loss(jnp.sum(jnp.square(vectors), axis=1), self.typical)
 
     def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss of what the trained model will compute."""
@@ -118,6 +131,7 @@ def fit(
     sample: Sampler | None = None,
     args: Args = None,
     recipe: Recipe | None = None,
+    manifold: Manifold = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone: no solution is needed.
@@ -130,6 +144,9 @@ def fit(
     An update that is not finite is not made. The model that is returned is the best that was seen,
     not the last.
 
+    A `PINN` of several windows is trained window by window; each starts where the one before ended,
+    moved onto the manifold if one is given.
+
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.DeepONet`][], or any Module
@@ -138,7 +155,9 @@ def fit(
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, a function from a random key to an initial state.
     - `args`: passed to `vector_field`.
-    - `recipe`: a [`diffrax_conserve.Recipe`][]. Default: [`diffrax_conserve.paper`][]`(model)`.
+    - `recipe`: a [`diffrax_conserve.Recipe`][]. Default: [`diffrax_conserve.second_order`][]`(model)`.
+    - `manifold`: for a `PINN` of several windows, where the ends of the windows are moved to: the
+        values of its integrals are those at the initial state. Default: that of its layer.
     - `progress`: whether to print a line on standard error, or a function that is called now and
         then with the number of epochs done, that of all epochs, the last loss and the best
         criterion.
@@ -168,39 +187,135 @@ def fit(
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
-    _check(model, sample)
-    recipe = paper(model) if recipe is None else recipe
-    problem, carry = _start(model, vector_field, key, sample, args, recipe)
-    begun = time.perf_counter()
-    advance = eqx.filter_jit(_advance)
-    arguments = (problem, carry, jnp.asarray(0), jnp.asarray(0))
-    compiled = advance.lower(*arguments).compile()  # pyright: ignore[reportFunctionMemberAccess]
-    compile_seconds = time.perf_counter() - begun
-    checked, criteria, done = [], [], 0
-    while True:
-        # Without an epoch between them, the first round only judges the model as it came.
-        stop = min(done + recipe.check_every, recipe.epochs) if checked else 0
-        carry, criterion = compiled(problem, carry, jnp.asarray(done), jnp.asarray(stop))
-        done = stop
-        checked.append(done)
-        criteria.append(float(criterion))
-        _report(progress, done, recipe.epochs, carry)
-        if done == recipe.epochs:
-            break
-    log = FitLog(
-        losses=np.asarray(carry.losses),
-        checked=np.array(checked),
-        criteria=np.array(criteria),
-        best_epoch=int(carry.best_epoch),
-        best=float(carry.best),
-        skipped=int(carry.skipped),
-        seconds=time.perf_counter() - begun - compile_seconds,
-        compile_seconds=compile_seconds,
+    _check(model, sample, manifold)
+    recipe = second_order(model) if recipe is None else recipe
+    windows = model.windows if isinstance(model, PINN) else 1
+    trainer = _Trainer(vector_field, sample, args, recipe, progress, windows)
+    if not isinstance(model, PINN):
+        trained, log = trainer.train(model, key)
+        return trained, log
+    target = _Joint.of(model, manifold, args)
+    logs = []
+    for k in range(windows):
+        window, log = trainer.train(model.window(k), key if k == 0 else jr.fold_in(key, k))
+        logs.append(log)
+        model = _with_window(model, k, window, target)
+    return model, _joined(logs, recipe.epochs)
+
+
+@final
+class _Trainer:
+    """Trains one network after the other, all of the same shape, with one compilation."""
+
+    def __init__(
+        self,
+        vector_field: VectorField,
+        sample: Sampler | None,
+        args: Args,
+        recipe: Recipe,
+        progress: bool | Progress,
+        count: int,
+    ):
+        self.vector_field, self.sample, self.args = vector_field, sample, args
+        self.recipe, self.progress, self.count = recipe, progress, count
+        self.trained, self.compiled = 0, None
+
+    def train(self, model: Any, key: PRNGKeyArray) -> tuple[Any, FitLog]:
+        recipe = self.recipe
+        problem, carry = _start(model, self.vector_field, key, self.sample, self.args, recipe)
+        begun = time.perf_counter()
+        if self.compiled is None:
+            arguments = (problem, carry, jnp.asarray(0), jnp.asarray(0))
+            advance = eqx.filter_jit(_advance)
+            lowered = advance.lower(*arguments)  # pyright: ignore[reportFunctionMemberAccess]
+            self.compiled = lowered.compile()
+        compile_seconds = time.perf_counter() - begun
+        checked, criteria, done = [], [], 0
+        while True:
+            # Without an epoch between them, the first round only judges the model as it came.
+            stop = min(done + recipe.check_every, recipe.epochs) if checked else 0
+            carry, criterion = self.compiled(problem, carry, jnp.asarray(done), jnp.asarray(stop))
+            done = stop
+            checked.append(done)
+            criteria.append(float(criterion))
+            before = self.trained * recipe.epochs
+            _report(self.progress, done, before, self.count * recipe.epochs, carry)
+            if done == recipe.epochs:
+                break
+        self.trained += 1
+        log = FitLog(
+            losses=np.asarray(carry.losses),
+            checked=np.array(checked),
+            criteria=np.array(criteria),
+            best_epoch=int(carry.best_epoch),
+            best=float(carry.best),
+            skipped=int(carry.skipped),
+            seconds=time.perf_counter() - begun - compile_seconds,
+            compile_seconds=compile_seconds,
+        )
+        return eqx.combine(carry.best_weights, problem.static), log
+
+
+class _Joint(NamedTuple):
+    """Where the ends of the windows are moved to."""
+
+    manifold: Manifold
+    values: Any
+    args: Args
+
+    @classmethod
+    def of(cls, pinn: PINN, manifold: Manifold, args: Args) -> "_Joint | None":
+        if manifold is None:
+            if pinn.layer is None:
+                return None
+            manifold, args = pinn.layer.manifold, pinn.layer.args
+        return cls(manifold, conserved_values(manifold, pinn.t0, pinn.y0, args), args)
+
+    def __call__(self, t: Array, y: Any) -> Any:
+        found, info = _project(self.manifold, y, t=t, args=self.args, value=self.values)
+        # The end of a window that has not learned the solution may be too far from the manifold.
+        return found if bool(info.result == optx.RESULTS.successful) else y
+
+
+def _with_window(pinn: PINN, index: int, window: Window, joint: _Joint | None) -> PINN:
+    """`pinn` with this window trained and the next one starting at its end."""
+
+    def put(i: int, stacked: Any, new: Any) -> Any:
+        return jtu.tree_map(lambda x, y: x.at[i].set(y), stacked, new)
+
+    pinn = eqx.tree_at(lambda m: m.nets, pinn, put(index, pinn.nets, window.net))
+    if index + 1 == pinn.windows:
+        return pinn
+    t = window.start + window.length
+    end = window(t)
+    end = end if joint is None else joint(t, end)
+    return eqx.tree_at(lambda m: m.y0s, pinn, put(index + 1, pinn.y0s, end))
+
+
+def _joined(logs: list[FitLog], epochs: int) -> FitLog:
+    """The log of all windows one after the other; its best is that of the worst window."""
+    worst = max(range(len(logs)), key=lambda k: logs[k].best)
+    return FitLog(
+        losses=np.concatenate([log.losses for log in logs]),
+        checked=np.concatenate([k * epochs + log.checked for k, log in enumerate(logs)]),
+        criteria=np.concatenate([log.criteria for log in logs]),
+        best_epoch=worst * epochs + logs[worst].best_epoch,
+        best=logs[worst].best,
+        skipped=sum(log.skipped for log in logs),
+        seconds=sum(log.seconds for log in logs),
+        compile_seconds=sum(log.compile_seconds for log in logs),
     )
-    return eqx.combine(carry.best_weights, problem.static), log
 
 
-def _check(model: eqx.Module, sample: Sampler | None) -> None:
+def _check(model: eqx.Module, sample: Sampler | None, manifold: Manifold) -> None:
+    if manifold is not None:
+        check_manifold(manifold)
+        if not (isinstance(model, PINN) and model.windows > 1):
+            raise ValueError(
+                "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "
+                "network has no windows. To conserve its integrals give the network a `layer`, or "
+                "wrap its solver in `ManifoldProjection`."
+            )
     if isinstance(model, PINN):
         if sample is not None:
             raise ValueError("A `PINN` has one initial state, its own: leave `sample` out.")
@@ -229,11 +344,15 @@ def _start(
     weights, static = eqx.partition(model, trainable(model))
     points = draw(model, recipe.times, sample, recipe.points, points_key)
     optimiser = recipe.optimiser
-    if recipe.max_gradient_norm is not None:
+    if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
         clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
         optimiser = optax.chain(clip, optimiser)
     typical = typical_square(model, vector_field, args, points)
-    problem = _Problem(static, vector_field, args, sample, recipe, optimiser, points, typical, key)
+    last = eqx.filter(linear_weights(model), trainable(model))
+    linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
+    problem = _Problem(
+        static, vector_field, args, sample, recipe, optimiser, points, typical, linear, key
+    )
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     carry = _Carry(
         weights=weights,
@@ -271,12 +390,9 @@ def _epoch(problem: _Problem, carry: _Carry, epoch: Int[Array, ""]) -> _Carry:
     """One update."""
     points = _refreshed(problem, carry.points, epoch)
     p, s = problem.schedule(epoch)
-    loss, gradient = eqx.filter_value_and_grad(problem.loss)(carry.weights, points, p, s)
-    updates, optimiser_state = problem.optimiser.update(
-        gradient, carry.optimiser_state, carry.weights
-    )
-    weights = eqx.apply_updates(carry.weights, updates)
-    finite = jnp.isfinite(loss) & tree_all_finite(gradient) & tree_all_finite(weights)
+    update = _by_least_squares if isinstance(problem.optimiser, SecondOrder) else _by_gradient
+    weights, optimiser_state, loss = update(problem, carry, points, p, s, epoch)
+    finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # A model that is not finite stays so if only this update is left out: every point is used in
     # every epoch. So go back to the best one.
     fresh = problem.optimiser.init(carry.best_weights)
@@ -287,6 +403,39 @@ def _epoch(problem: _Problem, carry: _Carry, epoch: Int[Array, ""]) -> _Carry:
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
+
+
+def _by_gradient(
+    problem: _Problem, carry: _Carry, points: Points, p: Array, s: Array, epoch: Array
+) -> tuple[Any, Any, Float[Array, ""]]:
+    del epoch
+    loss, gradient = eqx.filter_value_and_grad(problem.loss)(carry.weights, points, p, s)
+    updates, state = problem.optimiser.update(gradient, carry.optimiser_state, carry.weights)
+    return eqx.apply_updates(carry.weights, updates), state, loss
+
+
+def _by_least_squares(
+    problem: _Problem, carry: _Carry, points: Points, p: Array, s: Array, epoch: Array
+) -> tuple[Any, Any, Float[Array, ""]]:
+    """The same by a second-order method, for which the weights are one vector."""
+    assert isinstance(problem.optimiser, SecondOrder)
+    vector, restore = ravel_pytree(carry.weights)
+
+    def at_one(vector: Array, point: Points) -> Array:
+        single = jtu.tree_map(lambda x: x[None], point)
+        return problem.defects(restore(vector), single, p, s)[0]
+
+    least_squares = LeastSquares(
+        defects=lambda v: problem.defects(restore(v), points, p, s),
+        jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
+        loss=problem.recipe.loss,
+        typical=problem.typical,
+    )
+    fraction = epoch / problem.recipe.epochs
+    vector, state, loss = problem.optimiser.update(
+        least_squares, vector, carry.optimiser_state, fraction, problem.linear
+    )
+    return restore(vector), state, loss
 
 
 def _refreshed(problem: _Problem, points: Points, epoch: Int[Array, ""]) -> Points:
@@ -306,11 +455,14 @@ def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
     return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def _report(progress: bool | Progress, done: int, epochs: int, carry: _Carry) -> None:
+def _report(
+    progress: bool | Progress, done: int, before: int, epochs: int, carry: _Carry
+) -> None:
     if progress is False:
         return
     loss = float(carry.losses[max(done - 1, 0)])
     best = float(carry.best)
+    done += before
     if progress is not True:
         progress(done, epochs, loss, best)
         return

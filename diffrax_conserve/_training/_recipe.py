@@ -4,12 +4,14 @@ from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
+import jax
 import optax
 from jaxtyping import Array
 
 from .._network import PINN
 from ._loss import Loss, bounded, mean_square
-from ._sampling import Times, uniform_times
+from ._sampling import Times, grid_times, uniform_times
+from ._second_order import SPRING, LevenbergMarquardt, SecondOrder
 from ._schedule import every_iteration, ramped_weight, staged_iterations
 
 Schedule = Callable[[Array, int, int], Array]
@@ -31,7 +33,7 @@ class Recipe(eqx.Module):
 
     epochs: int = 5000
     points: int = 2000
-    optimiser: optax.GradientTransformation = eqx.field(default_factory=lambda: optax.adam(1e-3))
+    optimiser: optax.GradientTransformation | SecondOrder = eqx.field(default_factory=lambda: optax.adam(1e-3))
     iterations: Schedule = staged_iterations
     weight: Schedule = ramped_weight
     loss: Loss = mean_square
@@ -52,7 +54,8 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 
 - `epochs`: the number of updates; each uses all collocation points.
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
-- `optimiser`: any [`optax.GradientTransformation`][].
+- `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.SPRING`][] or
+    [`diffrax_conserve.LevenbergMarquardt`][].
 - `iterations`, `weight`: the projection schedule, for a network with a conservative layer:
     functions of the epoch (traced), the number of epochs and the number of iterations in the layer,
     that return $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where
@@ -61,9 +64,51 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
     initial states, to the loss: `mean_square`, `bounded()`, or a function of your own.
 - `times`: how times are drawn: `uniform_times`, `grid_times`, or a function of your own.
 - `refresh`: after how many epochs new points are drawn. Default: never.
-- `max_gradient_norm`: longer gradients are scaled to this norm. `None` for no limit.
+- `max_gradient_norm`: longer gradients are scaled to this norm. `None` for no limit. Second-order
+    methods have their damping instead.
 - `check_every`: after how many epochs the model is compared with the best one so far.
 """
+
+
+def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
+    """The default recipe: second-order training, by the size of the problem.
+
+    A `PINN` with up to 2,000 weights in each window is trained by
+    [`diffrax_conserve.LevenbergMarquardt`][] on a grid of 120 times, in 40 epochs for each window.
+    A larger one, and every flow map, is trained by [`diffrax_conserve.SPRING`][] on 250 fresh
+    points in each of 2,000 epochs.
+
+    **Arguments:**
+
+    - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
+    - `epochs`: as of [`diffrax_conserve.Recipe`][]: the error falls with it until the network is
+        as good as it can be.
+    """
+    if isinstance(model, PINN) and _size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
+        return Recipe(
+            epochs=epochs or 40,
+            points=120,
+            optimiser=LevenbergMarquardt(),
+            iterations=every_iteration,
+            times=grid_times,
+            check_every=5,
+        )
+    return Recipe(
+        epochs=epochs or 2000,
+        points=250,
+        optimiser=SPRING(),
+        iterations=every_iteration,
+        refresh=1,
+        check_every=20,
+    )
+
+
+def _size(net: eqx.Module) -> int:
+    return sum(x.size for x in jax.tree_util.tree_leaves(eqx.filter(net, eqx.is_array)))
+
+
+# Its QR factorisation of so many columns takes about as long as SPRING's Cholesky one.
+_LEVENBERG_MARQUARDT_MAX = 2000
 
 
 def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -> Recipe:
