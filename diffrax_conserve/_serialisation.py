@@ -293,9 +293,8 @@ def _describe_core(model: DeepONet) -> dict[str, Any]:
 def _describe_taylor(taylor: Taylor | None) -> dict[str, Any] | None:
     if taylor is None:
         return None
-    system = _owner(taylor.vector_field)
-    known = system is not None and taylor.args is None
-    return {"order": taylor.order, "system": system.name if known else None}
+    system = _field_system(taylor)
+    return {"order": taylor.order, "system": None if system is None else system.name}
 
 
 def _describe_layer(layer: ConservativeLayer | None) -> dict[str, Any] | None:
@@ -312,6 +311,11 @@ def _system_of(layer: ConservativeLayer) -> AbstractSystem | None:
     if owner is None or layer.args is not None:
         return None
     return owner if bool(eqx.tree_equal(layer.manifold, owner.manifold)) else None
+
+
+def _field_system(taylor: Taylor) -> AbstractSystem | None:
+    """The system of the catalogue whose vector field the polynomial has."""
+    return _owner(taylor.vector_field) if taylor.args is None else None
 
 
 def _owner(function: Any) -> AbstractSystem | None:
@@ -391,7 +395,7 @@ def _arrays(model: PINN | DeepONet) -> list[Any]:
     layer, taylor = model.layer, getattr(model, "taylor", None)
     own = jtu.tree_leaves(eqx.filter(_without(model), eqx.is_array))
     of_layer = None if layer is None else _system_of(layer)
-    of_taylor = None if taylor is None or taylor.args is not None else _owner(taylor.vector_field)
+    of_taylor = None if taylor is None else _field_system(taylor)
     return [*own, *jtu.tree_leaves(of_layer), *jtu.tree_leaves(of_taylor)]
 
 

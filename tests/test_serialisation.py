@@ -11,13 +11,20 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution
+from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator, solution
 
 NETWORKS = {
     "pinn": solution(activation="sin"),
     "raw pinn": solution(normalise=False),
     "deeponet": flow_map(depth=3),
     "conservative pinn": solution(layer=dfc.ConservativeLayer(LORENZ.manifold, steps=4)),
+    "windows": solution(windows=3, slope=2.0),
+    "gated": flow_map(inputs="gated", taylor=dfc.Taylor(LORENZ.vector_field, 2)),
+    "concatenated": flow_map(
+        inputs="concatenated",
+        taylor=dfc.Taylor(LORENZ.vector_field),
+        layer=dfc.ConservativeLayer(LORENZ.manifold),
+    ),
     "conservative deeponet": flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold)),
 }
 
@@ -61,6 +68,15 @@ def test_a_layer_of_the_users_own_is_given_again(path):
     dfc.save(path, NETWORKS["pinn"])
     with pytest.raises(ValueError, match="leave `layer` out"):
         dfc.load(path, layer=layer)
+
+
+def test_a_vector_field_of_the_users_own_is_given_again(path):
+    taylor = dfc.Taylor(oscillator, 3)
+    network = dfc.DeepONet(EAST[None], 1.0, key=jr.key(0), taylor=taylor, **SMALL)
+    dfc.save(path, network)
+    with pytest.raises(ValueError, match=r"taylor=Taylor\(vector_field, 3\)"):
+        dfc.load(path)
+    assert eqx.tree_equal(dfc.load(path, taylor=taylor), network)
 
 
 def test_the_info(path):
@@ -153,8 +169,14 @@ def test_a_foreign_file(path):
 
 
 def test_a_file_of_a_newer_version(path, content):
-    path.write_bytes(content.replace(b"network 1 ", b"network 2 ", 1))
+    path.write_bytes(content.replace(b"network 2 ", b"network 3 ", 1))
     with pytest.raises(ValueError, match=r"newer version .* Upgrade"):
+        dfc.load(path)
+
+
+def test_a_file_from_before_the_first_release(path, content):
+    path.write_bytes(content.replace(b"network 2 ", b"network 1 ", 1))
+    with pytest.raises(ValueError, match=r"before the first release"):
         dfc.load(path)
 
 

@@ -17,7 +17,7 @@ from ._mlp import MLP, Activation, check_sizes
 
 @final
 class Window(eqx.Module):
-    """A network for the solution through one state, on the interval from `start` to `start + length`.
+    """A network for the solution through one state, from the time `start` on, for a time `length`.
 
     A `PINN` is one of these, or several that follow each other.
     """

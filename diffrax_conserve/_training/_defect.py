@@ -134,7 +134,7 @@ def _weights(model: Any) -> Callable[[Any], Any] | None:
 def linear_weights(model: Any) -> Any:
     """`model` with `True` in the place of every weight that its output is linear in."""
 
-    def last_layer(model: Any) -> tuple[Array, Array]:
+    def last_layer(model: Any) -> Any:
         net = model.net if isinstance(model, Window) else output_layer(model.core)
         return net.weights[-1], net.biases[-1]
 

@@ -26,8 +26,8 @@ from ._defect import (
     Points,
     Sampler,
     VectorField,
-    draw,
     defects,
+    draw,
     layer_of,
     linear_weights,
     trainable,
@@ -155,7 +155,8 @@ def fit(
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, a function from a random key to an initial state.
     - `args`: passed to `vector_field`.
-    - `recipe`: a [`diffrax_conserve.Recipe`][]. Default: [`diffrax_conserve.second_order`][]`(model)`.
+    - `recipe`: a [`diffrax_conserve.Recipe`][]. Default:
+        [`diffrax_conserve.second_order`][]`(model)`.
     - `manifold`: for a `PINN` of several windows, where the ends of the windows are moved to: the
         values of its integrals are those at the initial state. Default: that of its layer.
     - `progress`: whether to print a line on standard error, or a function that is called now and
@@ -410,6 +411,7 @@ def _by_gradient(
 ) -> tuple[Any, Any, Float[Array, ""]]:
     del epoch
     loss, gradient = eqx.filter_value_and_grad(problem.loss)(carry.weights, points, p, s)
+    assert not isinstance(problem.optimiser, SecondOrder)
     updates, state = problem.optimiser.update(gradient, carry.optimiser_state, carry.weights)
     return eqx.apply_updates(carry.weights, updates), state, loss
 
@@ -455,9 +457,7 @@ def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
     return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def _report(
-    progress: bool | Progress, done: int, before: int, epochs: int, carry: _Carry
-) -> None:
+def _report(progress: bool | Progress, done: int, before: int, epochs: int, carry: _Carry) -> None:
     if progress is False:
         return
     loss = float(carry.losses[max(done - 1, 0)])

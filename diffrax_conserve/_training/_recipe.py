@@ -11,8 +11,8 @@ from jaxtyping import Array
 from .._network import PINN
 from ._loss import Loss, bounded, mean_square
 from ._sampling import Times, grid_times, uniform_times
-from ._second_order import SPRING, LevenbergMarquardt, SecondOrder
 from ._schedule import every_iteration, ramped_weight, staged_iterations
+from ._second_order import SPRING, LevenbergMarquardt, SecondOrder
 
 Schedule = Callable[[Array, int, int], Array]
 
@@ -33,7 +33,9 @@ class Recipe(eqx.Module):
 
     epochs: int = 5000
     points: int = 2000
-    optimiser: optax.GradientTransformation | SecondOrder = eqx.field(default_factory=lambda: optax.adam(1e-3))
+    optimiser: optax.GradientTransformation | SecondOrder = eqx.field(
+        default_factory=lambda: optax.adam(1e-3)
+    )
     iterations: Schedule = staged_iterations
     weight: Schedule = ramped_weight
     loss: Loss = mean_square

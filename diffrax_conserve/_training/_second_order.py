@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from .._custom_types import RealScalarLike
 from ._loss import Loss
 
 
@@ -57,7 +58,7 @@ class SpringState(NamedTuple):
 
 @final
 class SPRING(eqx.Module):
-    r"""A natural gradient in the space of the samples, with momentum, for fresh points in each epoch.
+    r"""A natural gradient in the space of samples, with momentum, for fresh points in each epoch.
 
     Of all updates that solve the linearised equations of the epoch's points, up to the damping, it
     takes the one nearest to $\zeta = \mu \delta_{\text{last}}$:
@@ -93,8 +94,8 @@ class SPRING(eqx.Module):
         problem: LeastSquares,
         weights: Float[Array, " weights"],
         state: SpringState,
-        fraction: Float[Array, ""],
-        linear: Float[Array, " weights"],
+        fraction: RealScalarLike,
+        linear: Bool[Array, " weights"],
     ) -> tuple[Float[Array, " weights"], SpringState, Float[Array, ""]]:
         del linear
         r, jacobian, loss = problem.rows(weights)
@@ -148,8 +149,8 @@ class LevenbergMarquardt(eqx.Module):
         problem: LeastSquares,
         weights: Float[Array, " weights"],
         state: Float[Array, ""],
-        fraction: Float[Array, ""],
-        linear: Float[Array, " weights"],
+        fraction: RealScalarLike,
+        linear: Bool[Array, " weights"],
     ) -> tuple[Float[Array, " weights"], Float[Array, ""], Float[Array, ""]]:
         del fraction
         r, jacobian, loss = problem.rows(weights)

@@ -67,15 +67,15 @@ def test_numbers_are_states():
 def test_the_ansatz_of_the_pinn():
     pinn = solution(t1=4.0)
     largest = jnp.max(jnp.abs(LORENZ.y0))
-    expected = LORENZ.y0 + 3 / 4 * largest * pinn.net(jnp.array([2 * 3 / 4 - 1]))
+    expected = LORENZ.y0 + 3 / 4 * largest * pinn.window(0).net(jnp.array([2 * 3 / 4 - 1]))
     np.testing.assert_allclose(pinn(3.0), expected, rtol=1e-15)
 
 
 def test_the_ansatz_of_the_deeponet():
     net, y0, h = flow_map(), LORENZ.y0, 0.2
     mean, deviation = jnp.mean(states(), axis=0), jnp.std(states(), axis=0)
-    b = net.branch((y0 - mean) / deviation).reshape(3, 4)
-    tau = net.trunk(jnp.array([2 * h / 0.25 - 1])).reshape(3, 4)
+    b = net.core.branch((y0 - mean) / deviation).reshape(3, 4)
+    tau = net.core.trunk(jnp.array([2 * h / 0.25 - 1])).reshape(3, 4)
     expected = y0 + h / 0.25 * deviation * jnp.einsum("jl,jl->j", b, tau) / 2
     np.testing.assert_allclose(net(y0, h), expected, rtol=1e-14)
 
@@ -83,22 +83,22 @@ def test_the_ansatz_of_the_deeponet():
 def test_without_normalisation_the_inputs_are_raw():
     pinn = solution(t1=4.0, normalise=False)
     np.testing.assert_allclose(
-        pinn(3.0), LORENZ.y0 + 3 / 4 * pinn.net(jnp.array([3.0])), rtol=1e-15
+        pinn(3.0), LORENZ.y0 + 3 / 4 * pinn.window(0).net(jnp.array([3.0])), rtol=1e-15
     )
     net, y0 = flow_map(normalise=False), LORENZ.y0
-    b, tau = (x.reshape(3, 4) for x in (net.branch(y0), net.trunk(jnp.array([0.2]))))
+    b, tau = (x.reshape(3, 4) for x in (net.core.branch(y0), net.core.trunk(jnp.array([0.2]))))
     np.testing.assert_allclose(net(y0, 0.2), y0 + 0.8 * jnp.sum(b * tau, axis=1) / 2, rtol=1e-14)
 
 
 @pytest.mark.parametrize(("width", "depth", "latent"), [(5, 1, 3), (7, 4, 2)])
 def test_sizes(width, depth, latent):
     net = dfc.DeepONet(states(), 1.0, width=width, depth=depth, latent=latent, key=jr.key(0))
-    assert [w.shape for w in net.branch.weights] == [
+    assert [w.shape for w in net.core.branch.weights] == [
         (3, width),
         *[(width, width)] * (depth - 1),
         (width, 3 * latent),
     ]
-    assert len(net.trunk.weights) == depth + 1
+    assert len(net.core.trunk.weights) == depth + 1
 
 
 def test_the_activation_by_name_and_as_a_function():

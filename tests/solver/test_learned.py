@@ -211,7 +211,7 @@ def test_gradient_with_respect_to_the_weights_of_a_pinn():
     def directly(pinn):
         return jnp.sum(jax.vmap(pinn)(jnp.arange(1, 5) / 4) ** 2)
 
-    a, b = through_the_solver(PINN).net, directly(PINN).net
+    a, b = through_the_solver(PINN).nets, directly(PINN).nets
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-13)
 
@@ -251,9 +251,9 @@ def test_random_networks_are_on_the_manifold_or_fail(layer):
         key = jr.key(seed)
         noisy = jax.tree.map(
             lambda x, k=key, f=factor: x + f * jr.normal(k, x.shape),
-            (network.branch, network.trunk),
+            network.core,
         )
-        ok, drift = run(eqx.tree_at(lambda n: (n.branch, n.trunk), network, noisy))
+        ok, drift = run(eqx.tree_at(lambda n: n.core, network, noisy))
         outcomes.append(bool(ok))
         assert not ok or drift <= 1e-14
     assert sum(outcomes) >= 3

@@ -91,8 +91,8 @@ def test_a_deeponet_learns_a_flow_map(layer):
     # Only the weights were trained.
     assert eqx.tree_equal(before.layer, after.layer)
     assert eqx.tree_equal((before.shift, before.scale), (after.shift, after.scale))
-    assert not eqx.tree_equal(before.branch, after.branch)
-    assert not eqx.tree_equal(before.trunk, after.trunk)
+    assert not eqx.tree_equal(before.core.branch, after.core.branch)
+    assert not eqx.tree_equal(before.core.trunk, after.core.trunk)
 
 
 def test_any_flow_map_of_the_user_learns():
@@ -158,7 +158,7 @@ def test_a_planted_nan_is_survived():
     model, log = train(circle(), trap, epochs=100)
     assert log.skipped > 0
     assert np.isfinite(log.best)
-    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(model.net))
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(model.nets))
     assert log.best <= log.criteria[0]
 
 
@@ -174,7 +174,7 @@ def test_long_gradients_are_shortened():
     before = circle()
     options = dict(epochs=1, optimiser=optax.sgd(1.0))
     after, _ = train(before, max_gradient_norm=1e-3, **options)
-    nets = (eqx.filter(model.net, eqx.is_array) for model in (after, before))
+    nets = (eqx.filter(model.nets, eqx.is_array) for model in (after, before))
     moved = jax.tree.map(lambda a, b: a - b, *nets)
     assert sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(moved)) <= 1.001e-6
 
@@ -284,7 +284,7 @@ def test_the_papers_recipe_on_the_rigid_body():
     system = dfc.systems.get("rigid-body")
     layer = dfc.ConservativeLayer(system.manifold, steps=5)
     pinn = dfc.PINN(system.y0, 0.0, system.t1, key=jr.key(0), layer=layer)
-    pinn, log = dfc.fit(pinn, system.vector_field, key=jr.key(1))
+    pinn, log = dfc.fit(pinn, system.vector_field, key=jr.key(1), recipe=dfc.paper(pinn))
     ts = jnp.linspace(0, system.t1, 100)
     assert float(jnp.max(jnp.abs(jax.vmap(pinn)(ts) - system.reference(ts)))) < 1e-3
     assert log.skipped == 0
