@@ -22,8 +22,8 @@ class Taylor(eqx.Module):
 
     A [`diffrax_conserve.DeepONet`][] with it learns what is left, $u(h) = T_q(u_0, h) +
     (h/\Delta)^{q+1} S N(u_0, h)$. With $q = 1$ its initial slope is exact. It is then a method of
-    order $q$ whatever its weights, so that smaller steps help. A high order is worth its cost, which
-    doubles with each, only while the polynomial itself is sensible: $h$ times the rate of change of
+    order $q$ whatever its weights, so that smaller steps help. Its cost doubles with each order,
+    which is worth it only while the polynomial itself is sensible: $h$ times the rate of change of
     $f$ not much above one.
 
     !!! example

@@ -13,14 +13,12 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 import optax
-import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .._custom_types import Args, Manifold
-from .._manifold import check_manifold, conserved_values
-from .._network import PINN, Window
-from .._projection import project
+from .._manifold import check_manifold
+from .._network import PINN
 from .._tree import tree_all_finite
 from ._defect import (
     Points,
@@ -35,8 +33,7 @@ from ._defect import (
 )
 from ._recipe import Recipe, second_order
 from ._second_order import LeastSquares, SecondOrder
-
-_project = eqx.filter_jit(project)
+from ._windows import Joint, with_window
 
 _Model = TypeVar("_Model", bound=eqx.Module)
 # Called with the epochs that are done, all epochs, the last loss and the best criterion.
@@ -195,12 +192,12 @@ def fit(
     if not isinstance(model, PINN):
         trained, log = trainer.train(model, key)
         return trained, log
-    target = _Joint.of(model, manifold, args)
+    target = Joint.of(model, manifold, args)
     logs = []
     for k in range(windows):
         window, log = trainer.train(model.window(k), key if k == 0 else jr.fold_in(key, k))
         logs.append(log)
-        model = _with_window(model, k, window, target)
+        model = with_window(model, k, window, target)
     return model, _joined(logs, recipe.epochs)
 
 
@@ -255,42 +252,6 @@ class _Trainer:
             compile_seconds=compile_seconds,
         )
         return eqx.combine(carry.best_weights, problem.static), log
-
-
-class _Joint(NamedTuple):
-    """Where the ends of the windows are moved to."""
-
-    manifold: Manifold
-    values: Any
-    args: Args
-
-    @classmethod
-    def of(cls, pinn: PINN, manifold: Manifold, args: Args) -> "_Joint | None":
-        if manifold is None:
-            if pinn.layer is None:
-                return None
-            manifold, args = pinn.layer.manifold, pinn.layer.args
-        return cls(manifold, conserved_values(manifold, pinn.t0, pinn.y0, args), args)
-
-    def __call__(self, t: Array, y: Any) -> Any:
-        found, info = _project(self.manifold, y, t=t, args=self.args, value=self.values)
-        # The end of a window that has not learned the solution may be too far from the manifold.
-        return found if bool(info.result == optx.RESULTS.successful) else y
-
-
-def _with_window(pinn: PINN, index: int, window: Window, joint: _Joint | None) -> PINN:
-    """`pinn` with this window trained and the next one starting at its end."""
-
-    def put(i: int, stacked: Any, new: Any) -> Any:
-        return jtu.tree_map(lambda x, y: x.at[i].set(y), stacked, new)
-
-    pinn = eqx.tree_at(lambda m: m.nets, pinn, put(index, pinn.nets, window.net))
-    if index + 1 == pinn.windows:
-        return pinn
-    t = window.start + window.length
-    end = window(t)
-    end = end if joint is None else joint(t, end)
-    return eqx.tree_at(lambda m: m.y0s, pinn, put(index + 1, pinn.y0s, end))
 
 
 def _joined(logs: list[FitLog], epochs: int) -> FitLog:
