@@ -6,6 +6,7 @@ from ._diagnostics import drift as drift
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._network import PINN as PINN
+from ._network import Box as Box
 from ._network import ConservativeLayer as ConservativeLayer
 from ._network import DeepONet as DeepONet
 from ._projection import AbstractProjection as AbstractProjection
@@ -24,6 +25,7 @@ from ._serialisation import save as save
 from ._solver import RK4 as RK4
 from ._solver import CountRejections as CountRejections
 from ._solver import DeepONetSolver as DeepONetSolver
+from ._solver import DomainStatistics as DomainStatistics
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
 from ._solver import ProjectionStatistics as ProjectionStatistics

@@ -1,0 +1,84 @@
+"""The states that a flow map was trained for."""
+
+from typing import final
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, PyTree, Real
+
+from .._custom_types import Y
+from ._flat import as_state
+
+
+@final
+class Box(eqx.Module):
+    r"""The states between two corners, $l \le y \le u$ in every component.
+
+    A flow map that has it as an attribute `domain` can be told apart, by the option `outside` of
+    [`diffrax_conserve.DeepONetSolver`][], from one that is asked for more than it has learned. Any
+    Module with a method `contains(y)`, which returns a boolean scalar, can take its place.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        box = dfc.Box.around(states)
+        assert box.contains(states[0])
+        assert not box.contains(100 * states[0])
+        ```
+    """
+
+    lower: PyTree[Real[Array, "..."]]
+    upper: PyTree[Real[Array, "..."]]
+
+    def __init__(self, lower: Y, upper: Y):
+        self.lower = as_state(lower)
+        self.upper = as_state(upper)
+
+    def __check_init__(self):
+        lower, upper = jtu.tree_structure(self.lower), jtu.tree_structure(self.upper)
+        shapes = [[jnp.shape(x) for x in jtu.tree_leaves(t)] for t in (self.lower, self.upper)]
+        if lower != upper or shapes[0] != shapes[1]:
+            raise ValueError(
+                f"`lower` has the structure {lower} with shapes {shapes[0]}, but `upper` has "
+                f"{upper} with {shapes[1]}. Both must be those of a state."
+            )
+
+    @classmethod
+    def around(cls, states: Y) -> "Box":
+        """The smallest box around `states`, which are stacked along a leading axis."""
+        states = as_state(states)
+        if any(jnp.ndim(x) == 0 or jnp.shape(x)[0] == 0 for x in jtu.tree_leaves(states)):
+            raise ValueError(
+                "`states` must be at least one state, stacked along a leading axis. For a single "
+                "state write `jax.tree.map(lambda x: x[None], y0)`."
+            )
+        lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
+        return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is in the box, its boundary included. NaN is not."""
+        if jtu.tree_structure(y) != jtu.tree_structure(self.lower):
+            raise ValueError(
+                f"The box is for states of the structure {jtu.tree_structure(self.lower)}, but was "
+                f"given one of {jtu.tree_structure(y)}."
+            )
+        inside = jtu.tree_map(
+            lambda x, a, b: jnp.all((a <= x) & (x <= b)), y, self.lower, self.upper
+        )
+        return jnp.all(jnp.stack(jtu.tree_leaves(inside)))
+
+
+Box.__init__.__doc__ = """**Arguments:**
+
+- `lower`, `upper`: the corners, two PyTrees like a state.
+
+**Raises:**
+
+`ValueError` or `TypeError` if they are not alike, or not real.
+"""
