@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, final
+from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -10,11 +10,10 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._network._flat import flatten, unflatten
-from .._tree import working_dtype
 from ._chebyshev import ChebyshevInterpolation, coefficients, fractions
 from ._error_estimate import estimate
 from ._learned import check_learned_terms, check_nodes, check_output
@@ -124,8 +123,8 @@ class DeepONetSolver(dfx.AbstractSolver[DomainStatistics | None]):
         *,
         nodes: int = 12,
         corrections: int = 0,
-        sweep: Literal["picard", "newton"] = "picard",
-        outside: Literal["ignore", "report", "fail"] | dfx.AbstractSolver = "ignore",
+        sweep: str = "picard",
+        outside: str | dfx.AbstractSolver = "ignore",
         max_error: RealScalarLike | None = None,
     ):
         check_policy(outside, max_error, getattr(flow_map, "domain", None))
@@ -216,25 +215,26 @@ class DeepONetSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     def _learned(self, h: Array, y0: Y, increment: Increment) -> Taken:
         """The step of the flow map, corrected."""
-
-        def states(rows: Path) -> Y:
-            return jax.vmap(lambda row: unflatten(row, y0))(rows)
-
+        _, unravel = ravel_pytree(y0)
         path = self._path(h, y0)
         if self.corrections == 0:
             y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.flow_map(y0, h), y0)
             error = estimate(increment, path)
         else:
             path, error = correct(SWEEPS[self.sweep], increment, path, self.corrections)
-            y1 = unflatten(path[-1], y0)
-        return Taken(y1, unflatten(error, y0), coefficients(states(path)), dfx.RESULTS.successful)
+            y1 = unravel(path[-1])
+        states = jax.vmap(unravel)(path)
+        return Taken(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
     def _path(self, h: Array, y0: Y) -> Path:
         """The states of the flow map at the nodes; the first is the initial state."""
-        dtype = working_dtype(y0)
-        rows = jax.vmap(lambda c: flatten(self.flow_map(y0, c * h)).astype(dtype))
-        inner = rows(fractions(self.nodes, h.dtype)[1:])
-        return jnp.concatenate([flatten(y0)[None], inner])
+        start, _ = ravel_pytree(y0)
+
+        def state(fraction: Array) -> Array:
+            return ravel_pytree(self.flow_map(y0, fraction * h))[0].astype(start.dtype)
+
+        rows = jax.vmap(state)(fractions(self.nodes, h.dtype)[1:])
+        return jnp.concatenate([start[None], rows])
 
     def _inside(self, y0: Y) -> Array:
         domain = getattr(self.flow_map, "domain", None)

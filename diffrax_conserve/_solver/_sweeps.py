@@ -13,10 +13,10 @@ from collections.abc import Callable
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Inexact
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._network._flat import flatten, unflatten
 from ._chebyshev import fractions, integrals
 
 Path = Inexact[Array, "nodes n"]
@@ -31,11 +31,12 @@ def increment(
     """The vector field of the term, as what it adds over the whole step."""
     control = terms.contr(t0, t1)
     length = jnp.asarray(t1 - t0)
+    _, unravel = ravel_pytree(like)
 
     def evaluate(fraction: Array, vector: Array) -> Array:
         t = t0 + fraction.astype(length.dtype) * length
-        change = terms.vf_prod(t, unflatten(vector, like), args, control)
-        return flatten(change).astype(vector.dtype)
+        change, _ = ravel_pytree(terms.vf_prod(t, unravel(vector), args, control))
+        return change.astype(vector.dtype)
 
     return evaluate
 
