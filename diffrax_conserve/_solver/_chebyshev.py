@@ -66,8 +66,8 @@ def at(where: tuple[float, ...], values: Array) -> Array:
 
 
 def _apply(matrix: np.ndarray, values: Array) -> Array:
-    matrix = jnp.asarray(matrix, values.dtype)
-    return jnp.tensordot(matrix, values, axes=1, precision=lax.Precision.HIGHEST)
+    weights = jnp.asarray(matrix, values.dtype)
+    return jnp.tensordot(weights, values, axes=1, precision=lax.Precision.HIGHEST)
 
 
 @ft.cache

@@ -283,9 +283,7 @@ def _reject_too_long(taken: Taken, h: Array, t1: RealScalarLike, max_step: Any) 
     # The difference of two large times carries their roundoff.
     slack = 1e-6 * max_step + 8 * jnp.finfo(h.dtype).eps * jnp.abs(t1)
     fits = h <= max_step + slack
-    first = math.floor(math.log10(max_step)) if _is_known(max_step) else -4
-    decades = (first, first + (2 if _is_known(max_step) else 8))
-    too_long = numbered(_refusal(max_step, "{}"), h, digits=3, decades=decades)
+    too_long = numbered(_refusal(max_step, "{}"), h, digits=3, decades=_decades(max_step))
     error = jtu.tree_map(lambda e: jnp.where(fits, e, jnp.inf), taken.error)
     result = dfx.RESULTS.where(fits, taken.result, too_long)
     return Taken(taken.y1, error, taken.coefficients, result)
@@ -297,6 +295,14 @@ def _refusal(max_step: Any, number: str) -> str:
         f"A step of {number} was asked of a flow map that was trained for steps from 0 to {longest}"
         ". Take a shorter `dt0`, and solve forwards in time."
     )
+
+
+def _decades(max_step: Any) -> tuple[int, int]:
+    """Where the lengths of steps that are too long lie."""
+    if not (_is_known(max_step) and 0 < max_step < math.inf):
+        return -4, 4
+    first = math.floor(math.log10(max_step))
+    return first, first + 2
 
 
 def _is_known(max_step: Any) -> bool:
