@@ -6,9 +6,9 @@
 
 The error is that of one step of the flow map's longest length, from random states of the domain,
 against a solve at tolerance 1e-13: the median of the Euclidean norms. The cost is that of a
-compiled solve with such steps, in processor time for each step and state. A classical method takes the same step in
-several pieces; its error at the cost of a learned step is interpolated between whole numbers of
-pieces.
+compiled solve with such steps, in processor time for each step and state. A classical method takes
+the same step in several pieces; its error at the cost of a learned step is interpolated between
+whole numbers of pieces.
 """
 
 import argparse
@@ -43,7 +43,7 @@ class Size:
     repeats: int = 20
     picard: tuple[int, ...] = (0, 1, 2, 3, 4, 6, 8)
     newton: tuple[int, ...] = (1, 2, 3)
-    pieces: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+    pieces: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256)
     classical: tuple[str, ...] = tuple(CLASSICAL)
 
 
