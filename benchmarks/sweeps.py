@@ -39,11 +39,11 @@ SEPARATION = 0.3
 @dataclasses.dataclass(frozen=True)
 class Size:
     states: int = 100
-    steps: int = 50
-    repeats: int = 20
+    steps: int = 20
+    repeats: int = 5
     picard: tuple[int, ...] = (0, 1, 2, 3, 4, 6, 8)
     newton: tuple[int, ...] = (1, 2, 3)
-    pieces: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256)
+    pieces: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128)
     classical: tuple[str, ...] = tuple(CLASSICAL)
 
 

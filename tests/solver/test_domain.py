@@ -33,8 +33,8 @@ class Rotation(eqx.Module):
 
 # The rotation from (1, 0) leaves it between the third and the fourth step of length 0.5.
 EASTERN = dfc.Box(jnp.array([0.0, -2.0]), jnp.array([2.0, 2.0]))
-KNOWS = Within(Rotation(1e-3), EASTERN)
-BARE = Rotation(1e-3)
+BARE = Rotation(jnp.array(1e-3))
+KNOWS = Within(BARE, EASTERN)
 
 
 def solve(solver, y0=EAST, *, t0=0.0, t1=5.0, dt0=0.5, **options):
@@ -137,17 +137,22 @@ def test_a_continued_solve_goes_on_counting():
         np.testing.assert_array_equal(a, b)
 
 
+def limited(max_error, error=1e-3):
+    network = Rotation(jnp.array(error))
+    return dfc.DeepONetSolver(network, outside="report", max_error=jnp.array(max_error))
+
+
 def test_a_large_error_counts_as_outside():
     """The error of a step is 1e-3 √2 h up to higher orders."""
 
     def outside(max_error, h):
-        solver = dfc.DeepONetSolver(BARE, outside="report", max_error=max_error)
-        return dfc.statistics(solve(solver, dt0=h, saveat=STATE)).domain.num_outside
+        return dfc.statistics(solve(limited(max_error), dt0=h, saveat=STATE)).domain.num_outside
 
     assert outside(6e-4, 0.5) == 0
     assert outside(3e-4, 0.5) == 10
     assert outside(3e-4, 0.25) == 0
-    with_nan = dfc.DeepONetSolver(Rotation(jnp.nan), outside="report", max_error=1.0)
+    assert outside(1.0, 0.5) == 0
+    with_nan = limited(1.0, error=jnp.nan)
     assert dfc.statistics(solve(with_nan, saveat=STATE)).domain.num_outside == 10
 
 
@@ -201,18 +206,24 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
 # ---- Another solver ----
 
 
-def test_another_solver_takes_all_steps_outside_and_none_inside():
-    for solver in (dfx.Dopri5(), dfc.ManifoldProjection(dfc.RK4(), RADIUS)):
-        shared = dfc.DeepONetSolver(KNOWS, outside=solver)
-        sol = solve(shared, saveat=STATE)
-        y, taken = EAST, 0
-        for i in range(10):
-            if EASTERN.contains(y):
-                y = KNOWS(y, 0.5)
-            else:
-                y, taken = solve(solver, y, t1=0.5).ys[-1], taken + 1
-            np.testing.assert_allclose(sol.ys[i], y, rtol=0, atol=1e-14)
-        assert 0 < taken == dfc.statistics(sol).domain.num_outside
+@pytest.mark.parametrize(
+    "solver",
+    [dfx.Dopri5()]
+    + [
+        pytest.param(solver, marks=pytest.mark.slow)
+        for solver in (dfc.RK4(), dfc.ManifoldProjection(dfx.Heun(), RADIUS))
+    ],
+)
+def test_another_solver_takes_all_steps_outside_and_none_inside(solver):
+    sol = solve(dfc.DeepONetSolver(KNOWS, outside=solver), saveat=STATE)
+    y, taken = EAST, 0
+    for i in range(10):
+        if EASTERN.contains(y):
+            y = KNOWS(y, 0.5)
+        else:
+            y, taken = solve(solver, y, t1=0.5).ys[-1], taken + 1
+        np.testing.assert_allclose(sol.ys[i], y, rtol=0, atol=1e-14)
+    assert 0 < taken == dfc.statistics(sol).domain.num_outside
 
 
 def test_dense_output_is_that_of_the_solver_outside():
@@ -248,6 +259,7 @@ def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     assert sol.result == dfx.RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_an_implicit_solver_outside():
     root_finder = dfx.VeryChord(rtol=1e-10, atol=1e-10, norm=optx.max_norm)
     implicit = dfx.Kvaerno3(root_finder=root_finder)
@@ -256,17 +268,27 @@ def test_an_implicit_solver_outside():
     np.testing.assert_allclose(found, solve(implicit, t1=1.0).ys, rtol=0, atol=1e-9)
 
 
-def test_derivatives():
-    """Of a solve that is partly here, partly there, and nowhere near the boundary."""
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_derivatives(whole):
+    """Of steps of either kind; and of a solve that is partly here, partly there, and nowhere near
+    the boundary."""
 
     def f(error, y0):
         solver = dfc.DeepONetSolver(Within(Rotation(error), EASTERN), outside=dfx.Bosh3())
-        return solve(solver, y0, t1=2.5, max_steps=8).ys
+        if whole:
+            return solve(solver, y0, t1=2.5, max_steps=8).ys
+        times = jnp.array(0.0), jnp.array(0.5)
+        states = [solver.init(TERM, *times, y, None) for y in (y0, -y0)]
+        return [
+            solver.step(TERM, *times, y, None, state, False)[0]
+            for y, state in zip((y0, -y0), states, strict=True)
+        ]
 
     point = jnp.array(0.1), jnp.array([0.9, 0.2])
     dct.assert_gradients(f, *point, rtol=1e-6, forward=False)
 
 
+@pytest.mark.slow
 def test_float32():
     def single(tree):
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)

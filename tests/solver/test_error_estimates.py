@@ -219,7 +219,7 @@ def test_tighter_tolerances_take_more_steps_and_err_less():
     assert errors[2] < 1e-7
 
 
-@pytest.mark.parametrize("dt0", [None, 1.0])
+@pytest.mark.parametrize("dt0", [None, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_steps_longer_than_the_longest_are_rejected(dt0):
     """Not an error: the controller tries a smaller one."""
     sol = solve(dfc.DeepONetSolver(SHIPPED), tol=1e-1, dt0=dt0, saveat=dfx.SaveAt(steps=True))
@@ -229,6 +229,7 @@ def test_steps_longer_than_the_longest_are_rejected(dt0):
     assert jnp.nanmax(lengths) > 0.04
 
 
+@pytest.mark.slow
 def test_a_controller_that_knows_the_longest_step_rejects_nothing():
     sol = solve(dfc.DeepONetSolver(SHIPPED), tol=1e-1, dtmax=SHIPPED.max_step)
     assert sol.stats["num_rejected_steps"] == 0
@@ -252,6 +253,7 @@ def test_a_flow_map_that_small_steps_do_not_help_says_so():
     assert sol.result == dfx.RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_adaptive_steps_on_the_manifold():
     solver = dfc.DeepONetSolver(SHIPPED, corrections=1)
     projected = dfc.ManifoldProjection(solver, LORENZ.manifold, projection=dfc.Newton())
