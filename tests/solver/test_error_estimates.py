@@ -38,7 +38,7 @@ def final(tree):
 # ---- Against the true error ----
 
 
-def ratios(name, kind, factor, count=20):
+def ratios(name, kind, factor, count):
     """Estimated over true error of one full step of a shipped flow map. A `factor` above one takes
     the states out of the domain that it was trained on."""
     system = dfc.systems.get(name)
@@ -62,7 +62,9 @@ def ratios(name, kind, factor, count=20):
     ],
 )
 def test_the_estimate_is_the_true_error_of_the_shipped_flow_maps(name, kind, factor):
-    low, middle, high = np.percentile(ratios(name, kind, factor), [5, 50, 95])
+    # Among the random vortices are pairs so close that `h ‖∂f‖` is beyond the estimate.
+    count = 100 if name == "point-vortices" else 20
+    low, middle, high = np.percentile(ratios(name, kind, factor, count), [5, 50, 95])
     assert 0.9 < low <= high < 1.1
     np.testing.assert_allclose(middle, 1, atol=0.01)
 
