@@ -126,6 +126,7 @@ def test_the_report_is_seen_through_projection_and_in_a_batch():
     assert jnp.all(found.residual_after < 4e-15)
 
 
+@pytest.mark.slow
 def test_a_continued_solve_goes_on_counting():
     solver = dfc.DeepONetSolver(KNOWS, outside="report")
     whole = solve(solver, saveat=STATE)
@@ -186,6 +187,7 @@ def test_one_lane_may_fail():
     np.testing.assert_array_equal(okay, [True, False])
 
 
+@pytest.mark.slow
 def test_through_projection_the_message_is_that_of_the_flow_map():
     solver = dfc.ManifoldProjection(dfc.DeepONetSolver(KNOWS, outside="fail"), RADIUS)
     assert "starts outside the domain" in message(solve(solver, throw=False))

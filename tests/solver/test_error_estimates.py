@@ -128,6 +128,7 @@ def test_the_estimate_is_never_small_where_something_is_not_finite():
     assert jnp.all(jnp.isnan(estimate))
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_lanes():
     solver, y0s = dfc.DeepONetSolver(flow_map()), states(3)
     batch = jax.vmap(lambda y0: step(solver, y0, 0.25)[1])(y0s)

@@ -223,7 +223,7 @@ def test_a_batch_is_its_lanes(sweep):
         np.testing.assert_allclose(solve(solver, y0).ys[-1], y1, rtol=1e-13)
 
 
-@SWEEPS
+@pytest.mark.parametrize("sweep", ["newton", pytest.param("picard", marks=pytest.mark.slow)])
 def test_float32(sweep, exact):
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (SHIPPED, *exact))
     network, y0s, y1s = single
