@@ -1,13 +1,11 @@
 """A learned flow map as a diffrax solver."""
 
-import math
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
@@ -26,10 +24,8 @@ from ._outside import (
     small_enough,
     taken_by,
 )
-from ._refusal import refuse_if
-from ._results import numbered
+from ._step_length import refuse_backwards, reject_too_long
 from ._sweeps import SWEEPS, Increment, Path, correct, increment
-from ._terms import time_direction
 
 # `(y0, h) ↦ y` with an attribute `max_step`: a `DeepONet`, or a Module of the user's own. It may
 # have an integer attribute `order` and an attribute `domain`, with a method `contains(y)`.
@@ -194,7 +190,7 @@ class DeepONetSolver(dfx.AbstractSolver[DomainStatistics | None]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
         del made_jump
-        h = _refuse_backwards(jnp.asarray(t1 - t0), terms, self.flow_map.max_step)
+        h = refuse_backwards(jnp.asarray(t1 - t0), terms, self.flow_map.max_step)
         taken = self._learned(h, y0, increment(terms, t0, t1, y0, args))
         if solver_state is not None:
             trusted = self._inside(y0) & self._accurate(taken.error)
@@ -206,7 +202,7 @@ class DeepONetSolver(dfx.AbstractSolver[DomainStatistics | None]):
                 taken = choose(
                     trusted, taken, lambda: taken_by(solver, terms, t0, t1, y0, args, nodes)
                 )
-        taken = _reject_too_long(taken, h, t1, self.flow_map.max_step)
+        taken = reject_too_long(taken, h, t1, self.flow_map.max_step)
         dense_info = dict(coefficients=taken.coefficients)
         return taken.y1, taken.error, dense_info, solver_state, taken.result
 
@@ -271,39 +267,3 @@ the state's, if a number is not what it must be, or if `outside` asks about a do
 map does not have. At run time an error that names the length of a step that is negative; a failed
 result that names that of one which is too long.
 """
-
-
-def _refuse_backwards(h: Array, terms: Any, max_step: Any) -> Array:
-    signed = h * time_direction(terms, h)
-    return refuse_if(h, ~(signed >= 0), signed, _refusal(max_step, "{:.6g}"))
-
-
-def _reject_too_long(taken: Taken, h: Array, t1: RealScalarLike, max_step: Any) -> Taken:
-    """`taken`, or a failure with an infinite error: an adaptive controller tries a smaller step."""
-    # The difference of two large times carries their roundoff.
-    slack = 1e-6 * max_step + 8 * jnp.finfo(h.dtype).eps * jnp.abs(t1)
-    fits = h <= max_step + slack
-    too_long = numbered(_refusal(max_step, "{}"), h, digits=3, decades=_decades(max_step))
-    error = jtu.tree_map(lambda e: jnp.where(fits, e, jnp.inf), taken.error)
-    result = dfx.RESULTS.where(fits, taken.result, too_long)
-    return Taken(taken.y1, error, taken.coefficients, result)
-
-
-def _refusal(max_step: Any, number: str) -> str:
-    longest = f"{float(max_step):.6g}" if _is_known(max_step) else "its `max_step`"
-    return (
-        f"A step of {number} was asked of a flow map that was trained for steps from 0 to {longest}"
-        ". Take a shorter `dt0`, and solve forwards in time."
-    )
-
-
-def _decades(max_step: Any) -> tuple[int, int]:
-    """Where the lengths of steps that are too long lie."""
-    if not (_is_known(max_step) and 0 < max_step < math.inf):
-        return -4, 4
-    first = math.floor(math.log10(max_step))
-    return first, first + 2
-
-
-def _is_known(max_step: Any) -> bool:
-    return not isinstance(max_step, jax.core.Tracer)

@@ -247,6 +247,22 @@ def test_fixed_steps_that_are_too_long_fail_without_an_exception():
     assert "from 0 to 0.25" in dfx.RESULTS[sol.result]
 
 
+def test_a_flow_map_for_steps_of_any_length():
+    assert (
+        dfx.diffeqsolve(
+            TERM, dfc.DeepONetSolver(Still(max_step=jnp.inf)), 0.0, 20.0, 10.0, LORENZ.y0
+        ).result
+        == dfx.RESULTS.successful
+    )
+
+
+def test_without_the_list_of_messages_a_step_that_is_too_long_still_fails(monkeypatch):
+    monkeypatch.setattr(dfx.RESULTS, "_index_to_message", tuple(dfx.RESULTS._index_to_message))
+    solver = dfc.DeepONetSolver(Still(max_step=0.5))
+    sol = dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 1.0, LORENZ.y0, throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
 def test_a_flow_map_that_small_steps_do_not_help_says_so():
     """An untrained network: its error is in proportion to the step, however small that is."""
     solver = dfc.DeepONetSolver(flow_map())
