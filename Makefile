@@ -101,6 +101,7 @@ bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
 
 bench-learned: $(PLOTS) ## measure what learned solvers cost
 	$(BIN)/python benchmarks/learned.py
+	$(BIN)/python benchmarks/sweeps.py
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.
 build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own

@@ -26,6 +26,7 @@ from ._serialisation import save as save
 from ._solver import RK4 as RK4
 from ._solver import CountRejections as CountRejections
 from ._solver import DeepONetSolver as DeepONetSolver
+from ._solver import DomainStatistics as DomainStatistics
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
 from ._solver import ProjectionStatistics as ProjectionStatistics

@@ -1,5 +1,8 @@
 """Small networks that several test files share. Untrained: their laws hold for every weight."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -31,3 +34,34 @@ def oscillator(t, y, args):
 
 RADIUS = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
 EAST = jnp.array([1.0, 0.0])
+
+
+class Still(eqx.Module):
+    """The worst flow map: nothing moves. Its error in one step is of first order in the step."""
+
+    max_step: float = 1.0
+
+    def __call__(self, y0, h):
+        return jax.tree.map(lambda x: x + 0 * h, y0)
+
+
+class Within(eqx.Module):
+    """A flow map that knows its domain."""
+
+    flow_map: Any
+    domain: Any
+
+    @property
+    def max_step(self):
+        return self.flow_map.max_step
+
+    def __call__(self, y0, h):
+        return self.flow_map(y0, h)
+
+
+def driven(t, y, args):
+    """A forced pendulum of square frequency `args`: nonlinear, not autonomous, a PyTree."""
+    return {"angle": y["rate"], "rate": -args * jnp.sin(y["angle"]) + jnp.cos(3 * t)}
+
+
+DRIVEN0 = {"angle": jnp.array(1.0), "rate": jnp.array([0.3])[0]}

@@ -77,6 +77,15 @@ def test_a_smoke_run_of_the_cost_of_learning(capsys):
     assert "| `rigid-body` |" in capsys.readouterr().out
 
 
+def test_a_smoke_run_of_the_sweeps(capsys):
+    found = benchmark("sweeps").main(["--smoke"])
+    none, two = found["sweeps"]["conservative-lorenz-standard"]["rows"]
+    assert two["error"] < 0.1 * none["error"]
+    (places,) = found["estimates"].values()
+    np.testing.assert_allclose(places["inside"]["ratio"], 1, atol=0.05)
+    assert "| 2 Picard |" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_a_smoke_run_of_the_paper():
     standard, conservative = benchmark("paper").main(["--smoke"])

@@ -5,7 +5,7 @@ from typing import final
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, PyTree, Real
+from jaxtyping import Array, ArrayLike, Bool, PyTree, Real, Shaped
 
 from .._custom_types import Y
 from ._flat import as_state
@@ -36,7 +36,9 @@ class Box(eqx.Module):
     lower: PyTree[Real[Array, "..."]]
     upper: PyTree[Real[Array, "..."]]
 
-    def __init__(self, lower: Y, upper: Y):
+    def __init__(
+        self, lower: PyTree[Shaped[ArrayLike, "..."]], upper: PyTree[Shaped[ArrayLike, "..."]]
+    ):
         self.lower = as_state(lower)
         self.upper = as_state(upper)
 

@@ -42,27 +42,67 @@ class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
 
 def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array]:
     """The coefficients for `states`, a function of the fraction of the step."""
-    fractions, matrix = _nodes(count)
-    values = jax.vmap(states)(jnp.asarray(fractions, dtype))
-    return jtu.tree_map(
-        lambda v: jnp.tensordot(
-            jnp.asarray(matrix, v.dtype), v, axes=1, precision=lax.Precision.HIGHEST
-        ),
-        values,
-    )
+    return coefficients(jax.vmap(states)(fractions(count, dtype)))
+
+
+def fractions(count: int, dtype: Any) -> Array:
+    """The Chebyshev points of the second kind on [0, 1]."""
+    return jnp.asarray(_points(count), dtype)
+
+
+def coefficients(values: PyTree[Array]) -> PyTree[Array]:
+    """Those of the Chebyshev series through `values` at all points, stacked along an axis."""
+    return jtu.tree_map(lambda v: _apply(_to_coefficients(v.shape[0]), v), values)
+
+
+def integrals(values: Array) -> Array:
+    """The integrals from the first point to each, of the polynomial through `values`."""
+    return _apply(_integration(values.shape[0]), values)
+
+
+def at(where: tuple[float, ...], values: Array) -> Array:
+    """The polynomial through `values` at the fractions `where`."""
+    return _apply(_evaluation(values.shape[0], where), values)
+
+
+def _apply(matrix: np.ndarray, values: Array) -> Array:
+    weights = jnp.asarray(matrix, values.dtype)
+    return jnp.tensordot(weights, values, axes=1, precision=lax.Precision.HIGHEST)
 
 
 @ft.cache
-def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The Chebyshev points of the second kind on [0, 1], and the matrix that maps values there to
-    the coefficients of the interpolating Chebyshev series."""
+def _points(count: int) -> np.ndarray:
+    n = count - 1
+    return np.sin(np.pi * np.arange(count) / (2 * n)) ** 2  # (1 - cos(pi k / n)) / 2
+
+
+@ft.cache
+def _to_coefficients(count: int) -> np.ndarray:
+    """The matrix from values at the points to the coefficients of the series."""
     n = count - 1
     index = np.arange(count)
-    fractions = np.sin(np.pi * index / (2 * n)) ** 2  # (1 - cos(pi k / n)) / 2
     # T_j at -cos(pi k / n); the sums of a type-I discrete cosine transform have halved ends.
     cosines = np.cos(np.pi * np.outer(index, n - index) / n)
     halves = np.where((index == 0) | (index == n), 0.5, 1.0)
-    return fractions, 2 / n * halves[:, None] * cosines * halves[None, :]
+    return 2 / n * halves[:, None] * cosines * halves[None, :]
+
+
+@ft.cache
+def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
+    x = 2 * np.asarray(where) - 1
+    return np.polynomial.chebyshev.chebvander(x, count - 1) @ _to_coefficients(count)
+
+
+@ft.cache
+def _integration(count: int) -> np.ndarray:
+    """Column `j` is for the polynomial that is one at point `j` and zero at the others."""
+    x = 2 * _points(count) - 1
+    # In `x` the interval is twice as long.
+    antiderivative = np.polynomial.chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
+    basis = np.polynomial.chebyshev.chebvander(x, count)
+    matrix = basis @ antiderivative @ _to_coefficients(count)
+    matrix[0] = 0.0  # exactly
+    return matrix
 
 
 def _clenshaw(coefficients: Array, x: Array) -> Array:

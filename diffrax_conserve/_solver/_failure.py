@@ -1,10 +1,5 @@
-"""Messages of failed projections, which say what failed, how far off it is, and what to do.
-
-A step reports its failure by a member of `diffrax.RESULTS`, which diffrax turns into an error where
-the solve really ends (an adaptive solver rejects the step and goes on). The members that diffrax
-has speak of implicit solvers and cannot hold a name or a number. So messages of ours, one for each
-entry of a manifold and each order of magnitude, are added to the end of its list when a solver is
-traced.
+"""Messages of failed projections, which say what failed, how far off it is, and what to do: one for
+each entry of a manifold and each order of magnitude.
 """
 
 import itertools
@@ -17,6 +12,7 @@ import optimistix as optx
 from .._custom_types import Manifold, Values
 from .._manifold import is_entry, named_entries
 from .._projection import DECADES, ProjectionInfo
+from ._results import member, register
 
 # The kinds of messages for one entry; the decades follow.
 _NONFINITE, _TOO_FAR, _FIRST_DECADE = 0, 1, 2
@@ -34,7 +30,7 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     ]
     if len(names) > _NAMED_MAX:
         names, sizes = ("manifold",), [sum(sizes)]
-    first = _register(names)
+    first = register(names, lambda: [text for name in names for text in _messages(name)])
     if first is None:
         return dfx.RESULTS.promote(info.result)
     # Written out: this is computed at every step, needed or not.
@@ -44,7 +40,7 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     unsatisfied = info.failure.decade - DECADES[0]
     kind = jnp.where(unsatisfied < 0, _TOO_FAR, _FIRST_DECADE + unsatisfied)
     kind = jnp.where(info.result == optx.RESULTS.nonfinite, _NONFINITE, kind)
-    return _member(first + _KINDS * entry + kind)
+    return member(first + _KINDS * entry + kind)
 
 
 def _messages(name: str) -> list[str]:
@@ -73,24 +69,3 @@ def _messages(name: str) -> list[str]:
         return f"`{name}` is still off by {size} of its scale. {remedy}."
 
     return [start + x for x in (nonfinite, too_far, *map(unsatisfied, DECADES))]
-
-
-# The index of the first message for the names of each manifold.
-_REGISTERED: dict[tuple[str, ...], int] = {}
-
-
-def _register(names: tuple[str, ...]) -> int | None:
-    # private: `equinox.Enumeration` has no public way to add to one. Without it the members that
-    # diffrax has must do.
-    messages = getattr(dfx.RESULTS, "_index_to_message", None)
-    if not isinstance(messages, list):
-        return None
-    if names not in _REGISTERED:
-        _REGISTERED[names] = len(messages)
-        messages.extend(message for name in names for message in _messages(name))
-    return _REGISTERED[names]
-
-
-def _member(index) -> dfx.RESULTS:
-    kind = type(dfx.RESULTS.successful)
-    return kind(index.astype(jnp.int32), dfx.RESULTS)  # pyright: ignore

@@ -1,4 +1,4 @@
-"""What the projections of a solve did, carried in the solver state."""
+"""What the projections of a solve did and where its flow map was, carried in the solver state."""
 
 import dataclasses
 from typing import Any, final
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._projection import ProjectionInfo
 from ._count_rejections import RejectionCount
+from ._outside import DomainStatistics
 
 
 @final
@@ -27,6 +28,8 @@ class ProjectionStatistics(eqx.Module):
     - `rank`: the smallest numerical rank of the constraints.
     - `num_rejected`: how many steps were rejected because their projection failed, if they were
         counted by a [`diffrax_conserve.CountRejections`][]; otherwise `None`.
+    - `domain`: a [`diffrax_conserve.DomainStatistics`][], if a `DeepONetSolver` minds its domain;
+        otherwise `None`.
     """
 
     num_projections: Int[Array, "..."]
@@ -37,6 +40,7 @@ class ProjectionStatistics(eqx.Module):
     correction: Float[Array, "..."]
     rank: Int[Array, "..."]
     num_rejected: Int[Array, "..."] | None = None
+    domain: DomainStatistics | None = None
 
     @classmethod
     def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
@@ -57,10 +61,11 @@ class ProjectionStatistics(eqx.Module):
 
 
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:
-    """What the projections of a solve did.
+    """What the projections of a solve did, and how often a learned solver was outside its domain.
 
-    They are part of the state of a `ManifoldProjection`, so diffrax must be asked to return that,
-    by `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
+    They are part of the state of a `ManifoldProjection`, and of a `DeepONetSolver` with another
+    option `outside` than `"ignore"`, so diffrax must be asked to return that, by
+    `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
 
     diffrax discards the solver state of a rejected step, so rejected steps count only in
     `sol.stats["num_rejected_steps"]`. Those that a failed projection caused can be counted by a
@@ -74,11 +79,12 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Returns:**
 
-    A [`diffrax_conserve.ProjectionStatistics`][].
+    A [`diffrax_conserve.ProjectionStatistics`][]; of a solve without projection it is all zeros but
+    for `domain`.
 
     **Raises:**
 
-    `ValueError` if `sol` holds no state of a `ManifoldProjection`.
+    `ValueError` if `sol` holds no state of either.
 
     !!! example
 
@@ -102,15 +108,24 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```
     """
     found = _instances(sol.solver_state, ProjectionStatistics)
-    if not found:
-        raise ValueError(
-            "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
-            "and with `saveat=SaveAt(..., solver_state=True)`."
-        )
+    domains = _instances(sol.solver_state, DomainStatistics)
     counts = _instances(sol.controller_state, RejectionCount)
-    if counts:
-        return dataclasses.replace(found[0], num_rejected=counts[0].count)
-    return found[0]
+    if not found and not domains:
+        raise ValueError(
+            "`sol` holds no state of a `ManifoldProjection`, nor of a `DeepONetSolver` that minds "
+            "its domain. Solve with a `ManifoldProjection`, or with a `DeepONetSolver(..., "
+            'outside="report")`, and with `saveat=SaveAt(..., solver_state=True)`.'
+        )
+    return dataclasses.replace(
+        found[0] if found else _no_projections(domains[0]),
+        num_rejected=counts[0].count if counts else None,
+        domain=domains[0] if domains else None,
+    )
+
+
+def _no_projections(domain: DomainStatistics) -> ProjectionStatistics:
+    count, size = jnp.zeros_like(domain.num_steps), jnp.zeros_like(domain.first_outside)
+    return ProjectionStatistics(count, count, count, size, size, size, count)
 
 
 def _instances(tree: Any, kind: type) -> list[Any]:

@@ -339,7 +339,7 @@ def test_arguments_that_are_refused():
         dfx.diffeqsolve(term, FOLLOW, 0.0, 1.0, 0.25, (LORENZ.y0, LORENZ.y0))
 
 
-def test_adaptive_steps_need_an_error_estimate():
+def test_a_pinn_has_no_error_estimate_for_adaptive_steps():
     controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
     with pytest.raises(RuntimeError, match="error"):
-        solve(FLOW, stepsize_controller=controller)
+        solve(FOLLOW, stepsize_controller=controller)
