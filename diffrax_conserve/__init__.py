@@ -27,6 +27,7 @@ from ._solver import DeepONetSolver as DeepONetSolver
 from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
 from ._solver import ProjectionStatistics as ProjectionStatistics
+from ._solver import RandomFeatureSolver as RandomFeatureSolver
 from ._solver import statistics as statistics
 from ._training import FitLog as FitLog
 from ._training import Recipe as Recipe

@@ -42,7 +42,7 @@ class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
 
 def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array]:
     """The coefficients for `states`, a function of the fraction of the step."""
-    fractions, matrix = _nodes(count)
+    fractions, matrix = chebyshev_points(count)
     values = jax.vmap(states)(jnp.asarray(fractions, dtype))
     return jtu.tree_map(
         lambda v: jnp.tensordot(
@@ -53,7 +53,7 @@ def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array
 
 
 @ft.cache
-def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+def chebyshev_points(count: int) -> tuple[np.ndarray, np.ndarray]:
     """The Chebyshev points of the second kind on [0, 1], and the matrix that maps values there to
     the coefficients of the interpolating Chebyshev series."""
     n = count - 1

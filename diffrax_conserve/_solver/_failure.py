@@ -1,4 +1,4 @@
-"""Messages of failed projections, which say what failed, how far off it is, and what to do.
+"""Messages of failed steps, which say what failed, how far off it is, and what to do.
 
 A step reports its failure by a member of `diffrax.RESULTS`, which diffrax turns into an error where
 the solve really ends (an adaptive solver rejects the step and goes on). The members that diffrax
@@ -13,6 +13,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
+from jaxtyping import Array, Bool
 
 from .._custom_types import Manifold, Values
 from .._manifold import is_entry, named_entries
@@ -34,7 +35,7 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     ]
     if len(names) > _NAMED_MAX:
         names, sizes = ("manifold",), [sum(sizes)]
-    first = _register(names)
+    first = _register(names, [message for name in names for message in _messages(name)])
     if first is None:
         return dfx.RESULTS.promote(info.result)
     # Written out: this is computed at every step, needed or not.
@@ -45,6 +46,24 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     kind = jnp.where(unsatisfied < 0, _TOO_FAR, _FIRST_DECADE + unsatisfied)
     kind = jnp.where(info.result == optx.RESULTS.nonfinite, _NONFINITE, kind)
     return _member(first + _KINDS * entry + kind)
+
+
+def unsolved(found: Bool[Array, ""]) -> dfx.RESULTS:
+    """The result of a step of a `RandomFeatureSolver`, by whether its equations were solved."""
+    first = _register(("RandomFeatureSolver", "equations"), [_UNSOLVED])
+    failed = (
+        dfx.RESULTS.promote(optx.RESULTS.nonlinear_max_steps_reached)
+        if first is None
+        else _member(jnp.asarray(first))
+    )
+    return dfx.RESULTS.where(found, dfx.RESULTS.successful, failed)
+
+
+_UNSOLVED = (
+    "diffrax_conserve: the equations of a step of `RandomFeatureSolver` were not solved. Newton's "
+    "method diverged, or the vector field is not finite near the step. Take smaller steps: a "
+    "smaller `dt0`, or with `diffrax.PIDController`, which tries them by itself, a smaller `dtmin`."
+)
 
 
 def _messages(name: str) -> list[str]:
@@ -75,20 +94,20 @@ def _messages(name: str) -> list[str]:
     return [start + x for x in (nonfinite, too_far, *map(unsatisfied, DECADES))]
 
 
-# The index of the first message for the names of each manifold.
+# The index of the first of the messages of each manifold or solver.
 _REGISTERED: dict[tuple[str, ...], int] = {}
 
 
-def _register(names: tuple[str, ...]) -> int | None:
+def _register(key: tuple[str, ...], new: list[str]) -> int | None:
     # private: `equinox.Enumeration` has no public way to add to one. Without it the members that
     # diffrax has must do.
     messages = getattr(dfx.RESULTS, "_index_to_message", None)
     if not isinstance(messages, list):
         return None
-    if names not in _REGISTERED:
-        _REGISTERED[names] = len(messages)
-        messages.extend(message for name in names for message in _messages(name))
-    return _REGISTERED[names]
+    if key not in _REGISTERED:
+        _REGISTERED[key] = len(messages)
+        messages.extend(new)
+    return _REGISTERED[key]
 
 
 def _member(index) -> dfx.RESULTS:
