@@ -27,7 +27,7 @@ _NEURONS = 4
 class FeatureBasis(NamedTuple):
     """Tables of an orthonormal basis `q_k` of slopes on [0, 1], the constant first.
 
-    The first `count` of its members span the solution; the others tell its error. Columns belong to
+    The first `count` of its members span the solution, all of them its error. Columns belong to
     members, rows to the Gauss points `fractions`.
     """
 
@@ -36,7 +36,7 @@ class FeatureBasis(NamedTuple):
     slopes: Float[np.ndarray, "points wide"]  # q_k
     integrals: Float[np.ndarray, "points wide"]  # of q_k, from 0
     fit: Float[np.ndarray, "wide points"]  # values to the coefficients of the least-squares fit
-    series: Float[np.ndarray, "degrees count"]  # of the integrals, as a Chebyshev series
+    series: Float[np.ndarray, "degrees wide"]  # the integrals, as Chebyshev series in 2 s - 1
 
 
 @ft.cache
@@ -53,7 +53,7 @@ def feature_basis(count: int, seed: int) -> FeatureBasis:
     fit = np.linalg.pinv(root * slopes) * root.T
 
     fractions, matrix = chebyshev_points(2 * count + 8)
-    values = legendre.legval(2 * fractions - 1, integrated[:, :count]).T
+    values = legendre.legval(2 * fractions - 1, integrated).T
     return FeatureBasis(
         count,
         (points + 1) / 2,

@@ -70,7 +70,8 @@ class StepEquations(NamedTuple):
 
 
 def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
-    """The coefficients, and whether Newton's method found them; if not, those of a straight line.
+    """The coefficients, and whether Newton's method found them; if not, zero: the state stays,
+    where the vector field is known to be finite, as derivatives of a rejected step need it.
 
     The iteration is not differentiated: the equations are, by the implicit function theorem.
     """
@@ -112,24 +113,32 @@ def _newton(
     # ways.
     carry = (jnp.asarray(True), start, jnp.asarray(False), jnp.asarray(1))
     _, coefficients, found, _ = lax.while_loop(lambda carry: carry[0], iterate, carry)
-    return jnp.where(found, coefficients, start), found.astype(start.dtype)
+    return jnp.where(found, coefficients, 0), found.astype(start.dtype)
 
 
-def end_error(equations: StepEquations, coefficients: Coefficients) -> Float[Array, " n"]:
-    """The error of the state at the end of the step, from the defect that the fit has left.
+def error(equations: StepEquations, coefficients: Coefficients) -> Coefficients:
+    """The error of the solution over the step, in the wider basis, from the defect that it leaves.
 
-    The linearised equation of the error, `e' = h ∂f/∂u e + h f - u'`, is solved in the wider basis
-    on the same points: one more linear system.
+    The linearised equation of the error, `e' = h ∂f/∂u e + h f - u'`, is solved on the same points:
+    one more linear system. Only the first member has an integral over the step, so the error at the
+    end is the first row.
     """
     states = equations.states(coefficients)
     slopes = _multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
     right = _multiply(equations.basis.fit, equations.slopes(states) - slopes)
-    return equations.solve_linear(equations.jacobians(states), right)[0]
+    return equations.solve_linear(equations.jacobians(states), right)
 
 
-def dense_series(equations: StepEquations, coefficients: Coefficients) -> Float[Array, "degrees n"]:
-    """`u` over the step, as a Chebyshev series in `2 s - 1`."""
-    return _multiply(equations.basis.series, coefficients).at[0].add(equations.y0)
+def dense_series(
+    equations: StepEquations, coefficients: Coefficients, error: Coefficients
+) -> Float[Array, "degrees n"]:
+    """`u` over the step, as a Chebyshev series in `2 s - 1`.
+
+    At the end of a step a Galerkin method is far more accurate than inside. So what is known of the
+    error inside is added, and the end is left as it is.
+    """
+    inside = error.at[0].set(0).at[: len(coefficients)].add(coefficients)
+    return _multiply(equations.basis.series, inside).at[0].add(equations.y0)
 
 
 def _multiply(table: np.ndarray, x: Array) -> Array:

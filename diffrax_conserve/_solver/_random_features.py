@@ -14,7 +14,7 @@ from .._projection import check_state
 from ._chebyshev import ChebyshevInterpolation
 from ._failure import unsolved
 from ._feature_basis import feature_basis
-from ._galerkin import StepEquations, dense_series, end_error, flatten, solve
+from ._galerkin import StepEquations, dense_series, error, flatten, solve
 from ._terms import check_ode
 
 # With fewer there is no random one, with more they are not told apart in double precision.
@@ -146,12 +146,13 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 
         equations = StepEquations(feature_basis(self.features, self.seed), increment, start)
         coefficients, found = solve(equations)
-        error = jnp.abs(end_error(equations, coefficients))
-        error = jnp.where(found & jnp.isfinite(error), error, jnp.inf)
-        series = dense_series(equations, coefficients)
+        errors = error(equations, coefficients)
+        series = dense_series(equations, coefficients, errors)
+        # The mean slope counts: the other members have a mean of zero.
+        known = found & jnp.all(jnp.isfinite(errors[0]))
         return (
-            unflatten(start + coefficients[0]),  # the other slopes have a mean of zero
-            unflatten(error),
+            unflatten(start + coefficients[0]),
+            unflatten(jnp.where(known, jnp.abs(errors[0]), jnp.inf)),
             dict(coefficients=jax.vmap(unflatten)(series)),
             None,
             unsolved(found),
