@@ -21,6 +21,7 @@ from .._custom_types import Y
 from ._feature_basis import FeatureBasis
 
 Coefficients = Float[Array, "members n"]
+Errors = Float[Array, "wide n"]
 
 # Newton's method converges quadratically, or not at all: then a shorter step is cheaper.
 _MAX_STEPS = 10
@@ -116,7 +117,7 @@ def _newton(
     return jnp.where(found, coefficients, 0), found.astype(start.dtype)
 
 
-def error(equations: StepEquations, coefficients: Coefficients) -> Coefficients:
+def error(equations: StepEquations, coefficients: Coefficients) -> Errors:
     """The error of the solution over the step, in the wider basis, from the defect that it leaves.
 
     The linearised equation of the error, `e' = h ∂f/∂u e + h f - u'`, is solved on the same points:
@@ -130,7 +131,7 @@ def error(equations: StepEquations, coefficients: Coefficients) -> Coefficients:
 
 
 def dense_series(
-    equations: StepEquations, coefficients: Coefficients, error: Coefficients
+    equations: StepEquations, coefficients: Coefficients, error: Errors
 ) -> Float[Array, "degrees n"]:
     """`u` over the step, as a Chebyshev series in `2 s - 1`.
 

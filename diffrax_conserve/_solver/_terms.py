@@ -30,7 +30,9 @@ def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
 
 def check_ode(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
     """Raises unless every term is a `diffrax.ODETerm`, whose control is time."""
-    for term in jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, dfx.AbstractTerm | WrapTerm)):
+    for term in jtu.tree_leaves(
+        terms, is_leaf=lambda x: isinstance(x, dfx.AbstractTerm | WrapTerm)
+    ):
         if isinstance(term, dfx.MultiTerm):
             check_ode(term.terms, name)
         elif isinstance(term, WrapTerm | AdjointTerm):
