@@ -42,8 +42,11 @@ class FeatureBasis(NamedTuple):
 @ft.cache
 def feature_basis(count: int, seed: int) -> FeatureBasis:
     """The basis with `count` members for the solution and half as many again for its error."""
-    wide = count + -(-count // 2)
-    members = _directions(wide, seed)
+    return tabulate(count, _directions(count + -(-count // 2), seed))
+
+
+def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureBasis:
+    """The tables of a basis that is given by its Legendre coefficients, in `2 s - 1`."""
     integrated = legendre.legint(members, lbnd=-1, axis=0) / 2
 
     points, weights = legendre.leggauss(2 * count)

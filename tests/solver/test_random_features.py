@@ -77,8 +77,7 @@ def test_target_of_the_oscillator(tol):
     assert relative_error(sol.ys, oscillation(np.asarray(ts))) <= 1e-12
 
 
-@pytest.mark.parametrize("tol", [None, 1e-12], ids=["fixed", "adaptive"])
-def test_target_of_the_rigid_body(tol):
+def test_target_of_the_rigid_body():
     """Over [0, 1.75], against Jacobi's elliptic functions."""
     system = dfc.systems.RigidBody()
     ts = jnp.linspace(0, 1.75, 36)
@@ -87,8 +86,7 @@ def test_target_of_the_rigid_body(tol):
         system.y0,
         1.75,
         solver=dfc.RandomFeatureSolver(),
-        dt0=0.5 if tol is None else None,
-        tol=tol,
+        dt0=0.5,
         saveat=dfx.SaveAt(ts=ts),
     )
     assert relative_error(sol.ys, system.solution(ts, system.y0)) <= 1e-12
@@ -104,8 +102,8 @@ def test_more_features_and_shorter_steps_are_more_accurate():
         sol = solve(oscillator, NORTH, 12.0, solver=dfc.RandomFeatureSolver(features), dt0=dt0)
         return np.max(np.abs(sol.ys[-1] - oscillation(12.0)))
 
-    errors = [error(features, 4.0) for features in (4, 6, 8, 12)]
-    assert errors[0] > 10 * errors[1] > 100 * errors[2] > 1000 * errors[3]
+    errors = [error(features, 4.0) for features in (4, 8, 12)]
+    assert errors[0] > 100 * errors[1] > 1e4 * errors[2]
     assert error(8, 4.0) > 5 * error(8, 3.0)
 
 
@@ -134,10 +132,18 @@ ONE_STEP = {
 }
 
 
-@pytest.mark.parametrize("name", ONE_STEP)
+CHEAP = [("kepler", 8), ("lorenz", 8)]
+
+
 @pytest.mark.parametrize(
-    "features",
-    [8, pytest.param(12, marks=pytest.mark.slow), pytest.param(16, marks=pytest.mark.slow)],
+    ("name", "features"),
+    CHEAP
+    + [
+        pytest.param(name, features, marks=pytest.mark.slow)
+        for name in ONE_STEP
+        for features in (8, 12, 16)
+        if (name, features) not in CHEAP
+    ],
 )
 def test_the_estimate_is_the_true_error_of_a_step(name, features):
     """Over step lengths from easy to hopeless: to a few per cent, down to 1e-12."""
@@ -244,7 +250,7 @@ def test_a_step_decays_where_the_solution_does():
     np.testing.assert_allclose(moduli[:40], 1, atol=1e-7)  # purely imaginary
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_draw_does_not_matter_to_the_tolerance(seed):
     a, b = (
         solve(lorenz, jnp.ones(3), 1.0, solver=dfc.RandomFeatureSolver(12, seed=s), tol=1e-9).ys[-1]
