@@ -27,11 +27,11 @@ _NEURONS = 4
 class FeatureBasis(NamedTuple):
     """Tables of an orthonormal basis `q_k` of slopes on [0, 1], the constant first.
 
-    The first `count` of its members span the solution, all of them its error. Columns belong to
+    The first `size` of its members span the solution, all of them its error. Columns belong to
     members, rows to the Gauss points `fractions`.
     """
 
-    count: int
+    size: int
     fractions: Float[np.ndarray, " points"]
     slopes: Float[np.ndarray, "points wide"]  # q_k
     integrals: Float[np.ndarray, "points wide"]  # of q_k, from 0

@@ -77,7 +77,7 @@ def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
     The iteration is not differentiated: the equations are, by the implicit function theorem.
     """
     slope = equations.increment(jnp.zeros((), equations.y0.dtype), equations.y0)
-    rest = jnp.zeros((equations.basis.count - 1, slope.size), slope.dtype)
+    rest = jnp.zeros((equations.basis.size - 1, slope.size), slope.dtype)
     start = jnp.concatenate([slope[None], rest])
 
     def tangent_solve(linear: Callable, right: Coefficients) -> Coefficients:

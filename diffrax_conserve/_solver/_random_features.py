@@ -38,10 +38,10 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
     $$u' = P f(t, u), \qquad P \text{ the least-squares fit by slopes of the network.}$$
 
     **Accuracy.** A step can be long: 16 features follow half a turn of an oscillator to 2e-14, a
-    whole one to 1e-12 and two to 1e-9. Where accuracy counts, or the system is stiff, this solver is fast; where
-    neither does and $f$ is cheap, an explicit method is faster. See "Learned solvers" for figures.
-    Each step solves a few dense linear systems of `features` times the size of the state, so the
-    state should be small.
+    whole one to 1e-12 and two to 1e-9. Where accuracy counts, or the system is stiff, this solver
+    is fast; where neither does and $f$ is cheap, an explicit method is faster. See "Learned
+    solvers" for figures. Each step solves a few dense linear systems of `features` times the size
+    of the state, so the state should be small.
 
     **Error estimate.** The defect that the fit leaves, carried to the end of the step by the
     linearised equation. It is the true error of the step to within some per cent, down to roundoff,
@@ -52,8 +52,8 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
     method) this keeps the energy of every canonical Hamiltonian system, $y' = J \nabla H(y)$, to
     the accuracy of the Gauss rule, which is soon that of roundoff, also where the error in the
     state is large. Linear equations stay bounded where their exact solution does (to 1e-6 a step).
-    Very stiff components are not damped; near such transients steps get short. Other integrals are kept inside
-    [`diffrax_conserve.ManifoldProjection`][].
+    Very stiff components are not damped; near such transients steps get short. Other integrals
+    are kept inside [`diffrax_conserve.ManifoldProjection`][].
 
     If Newton's method fails, an adaptive solve tries a shorter step, and one with fixed steps says
     that it failed. Dense output is the network. Derivatives, forward and reverse and of any order,
