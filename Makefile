@@ -98,10 +98,12 @@ bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/overhead.py --smoke
 	$(BIN)/python benchmarks/gradients.py --smoke
 	$(BIN)/python benchmarks/many_constraints.py --smoke
+	$(BIN)/python benchmarks/random_features.py --smoke
 
 bench-learned: $(PLOTS) ## measure what learned solvers cost
 	$(BIN)/python benchmarks/learned.py
 	$(BIN)/python benchmarks/sweeps.py
+	$(BIN)/python benchmarks/random_features.py
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.
 build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own

@@ -95,6 +95,18 @@ MUTANTS = {
         "jnp.all(flags), states",
         ("tests/projection/test_laws.py", "-k", "lane_of_a_batch"),
     ),
+    "stop the Newton iteration of random features at once": Mutant(
+        "_solver/_galerkin.py",
+        "found = size <= tolerance * jnp.max(jnp.abs(states))",
+        "found = size < jnp.inf",
+        ("tests/solver/test_random_features.py", "-k", "rigid_body"),
+    ),
+    "report unsolved equations as a success": Mutant(
+        "_solver/_random_features.py",
+        "            unsolved(found),",
+        "            unsolved(found | True),",
+        ("tests/solver/test_random_features_in_diffrax.py", "-k", "say_so"),
+    ),
 }
 
 

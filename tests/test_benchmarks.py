@@ -100,3 +100,13 @@ def test_the_papers_results_are_what_the_documentation_shows():
     paper = benchmark("paper")
     page = (FOLDER.parent / "docs" / "paper.md").read_text(encoding="utf-8")
     assert paper.table(paper.read_results()) in page
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_random_features_meets_the_targets(tmp_path):
+    out = tmp_path / "random_features.json"
+    found = benchmark("random_features").main(["--smoke", "--out", str(out)])
+    assert all(row["error"] <= 1e-12 and row["seconds"] < 1 for row in found["targets"])
+    assert all(row["okay"] and row["error"] < 1e-4 for row in found["comparison"])
+    assert found["energy"][1]["drift"]["energy"] < 1e-14 < found["energy"][0]["drift"]["energy"]
+    assert json.loads(out.read_text())["targets"] == found["targets"]

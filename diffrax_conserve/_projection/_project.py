@@ -172,12 +172,12 @@ def _problem(
     return Problem(residual, magnitude, weights, t, args, values)
 
 
-def check_state(y: Y) -> None:
-    """Raises unless every leaf of the state is a real floating-point array."""
+def check_state(y: Y, user: str = "a projection") -> None:
+    """Raises unless every leaf of the state is a real floating-point array, as `user` needs."""
     for leaf in jtu.tree_leaves(y):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise TypeError(
-                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but a projection needs "
+                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but {user} needs "
                 "real floating-point states. Split a complex leaf into its real and its imaginary "
                 "part."
             )

@@ -47,12 +47,12 @@ def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array
 
 def fractions(count: int, dtype: Any) -> Array:
     """The Chebyshev points of the second kind on [0, 1]."""
-    return jnp.asarray(_points(count), dtype)
+    return jnp.asarray(chebyshev_points(count), dtype)
 
 
 def coefficients(values: PyTree[Array]) -> PyTree[Array]:
     """Those of the Chebyshev series through `values` at all points, stacked along an axis."""
-    return jtu.tree_map(lambda v: _apply(_to_coefficients(v.shape[0]), v), values)
+    return jtu.tree_map(lambda v: _apply(to_coefficients(v.shape[0]), v), values)
 
 
 def integrals(values: Array) -> Array:
@@ -71,13 +71,13 @@ def _apply(matrix: np.ndarray, values: Array) -> Array:
 
 
 @ft.cache
-def _points(count: int) -> np.ndarray:
+def chebyshev_points(count: int) -> np.ndarray:
     n = count - 1
     return np.sin(np.pi * np.arange(count) / (2 * n)) ** 2  # (1 - cos(pi k / n)) / 2
 
 
 @ft.cache
-def _to_coefficients(count: int) -> np.ndarray:
+def to_coefficients(count: int) -> np.ndarray:
     """The matrix from values at the points to the coefficients of the series."""
     n = count - 1
     index = np.arange(count)
@@ -90,17 +90,17 @@ def _to_coefficients(count: int) -> np.ndarray:
 @ft.cache
 def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
     x = 2 * np.asarray(where) - 1
-    return np.polynomial.chebyshev.chebvander(x, count - 1) @ _to_coefficients(count)
+    return np.polynomial.chebyshev.chebvander(x, count - 1) @ to_coefficients(count)
 
 
 @ft.cache
 def _integration(count: int) -> np.ndarray:
     """Column `j` is for the polynomial that is one at point `j` and zero at the others."""
-    x = 2 * _points(count) - 1
+    x = 2 * chebyshev_points(count) - 1
     # In `x` the interval is twice as long.
     antiderivative = np.polynomial.chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
     basis = np.polynomial.chebyshev.chebvander(x, count)
-    matrix = basis @ antiderivative @ _to_coefficients(count)
+    matrix = basis @ antiderivative @ to_coefficients(count)
     matrix[0] = 0.0  # exactly
     return matrix
 

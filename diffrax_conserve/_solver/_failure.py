@@ -1,5 +1,5 @@
-"""Messages of failed projections, which say what failed, how far off it is, and what to do: one for
-each entry of a manifold and each order of magnitude.
+"""Messages of failed steps, which say what failed, how far off it is, and what to do: of a failed
+projection one for each entry of a manifold and each order of magnitude.
 """
 
 import itertools
@@ -8,6 +8,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
+from jaxtyping import Array, Bool
 
 from .._custom_types import Manifold, Values
 from .._manifold import is_entry, named_entries
@@ -41,6 +42,24 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     kind = jnp.where(unsatisfied < 0, _TOO_FAR, _FIRST_DECADE + unsatisfied)
     kind = jnp.where(info.result == optx.RESULTS.nonfinite, _NONFINITE, kind)
     return member(first + _KINDS * entry + kind)
+
+
+def unsolved(found: Bool[Array, ""]) -> dfx.RESULTS:
+    """The result of a step of a `RandomFeatureSolver`, by whether its equations were solved."""
+    first = register("RandomFeatureSolver", lambda: [_UNSOLVED])
+    failed = (
+        dfx.RESULTS.promote(optx.RESULTS.nonlinear_max_steps_reached)
+        if first is None
+        else member(first)
+    )
+    return dfx.RESULTS.where(found, dfx.RESULTS.successful, failed)
+
+
+_UNSOLVED = (
+    "diffrax_conserve: the equations of a step of `RandomFeatureSolver` were not solved. Newton's "
+    "method diverged, or the vector field is not finite near the step. Take smaller steps: a "
+    "smaller `dt0`, or with `diffrax.PIDController`, which tries them by itself, a smaller `dtmin`."
+)
 
 
 def _messages(name: str) -> list[str]:

@@ -28,5 +28,22 @@ def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
     return any(isinstance(x, AdjointTerm) for x in inner)
 
 
+def check_ode(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
+    """Raises unless every term is a `diffrax.ODETerm`, whose control is time."""
+    for term in jtu.tree_leaves(
+        terms, is_leaf=lambda x: isinstance(x, dfx.AbstractTerm | WrapTerm)
+    ):
+        if isinstance(term, dfx.MultiTerm):
+            check_ode(term.terms, name)
+        elif isinstance(term, WrapTerm | AdjointTerm):
+            check_ode(term.term, name)
+        elif not isinstance(term, dfx.ODETerm):
+            raise TypeError(
+                f"`{name}` solves ordinary differential equations, but is given a "
+                f"`{type(term).__name__}`. Pass a `diffrax.ODETerm`; for a stochastic equation "
+                "take a solver of diffrax, for example `diffrax.Heun()`."
+            )
+
+
 def _leaves(terms: PyTree[dfx.AbstractTerm], kind: type) -> list[Any]:
     return jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, kind))
