@@ -139,5 +139,6 @@ def linear_weights(model: Any) -> Any:
         return net.weights[-1], net.biases[-1]
 
     nothing = jtu.tree_map(lambda _: False, model)
-    known = isinstance(model, Window | DeepONet)
+    # With a conservative layer after it, the output is not linear in the last layer.
+    known = isinstance(model, Window | DeepONet) and model.layer is None
     return eqx.tree_at(last_layer, nothing, (True, True)) if known else nothing

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._tree import tree_all_finite
@@ -17,7 +17,7 @@ from .._tree import tree_all_finite
 
 def reachable_states(
     vector_field: Callable[[RealScalarLike, Any, Args], Any],
-    y0s: Y,
+    y0s: PyTree[ArrayLike],
     duration: RealScalarLike,
     *,
     key: PRNGKeyArray,
@@ -25,7 +25,7 @@ def reachable_states(
     keep: Callable[[Any], Bool[Array, ""]] | None = None,
     solver: dfx.AbstractSolver | None = None,
     dt0: RealScalarLike | None = None,
-) -> Y:
+) -> PyTree[Array]:
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
     A flow map is stepped from where its last step ended, so it must be trained there. The region
@@ -86,7 +86,7 @@ def reachable_states(
             y0,
             args,
             stepsize_controller=controller,
-            max_steps=None,
+            max_steps=_MAX_STEPS,
             adjoint=dfx.ForwardMode(),
             throw=False,
         )
@@ -101,6 +101,10 @@ def reachable_states(
             "`duration`, or give another `solver`."
         )
     return jtu.tree_map(lambda x: x[good], ys)
+
+
+# Where a solution ends in finite time, the steps towards its end would never end.
+_MAX_STEPS = 10_000
 
 
 @final
