@@ -210,15 +210,16 @@ def pretrained_path(name: str) -> Path:
 
 
 def load_pretrained(name: str) -> PINN | DeepONet:
-    """A network that comes with the package, trained by the paper's recipe.
+    """A network that comes with the package.
 
-    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`, the
-    latter with a conservative layer. [`diffrax_conserve.read_info`][] tells the command that made
-    it and its measured errors.
+    For each of the paper's five systems there are `SYSTEM`, small and trained by
+    [`diffrax_conserve.second_order`][], and, trained by the paper's recipe, `SYSTEM-standard` and
+    `SYSTEM-conservative`, the latter with a conservative layer. [`diffrax_conserve.read_info`][]
+    tells the command that made it and its measured errors.
 
     **Arguments:**
 
-    - `name`: such as `"rigid-body-conservative"`.
+    - `name`: such as `"rigid-body"` or `"rigid-body-conservative"`.
 
     **Raises:**
 
@@ -229,7 +230,7 @@ def load_pretrained(name: str) -> PINN | DeepONet:
         ```python
         import diffrax_conserve as dfc
 
-        pinn = dfc.load_pretrained("rigid-body-conservative")
+        pinn = dfc.load_pretrained("rigid-body")
         pinn(1.0)
         ```
     """

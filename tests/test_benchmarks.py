@@ -87,6 +87,19 @@ def test_a_smoke_run_of_the_sweeps(capsys):
 
 
 @pytest.mark.slow
+def test_a_smoke_run_of_the_zoo():
+    pinn, flow_map = benchmark("zoo").main(["--smoke"])
+    assert pinn["errors"]["projected"]["relative_l2_error"] < 1
+    assert flow_map["errors"]["RK4"]["one_step_rms"] < flow_map["errors"]["plain"]["one_step_rms"]
+    assert all(x["ns_per_step"] > 0 for x in flow_map["errors"].values())
+
+
+def test_the_zoos_results_are_what_the_documentation_shows():
+    zoo = benchmark("zoo")
+    page = (FOLDER.parent / "docs" / "zoo.md").read_text(encoding="utf-8")
+    assert zoo.tables(zoo.read_results()) in page
+
+
 def test_a_smoke_run_of_the_paper():
     standard, conservative = benchmark("paper").main(["--smoke"])
     assert standard["plain"]["drift"] > 1e-6

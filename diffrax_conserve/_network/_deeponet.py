@@ -1,6 +1,6 @@
 """A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
 
-from typing import Literal, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -17,7 +17,6 @@ from ._layer import ConservativeLayer
 from ._mlp import Activation, check_sizes
 from ._taylor import Taylor
 
-Inputs = Literal["product", "concatenated", "gated"]
 _CORES = {"concatenated": Concatenated, "gated": Gated}
 
 
@@ -76,7 +75,7 @@ class DeepONet(eqx.Module):
         width: int = 40,
         depth: int = 4,
         latent: int = 20,
-        inputs: Inputs = "product",
+        inputs: str = "product",
         activation: str | Activation = "tanh",
         normalise: bool = True,
         taylor: Taylor | None = None,

@@ -1,0 +1,162 @@
+"""The parts of a flow map beyond branch times trunk, and the windows of a PINN."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import EAST, LORENZ, RADIUS, flow_map, oscillator, solution
+
+KINDS = ("product", "concatenated", "gated")
+
+
+# ---- The Taylor polynomial ----
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_the_polynomial_of_a_linear_system(order):
+    matrix = jr.normal(jr.key(0), (3, 3))
+    taylor = dfc.Taylor(lambda t, y, args: args * (matrix @ y), order, args=2.0)
+    y0, h = jnp.array([1.0, -2.0, 0.5]), 0.3
+    expected, term = np.asarray(y0), np.asarray(y0)
+    for j in range(1, order + 1):
+        term = 2 * h / j * (np.asarray(matrix) @ term)
+        expected = expected + term
+    np.testing.assert_allclose(taylor(y0, h), expected, rtol=1e-14)
+
+
+def test_the_polynomial_of_any_state():
+    y0 = {"a": jnp.array(1.0), "b": (jnp.ones(2, jnp.float32),)}
+    taylor = dfc.Taylor(lambda t, y, args: jax.tree.map(lambda x: -x, y), 3)
+    y = taylor(y0, 0.1)
+    assert y["b"][0].dtype == jnp.float32
+    np.testing.assert_allclose(y["a"], 1 - 0.1 + 0.1**2 / 2 - 0.1**3 / 6, rtol=1e-15)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2, 3])
+@pytest.mark.parametrize("inputs", KINDS)
+def test_untrained_it_has_the_order_of_its_polynomial(inputs, order):
+    taylor = dfc.Taylor(LORENZ.vector_field, order) if order else None
+    network = flow_map(inputs=inputs, taylor=taylor)
+    assert network.order == order
+    steps = 0.02 / 2.0 ** np.arange(3)
+    exact = LORENZ.reference(jnp.asarray(steps[::-1]))[::-1]
+    errors = [jnp.linalg.norm(network(LORENZ.y0, h) - y) for h, y in zip(steps, exact, strict=True)]
+    slopes = np.diff(np.log2(np.asarray(errors)))
+    np.testing.assert_allclose(slopes, -(order + 1), atol=0.15)
+
+
+def test_its_solver_has_that_order_too():
+    solver = dfc.DeepONetSolver(flow_map(taylor=dfc.Taylor(LORENZ.vector_field, 2)))
+    assert solver.order(dfx.ODETerm(LORENZ.vector_field)) == 2
+
+
+def test_a_wrong_polynomial():
+    with pytest.raises(ValueError, match="`order` must be a positive integer"):
+        dfc.Taylor(oscillator, 0)
+
+
+# ---- The networks ----
+
+
+def test_concatenated_inputs():
+    network = flow_map(inputs="concatenated")
+    h = 0.2
+    x = jnp.append((LORENZ.y0 - network.shift) / network.scale, 2 * h / 0.25 - 1)
+    first, second, last = network.core.net.weights
+    z = jnp.tanh(jnp.tanh(x @ first) @ second) @ last
+    np.testing.assert_allclose(
+        network(LORENZ.y0, h), LORENZ.y0 + 0.8 * network.scale * z, rtol=1e-14
+    )
+
+
+def test_gated_inputs():
+    network = flow_map(inputs="gated", depth=3)
+    core = network.core
+    assert len(core.hidden) == 3
+    x = jnp.append(jnp.array([0.3, -0.2, 0.5]), 0.1)
+    a, b = (jnp.tanh(x @ encoder.weights[0]) for encoder in core.encoders)
+    z = x
+    for layer in core.hidden:
+        gate = jnp.tanh(z @ layer.weights[0])
+        z = gate * a + (1 - gate) * b
+    expected = z @ core.last.weights[0]
+    np.testing.assert_allclose(core(x[:3], x[3]), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("inputs", KINDS)
+def test_every_kind_starts_at_its_state(inputs):
+    network = flow_map(inputs=inputs, taylor=dfc.Taylor(LORENZ.vector_field))
+    np.testing.assert_array_equal(network(LORENZ.y0, 0.0), LORENZ.y0)
+    slope = jax.jacfwd(lambda h: network(LORENZ.y0, h))(0.0)
+    np.testing.assert_allclose(slope, LORENZ.vector_field(0.0, LORENZ.y0, None), rtol=1e-14)
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(ValueError, match="`inputs` is 'both'"):
+        flow_map(inputs="both")
+
+
+def test_its_domain_is_the_box_round_its_states():
+    states = jnp.array([[0.0, 1.0], [2.0, -1.0]])
+    domain = dfc.DeepONet(states, 1.0, width=4, depth=1, key=jr.key(0)).domain
+    assert domain.contains(jnp.array([1.0, 0.0]))
+    assert not domain.contains(jnp.array([1.0, 1.5]))
+
+
+# ---- Windows ----
+
+
+def test_a_pinn_of_windows_follows_them():
+    pinn = solution(t1=3.0, windows=3)
+    assert pinn.windows == 3
+    states = jax.vmap(LORENZ.sample)(jr.split(jr.key(0), 3))
+    pinn = eqx.tree_at(lambda p: p.y0s, pinn, states)
+    for t, k in [(0.0, 0), (0.5, 0), (1.0, 1), (1.9, 1), (2.0, 2), (3.0, 2)]:
+        np.testing.assert_array_equal(pinn(t), pinn.window(k)(t))
+        np.testing.assert_allclose(eqx.filter_jit(pinn)(t), pinn.window(k)(t), atol=1e-14)
+    for k in range(3):
+        np.testing.assert_array_equal(pinn.window(k)(float(k)), states[k])
+    np.testing.assert_array_equal(pinn.y0, states[0])
+
+
+def test_each_window_has_weights_of_its_own():
+    nets = solution(windows=3).nets
+    first = nets.weights[0]
+    assert not np.allclose(first[0], first[1])
+
+
+@pytest.mark.parametrize("wrong", [dict(windows=0), dict(slope=-1.0)])
+def test_wrong_windows_are_named(wrong):
+    with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must be"):
+        solution(**wrong)
+
+
+def test_the_units_of_a_first_layer_are_spread_over_the_interval():
+    pinn = dfc.PINN(EAST, 0.0, 1.0, width=500, depth=1, slope=2.0, key=jr.key(0))
+    net = pinn.window(0).net
+    slopes, centres = net.weights[0][0], -net.biases[0] / net.weights[0][0]
+    np.testing.assert_allclose(jnp.std(slopes), 2, rtol=0.1)
+    np.testing.assert_allclose(jnp.quantile(centres, jnp.array([0, 0.5, 1])), [-1, 0, 1], atol=0.1)
+
+
+def test_a_solve_across_windows():
+    pinn = dfc.PINN(EAST, 0.0, 4.0, windows=2, width=8, depth=1, slope=2.0, key=jr.key(0))
+    end = pinn.window(0)(2.0)
+    pinn = eqx.tree_at(lambda p: p.y0s, pinn, jnp.stack([EAST, end]))
+    ts = jnp.linspace(0, 4, 9)
+
+    def solve(solver):
+        return dfx.diffeqsolve(
+            dfx.ODETerm(oscillator), solver, 0.0, 4.0, 0.4, EAST, saveat=dfx.SaveAt(ts=ts)
+        ).ys
+
+    plain = dfc.PINNSolver(pinn)
+    np.testing.assert_allclose(solve(plain), jax.vmap(pinn)(ts), atol=1e-8)
+    projected = solve(dfc.ManifoldProjection(plain, RADIUS, projection=dfc.Newton()))
+    np.testing.assert_allclose(jnp.sum(projected**2, axis=1), 1, rtol=4e-15)
