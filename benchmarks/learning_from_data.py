@@ -251,18 +251,18 @@ def median(runs):
 
 
 def table(found):
-    """What the documentation shows."""
+    """The lines of the tables that the documentation shows."""
     marks = list(next(iter(found["unknown"].values()))["plain"]["error"])
     head = " | ".join(f"error, t = {t}" for t in marks)
-    yield f"| trained, data | solved | {head} | drift |"
-    yield "|---|---|" + "---|" * (len(marks) + 1)
+    yield f"| noise | trained | solved | {head} | largest | drift |"
+    yield "|---|---|---|" + "---|" * (len(marks) + 2)
     for noise, trainings in found["known"].items():
         for training, entry in trainings.items():
             for name, row in entry["solved"].items():
-                yield f"| {training}, noise {noise} | {name} | {cells(row)} |"
+                yield f"| {noise} | {training} | {name} | {cells(row)} |"
     yield ""
-    yield f"| solver | projected on | {head} | drift |"
-    yield "|---|---|" + "---|" * (len(marks) + 1)
+    yield f"| solver | projected on | {head} | largest | drift |"
+    yield "|---|---|" + "---|" * (len(marks) + 2)
     for solver, rows in found["unknown"].items():
         for name, row in rows.items():
             kind = "nothing" if name == "plain" else f"the {name}"
@@ -270,7 +270,8 @@ def table(found):
 
 
 def cells(row):
-    return " | ".join(f"{x:.1e}" for x in (*row["error"].values(), row["drift"]))
+    numbers = (*row["error"].values(), row["largest error"], row["drift"])
+    return " | ".join(f"{x:.1e}" for x in numbers)
 
 
 def main(argv=None):
