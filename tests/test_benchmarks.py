@@ -123,3 +123,21 @@ def test_a_smoke_run_of_random_features_meets_the_targets(tmp_path):
     assert all(row["okay"] and row["error"] < 1e-4 for row in found["comparison"])
     assert found["energy"][1]["drift"]["energy"] < 1e-14 < found["energy"][0]["drift"]["energy"]
     assert json.loads(out.read_text())["targets"] == found["targets"]
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_learning_from_data():
+    found = benchmark("learning_from_data").main(["--smoke"])
+    known = found["known"]["0.01"]["plain"]["solved"]
+    assert known["projected"]["drift"] < 1e-14 < 1e-6 < known["plain"]["drift"]
+    unknown = found["unknown"]["learned field"]
+    assert unknown["true integral"]["drift"] < 1e-14 < 1e-6 < unknown["plain"]["drift"]
+    assert all(row["failed"] == 0 for row in (*known.values(), *unknown.values()))
+
+
+def test_the_results_of_learning_from_data_are_what_the_documentation_shows():
+    learning = benchmark("learning_from_data")
+    page = (FOLDER.parent / "docs" / "learning-from-data.md").read_text(encoding="utf-8")
+    lines = list(learning.table(json.loads(learning.OUT.read_text())))
+    assert len(lines) > 20
+    assert [line for line in lines if line not in page] == []

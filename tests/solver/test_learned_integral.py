@@ -1,0 +1,76 @@
+"""A first integral that is a network: conserved, transformed and differentiated like any other."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+from ..problems import OMEGA0, largest, rigid_body, solve
+
+
+class NetworkIntegral(eqx.Module):
+    """Some smooth function of the state; no solution keeps it, so each projection has work."""
+
+    net: eqx.nn.MLP
+
+    def __init__(self, key):
+        self.net = eqx.nn.MLP(3, "scalar", 6, 1, jnp.tanh, key=key)
+
+    def __call__(self, t, y, args):
+        del t, args
+        return self.net(y)
+
+
+NETWORK = NetworkIntegral(jr.key(3))
+TIMES = jnp.array([0.0, 0.13, 0.4])
+
+
+def states(network, y0):
+    solver = dfc.ManifoldProjection(dfc.RK4(), {"learned": dfc.FirstIntegral(network)})
+    saveat = dfx.SaveAt(ts=TIMES)
+    return solve(rigid_body, solver, y0, t1=0.4, saveat=saveat, max_steps=8)
+
+
+@eqx.filter_jit
+def compiled(network, y0):
+    return states(network, y0)
+
+
+def test_its_value_is_kept_under_jit_and_without():
+    manifold = {"learned": dfc.FirstIntegral(NETWORK)}
+    plain = solve(rigid_body, dfc.RK4(), OMEGA0, t1=0.4, saveat=dfx.SaveAt(ts=TIMES))
+    sol = compiled(NETWORK, OMEGA0)
+    assert largest(dfc.drift(sol, manifold)) < 1e-14 < 1e-6 < largest(dfc.drift(plain, manifold))
+    np.testing.assert_allclose(sol.ys, states(NETWORK, OMEGA0).ys, rtol=1e-13)
+
+
+def test_one_network_of_a_batch_equals_that_network_alone():
+    networks = eqx.filter_vmap(NetworkIntegral)(jr.split(jr.key(4), 3))
+    batch = eqx.filter_jit(eqx.filter_vmap(states, in_axes=(eqx.if_array(0), None)))
+    together = batch(networks, OMEGA0).ys
+    for index in range(3):
+        weights, static = eqx.partition(networks, eqx.is_array)
+        alone = eqx.combine(jax.tree.map(lambda x: x[index], weights), static)  # noqa: B023
+        np.testing.assert_allclose(together[index], compiled(alone, OMEGA0).ys, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [dfc.SimplifiedNewton(), pytest.param(dfc.Newton(), marks=pytest.mark.slow)],
+    ids=["simplified", "newton"],
+)
+def test_gradients_with_respect_to_its_weights(projection):
+    """Against finite differences; the first test shows that there is something to correct."""
+
+    def final(network, y0):
+        manifold = {"learned": dfc.FirstIntegral(network)}
+        solver = dfc.ManifoldProjection(dfc.RK4(), manifold, projection=projection)
+        return solve(rigid_body, solver, y0, t1=0.3, max_steps=4).ys[-1]
+
+    dct.assert_gradients(final, NETWORK, OMEGA0, atol=1e-10, forward=False)
