@@ -14,7 +14,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve._solver._results import _position, _texts
 
-from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, flow_map, oscillator, states
+from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, oscillator, states
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
@@ -304,16 +304,6 @@ def test_float32():
 
 
 # ---- What is refused ----
-
-
-class Still(eqx.Module):
-    """A flow map without a domain."""
-
-    max_step: float = eqx.field(static=True, default=0.25)
-
-    def __call__(self, y0, h):
-        del h
-        return y0
 
 
 @pytest.mark.parametrize("outside", ["report", "fail", dfx.Tsit5()])
