@@ -212,10 +212,10 @@ def pretrained_path(name: str) -> Path:
 def load_pretrained(name: str) -> PINN | DeepONet:
     """A network that comes with the package.
 
-    For each of the paper's five systems there are `SYSTEM`, small and trained by
-    [`diffrax_conserve.second_order`][], and, trained by the paper's recipe, `SYSTEM-standard` and
-    `SYSTEM-conservative`, the latter with a conservative layer. [`diffrax_conserve.read_info`][]
-    tells the command that made it and its measured errors.
+    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
+    trained by the paper's recipe, the latter with a conservative layer; and for all but the
+    vortices `SYSTEM`, small and trained by [`diffrax_conserve.second_order`][].
+    [`diffrax_conserve.read_info`][] tells the command that made it and its measured errors.
 
     **Arguments:**
 
