@@ -124,7 +124,9 @@ def test_the_estimate_is_the_true_error_of_a_step(name, features):
     assert np.all((ratios > 0.7) & (ratios < 1.5))
 
 
-@pytest.mark.parametrize(("name", "t1"), [("kepler", 10.0), ("lorenz", 2.0)])
+@pytest.mark.parametrize(
+    ("name", "t1"), [pytest.param("kepler", 10.0, marks=pytest.mark.slow), ("lorenz", 2.0)]
+)
 def test_the_error_of_an_adaptive_solve_follows_the_tolerance(name, t1):
     vector_field, y0, _ = ONE_STEP[name]
     final = solve(vector_field, y0, t1, solver=dfx.Dopri8(), dt0=t1 / 1e4, max_steps=10_001).ys[-1]

@@ -175,6 +175,7 @@ def test_gradient_with_respect_to_what_the_vector_field_closes_over():
     np.testing.assert_allclose(jax.grad(final)(0.5), np.exp(0.5), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_solve_with_rejected_steps_is_finite():
     def final(rate):
         sol = solve(lambda t, y, args: rate * y**2, jnp.array(1.0), 0.9, dt0=0.9, tol=1e-8)

@@ -61,7 +61,9 @@ def error(pinn):
 # ---- It learns ----
 
 
-@pytest.mark.parametrize("layer", [None, LAYER], ids=["standard", "conservative"])
+@pytest.mark.parametrize(
+    "layer", [pytest.param(None, marks=pytest.mark.slow), LAYER], ids=["standard", "conservative"]
+)
 def test_a_pinn_learns_a_solution(layer):
     before = circle(layer)
     after, log = train(before, epochs=300, optimiser=optax.adam(5e-3))
