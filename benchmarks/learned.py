@@ -20,7 +20,7 @@ import jax.random as jr
 
 import diffrax_conserve as dfc
 from diffrax_conserve._reproduce._learned import KINDS, build, is_flow_map, is_learned
-from diffrax_conserve._training._defect import defects, draw, trainable
+from diffrax_conserve._training._defect import defects, draw, squared_norms, trainable
 
 OUT = Path(__file__).parent / "results" / "learned.json"
 SYSTEMS = [name for name in dfc.systems.names() if is_learned(dfc.systems.get(name))]
@@ -59,7 +59,7 @@ def epoch(system, kind, points):
         def loss(weights):
             model = eqx.combine(weights, static)
             vectors = defects(model, system.vector_field, None, batch, p, s)
-            return jnp.mean(jnp.sum(jnp.square(vectors), axis=1))
+            return jnp.mean(squared_norms(vectors))
 
         return jax.value_and_grad(loss)(weights)
 

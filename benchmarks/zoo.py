@@ -83,9 +83,7 @@ SMOKE = {
 
 
 def initial_states(system, spec, count, seed):
-    sample = system.sample
-    draw = jax.jit(jax.vmap(sample))
-    y0s = draw(jr.split(jr.key(seed), count))
+    y0s = jax.jit(jax.vmap(system.sample))(jr.split(jr.key(seed), count))
     return y0s if spec.keep is None else y0s[jax.vmap(spec.keep)(y0s)]
 
 
@@ -111,7 +109,7 @@ def train(system, spec, seed):
             width=spec.width, depth=spec.depth, inputs=spec.inputs, taylor=taylor, key=key,
         )  # fmt: skip
         recipe = dfc.second_order(network, epochs=spec.epochs)
-        recipe = eqx.tree_at(lambda r: r.points, recipe, spec.points)
+        recipe = dataclasses.replace(recipe, points=spec.points)
         network, log = dfc.fit(
             network, system.vector_field,
             key=key, sample=dfc.from_states(pool), recipe=recipe, progress=True,

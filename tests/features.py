@@ -7,6 +7,8 @@ import numpy as np
 
 import diffrax_conserve as dfc
 
+from .learned import oscillator as oscillator
+
 EIGHT = dfc.RandomFeatureSolver(8)
 
 
@@ -16,10 +18,6 @@ def solve(vector_field, y0, t1, *, solver=EIGHT, t0=0.0, dt0=None, tol=None, arg
         kwargs["stepsize_controller"] = dfx.PIDController(rtol=tol, atol=tol)
     kwargs.setdefault("max_steps", 512)
     return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs)
-
-
-def oscillator(t, y, args):
-    return jnp.stack([y[1], -y[0]])
 
 
 NORTH = jnp.array([1.0, 0.3])

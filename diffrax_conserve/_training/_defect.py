@@ -97,16 +97,17 @@ def typical_square(
     """The median of `|f|²` over the initial states."""
     if isinstance(model, Window):
         y0s = jtu.tree_map(lambda x: x[None], model.y0)
-        return _squared_norms(_field(vector_field, args, model.start[None], y0s))[0]
+        return squared_norms(_field(vector_field, args, model.start[None], y0s))[0]
     ts = jnp.zeros_like(points.ts)
-    return jnp.median(_squared_norms(_field(vector_field, args, ts, points.y0s)))
+    return jnp.median(squared_norms(_field(vector_field, args, ts, points.y0s)))
 
 
 def _field(vector_field: VectorField, args: Args, ts: Array, ys: Y) -> Y:
     return jax.vmap(vector_field, in_axes=(0, 0, None))(ts, ys, args)
 
 
-def _squared_norms(vectors: Y) -> Float[Array, " points"]:
+def squared_norms(vectors: Y) -> Float[Array, " points"]:
+    """Of vectors that are stacked along a leading axis, in each leaf."""
     leaves = [jnp.square(x).reshape(x.shape[0], -1) for x in jtu.tree_leaves(vectors)]
     return sum(jnp.sum(x, axis=1) for x in leaves)  # pyright: ignore
 

@@ -22,6 +22,7 @@ from ._defect import (
     draw,
     layer_of,
     linear_weights,
+    squared_norms,
     trainable,
     typical_square,
 )
@@ -61,7 +62,7 @@ class Problem(eqx.Module):
 
     def loss(self, weights: Any, points: Points, p: Array, s: Array) -> Float[Array, ""]:
         vectors = self.defects(weights, points, p, s)
-        return self.recipe.loss(jnp.sum(jnp.square(vectors), axis=1), self.typical)
+        return self.recipe.loss(squared_norms(vectors), self.typical)
 
     def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss of what the trained model will compute."""
@@ -92,14 +93,15 @@ def start(
     recipe: Recipe,
 ) -> tuple[Problem, Carry]:
     points_key, key = jr.split(key)
-    weights, static = eqx.partition(model, trainable(model))
+    trained = trainable(model)
+    weights, static = eqx.partition(model, trained)
     points = draw(model, recipe.times, sample, recipe.points, points_key)
     optimiser = recipe.optimiser
     if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
         clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
         optimiser = optax.chain(clip, optimiser)
     typical = typical_square(model, vector_field, args, points)
-    last = eqx.filter(linear_weights(model), trainable(model))
+    last = eqx.filter(linear_weights(model), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     problem = Problem(
         static, vector_field, args, sample, recipe, optimiser, points, typical, linear, key

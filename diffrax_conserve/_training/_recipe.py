@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
-import jax
 import optax
 from jaxtyping import Array
 
 from .._network import PINN
+from .._tree import tree_size
 from ._loss import Loss, bounded, mean_square
 from ._sampling import Times, grid_times, uniform_times
 from ._schedule import every_iteration, ramped_weight, staged_iterations
@@ -86,7 +86,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     - `epochs`: as of [`diffrax_conserve.Recipe`][]: the error falls with it until the network is
         as good as it can be.
     """
-    if isinstance(model, PINN) and _size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
+    if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
         return Recipe(
             epochs=epochs or 40,
             points=120,
@@ -103,10 +103,6 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
         refresh=1,
         check_every=20,
     )
-
-
-def _size(net: eqx.Module) -> int:
-    return sum(x.size for x in jax.tree_util.tree_leaves(eqx.filter(net, eqx.is_array)))
 
 
 # Its QR factorisation of so many columns takes about as long as SPRING's Cholesky one.

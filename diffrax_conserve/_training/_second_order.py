@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import RealScalarLike
+from ._defect import squared_norms
 from ._loss import Loss
 
 
@@ -33,14 +34,14 @@ class LeastSquares(NamedTuple):
     typical: Float[Array, ""]
 
     def value(self, defects: Float[Array, "points n"]) -> Float[Array, ""]:
-        return self.loss(jnp.sum(jnp.square(defects), axis=1), self.typical)
+        return self.loss(squared_norms(defects), self.typical)
 
     def rows(
         self, weights: Float[Array, " weights"]
     ) -> tuple[Float[Array, " rows"], Float[Array, "rows weights"], Float[Array, ""]]:
         """`r`, `J` and the loss, with every point weighted for the loss."""
         defects = self.defects(weights)
-        squares = jnp.sum(jnp.square(defects), axis=1)
+        squares = squared_norms(defects)
         loss, importance = jax.value_and_grad(self.loss)(squares, self.typical)
         root = jnp.sqrt(jnp.maximum(importance, 0))
         jacobian = root[:, None, None] * self.jacobian(weights)
