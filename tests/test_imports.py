@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _TREE = _TYPES | {"_tree"}
 _MANIFOLD = _TREE | {"_manifold"}
-_PROJECTION = _MANIFOLD | {"_projection"}
+_PROJECTION = _MANIFOLD | {"_scalars", "_projection"}
 _INTERPOLATION = _PROJECTION | {"_interpolation"}
 # The learned side: a network is wrapped by a solver, and trained by what lies above the solvers.
 _NETWORK = _PROJECTION | {"_network"}
@@ -31,9 +31,10 @@ MAY_IMPORT = {
     "_custom_types": set(),
     "_files": set(),
     "_tree": _TYPES,
+    "_scalars": _TYPES,
     "_manifold": _TREE,
     "_check": _MANIFOLD,
-    "_projection": _MANIFOLD,
+    "_projection": _MANIFOLD | {"_scalars"},
     "_interpolation": _PROJECTION,
     "_network": _PROJECTION,
     "_solver": _INTERPOLATION | {"_network"},

@@ -18,22 +18,26 @@ from ._jacobian import AbstractJacobian, Residual
 
 
 class Failure(eqx.Module):
-    """The constraint with the largest relative residual after a projection that failed.
+    """The constraint with the largest relative residual after a projection that failed, and why.
+
+    All in one number, so that a solver carries no more than that from step to step.
 
     **Attributes:**
 
-    - `index`: its position among the scalar constraints, in the order in which the manifold is
-        flattened; 0 if the projection succeeded.
+    - `code`: 0 if the projection succeeded.
+    - `index`: the position of the constraint among the scalar ones, in the order in which the
+        manifold is flattened; 0 if the projection succeeded.
     - `decade`: the order of magnitude of its residual relative to its scale, `⌊log10⌋`, from -16
         to 3, beyond which it is cut off; -17 if the projection succeeded.
+    - `nonfinite`: whether the candidate or its residual was not finite.
+    - `result`: an `optimistix.RESULTS`.
     """
 
-    index: Int[Array, ""]
-    decade: Int[Array, ""]
+    code: Int[Array, ""]
 
     @classmethod
     def none(cls) -> "Failure":
-        return cls(jnp.asarray(0), jnp.asarray(DECADES[0] - 1))
+        return cls(jnp.asarray(0, jnp.int32))
 
     @classmethod
     def of(
@@ -45,13 +49,43 @@ class Failure(eqx.Module):
         smaller = jnp.minimum(*relative)
         index = jnp.argmax(smaller)
         bounded = jnp.clip(smaller[index], 10.0 ** DECADES[0], 10.0 ** DECADES[-1])
-        return cls(index, jnp.floor(jnp.log10(bounded)).astype(int))
+        decade = jnp.floor(jnp.log10(bounded)).astype(int) - DECADES[0]
+        unsatisfied = jnp.where(tree_all_finite(after), _UNSATISFIED, _DIVERGED)
+        reason = jnp.where(tree_all_finite(before), unsatisfied, _NONFINITE)
+        code = reason | decade << _REASON_BITS | index << _REASON_BITS + _DECADE_BITS
+        return cls(code.astype(jnp.int32))
 
     def unless(self, success: Bool[Array, ""]) -> "Failure":
-        return jtu.tree_map(lambda a, b: jnp.where(success, a, b), Failure.none(), self)
+        return Failure(jnp.where(success, 0, self.code))
+
+    @property
+    def index(self) -> Int[Array, ""]:
+        return self.code >> _REASON_BITS + _DECADE_BITS
+
+    @property
+    def decade(self) -> Int[Array, ""]:
+        decade = self.code >> _REASON_BITS & (1 << _DECADE_BITS) - 1
+        return jnp.where(self.code == 0, -1, decade) + DECADES[0]
+
+    @property
+    def nonfinite(self) -> Bool[Array, ""]:
+        return self._reason == _NONFINITE
+
+    @property
+    def result(self) -> optx.RESULTS:
+        kinds = optx.RESULTS
+        result = kinds.where(self.code == 0, kinds.successful, kinds.nonlinear_max_steps_reached)
+        result = kinds.where(self._reason == _DIVERGED, kinds.nonlinear_divergence, result)
+        return kinds.where(self.nonfinite, kinds.nonfinite, result)
+
+    @property
+    def _reason(self) -> Int[Array, ""]:
+        return self.code & (1 << _REASON_BITS) - 1
 
 
 DECADES = range(-16, 4)
+_UNSATISFIED, _DIVERGED, _NONFINITE = 1, 2, 3
+_REASON_BITS, _DECADE_BITS = 2, 5
 
 
 class ProjectionInfo(eqx.Module):
@@ -86,8 +120,7 @@ class Problem(eqx.Module):
 
     **Attributes:**
 
-    - `residual`: `y ↦ g(y)`, whose closed-over arrays are part of its PyTree. Its values are a
-        tuple of scalars, or one array if there are many.
+    - `residual`: `y ↦ g(y)`, of shape `(m,)`, whose closed-over arrays are part of its PyTree.
     - `magnitude`: the absolute conserved values, as `residual` returns them.
     - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
     - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
@@ -158,12 +191,18 @@ def tolerances(
 
     scale = jtu.tree_map(combine, magnitude, jacobian.scale(y), jacobian.squared_norms(weights))
 
-    def tolerance(x: Array) -> Array:
+    return scale, tolerance(scale, rtol, atol)
+
+
+def tolerance(scale: Vector, rtol: float | Array | None, atol: float | Array | None) -> Vector:
+    """The residual at which each constraint counts as satisfied."""
+
+    def combine(x: Array) -> Array:
         relative = ROUNDOFF_MULTIPLE * jnp.finfo(x.dtype).eps if rtol is None else rtol
         absolute = 0 if atol is None else atol
         return jnp.asarray(relative, x.dtype) * x + jnp.asarray(absolute, x.dtype)
 
-    return scale, jtu.tree_map(tolerance, scale)
+    return jtu.tree_map(combine, scale)
 
 
 # What is accepted. Rounding the state and evaluating the residual cost about one unit of roundoff
@@ -184,7 +223,6 @@ def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
 
 
 def report(
-    success: Bool[Array, ""],
     num_steps: Int[Array, ""],
     candidate: Y,
     y: Y,
@@ -195,14 +233,9 @@ def report(
     failure: Failure,
 ) -> ProjectionInfo:
     """The `ProjectionInfo` of a projection from `candidate` to `y`."""
-    kinds = optx.RESULTS
-    unsatisfied = kinds.where(
-        tree_all_finite(after), kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
-    )
-    unsuccessful = kinds.where(tree_all_finite(before), unsatisfied, kinds.nonfinite)
     correction = tree_sub(y, candidate)
     return ProjectionInfo(
-        result=kinds.where(success, kinds.successful, unsuccessful),
+        result=failure.result,
         num_steps=num_steps,
         residual_before=largest_relative(before, scale),
         residual_after=largest_relative(after, scale),

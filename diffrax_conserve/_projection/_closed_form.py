@@ -88,7 +88,7 @@ class ClosedForm(AbstractProjection):
         failure = Failure.of(before, scales(candidate)[0], after, scale).unless(success)
         rank = jacobian.gram_solver(problem.weights).rank
         count = jnp.asarray(1)
-        return y, report(success, count, candidate, y, before, after, scale, rank, failure)
+        return y, report(count, candidate, y, before, after, scale, rank, failure)
 
 
 ClosedForm.__init__.__doc__ = r"""**Arguments:**

@@ -35,15 +35,15 @@ def unrolled_solver(gram: list[list[Array]], damping: Real[Array, ""] | float) -
     m = len(gram)
     least = _least_pivot(m, gram[0][0].dtype)
     lu = [list(row) for row in gram]
-    inverses = []
+    pivots = []
     rank = jnp.asarray(0)
     for k in range(m):
         pivot = lu[k][k] + damping * gram[k][k]
         regular = pivot > least * gram[k][k]
         rank = rank + regular.astype(int)
-        inverses.append(jnp.where(regular, 1 / jnp.where(regular, pivot, 1), 0))
+        pivots.append(jnp.where(regular, pivot, jnp.inf))
         for i in range(k + 1, m):
-            lu[i][k] = lu[i][k] * inverses[k]
+            lu[i][k] = lu[i][k] / pivots[k]
             for j in range(k + 1, m):
                 lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
 
@@ -55,7 +55,9 @@ def unrolled_solver(gram: list[list[Array]], damping: Real[Array, ""] | float) -
         for i in reversed(range(m)):
             for j in range(i + 1, m):
                 x[i] = x[i] - lu[i][j] * x[j]
-            x[i] = x[i] * inverses[i]
+            # A division, not a product with the inverse: XLA computes a cheap operation again
+            # in every loop that uses it, with all that it depends on.
+            x[i] = x[i] / pivots[i]
         return tuple(x)
 
     return GramSolver(solve, rank)

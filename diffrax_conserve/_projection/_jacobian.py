@@ -1,10 +1,10 @@
 """The constraint Jacobian `G`, and linear solves with Gram matrices `G W Hᵀ`.
 
 Vectors of `m` numbers (residuals, multipliers) come in two forms, and code that uses them must
-treat them as PyTrees: for few constraints a tuple of `m` scalars, so that each product, sum and
-2×2 solve is plain elementwise arithmetic that XLA fuses into the step around it (a `linalg` call on
-a 2×2 matrix costs more than the step itself); for many, one array of shape `(m,)`. For very many
-the rows are never formed.
+treat them as PyTrees: one array of shape `(m,)`, which compiles fast, or a tuple of `m` scalars,
+which runs fast if there are few: each product, sum and 2×2 solve is plain elementwise arithmetic
+that XLA fuses into the step around it (a `linalg` call on a 2×2 matrix costs more than the step
+itself). For very many constraints the rows are never formed.
 """
 
 import abc
@@ -71,14 +71,10 @@ class AbstractJacobian(eqx.Module):
 
 def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
     """`g(y)` and `G(y)`."""
-    struct = eqx.filter_eval_shape(residual, y)
-    if isinstance(struct, tuple):
+    if isinstance(residual, Elements):
         # One reverse pass per constraint, each of which touches only what that constraint depends
         # on; XLA merges the forward passes.
-        outs, rows = zip(
-            *(jax.value_and_grad(lambda y, i=i: residual(y)[i])(y) for i in range(len(struct))),
-            strict=True,
-        )
+        outs, rows = zip(*(jax.value_and_grad(fn)(y) for fn in residual.fns), strict=True)
         return outs, _Unrolled(rows)
     out, vjp = jax.vjp(residual, y)
     if out.size > DENSE_MAX:
@@ -86,6 +82,30 @@ def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
         return out, _MatrixFree(jvp, lambda multiplier: vjp(multiplier)[0])
     (rows,) = jax.vmap(vjp)(jnp.eye(out.size, dtype=out.dtype))
     return out, _Dense(rows)
+
+
+def few(residual: Residual, y: Y) -> bool:
+    """Whether a residual of shape `(m,)` is worth writing out as `m` scalars."""
+    return eqx.filter_eval_shape(residual, y).size <= UNROLLED_MAX
+
+
+class Elements(eqx.Module):
+    """A residual given as a list of functions, whose values are a tuple of scalars."""
+
+    fns: list[Residual]
+
+    @classmethod
+    def of(cls, residual: Residual, y: Y) -> "Elements":
+        size = eqx.filter_eval_shape(residual, y).size
+        return cls([lambda y, i=i: residual(y)[i] for i in range(size)])
+
+    def __call__(self, y: Y) -> tuple[Array, ...]:
+        return tuple(fn(y) for fn in self.fns)
+
+
+def as_array(vector: Vector) -> Real[Array, " m"]:
+    """A vector in either form, of shape `(m,)`."""
+    return jnp.stack(vector) if isinstance(vector, tuple) else vector
 
 
 @final
@@ -138,12 +158,7 @@ class _Dense(AbstractJacobian):
     rows: PyTree[Array]  # each leaf with a leading axis of length m
 
     def pullback(self, multiplier: Vector) -> Y:
-        return jtu.tree_map(
-            lambda x: jnp.tensordot(
-                multiplier.astype(x.dtype), x, axes=1, precision=lax.Precision.HIGHEST
-            ),
-            self.rows,
-        )
+        return jtu.tree_map(lambda x: _contract(multiplier.astype(x.dtype), x), self.rows)
 
     def pushforward(self, y: Y) -> Vector:
         dtype = working_dtype(y)
@@ -172,12 +187,26 @@ class _Dense(AbstractJacobian):
         def product(row: Array, column: Array, weight: Array) -> Array:
             m = row.shape[0]
             weighted = column * weight.astype(column.dtype)[None]
-            return jnp.matmul(
-                row.reshape(m, -1), weighted.reshape(m, -1).T, precision=lax.Precision.HIGHEST
-            ).astype(dtype)
+            return _contract(row.reshape(m, -1), weighted.reshape(m, -1).T).astype(dtype)
 
         products = jtu.tree_leaves(jtu.tree_map(product, self.rows, columns, weights))
-        return dense_solver(ft.reduce(jnp.add, products), damping)
+        gram = ft.reduce(jnp.add, products)
+        if len(gram) > UNROLLED_MAX:
+            return dense_solver(gram, damping)
+        solver = unrolled_solver([[*row] for row in gram], damping)
+        return GramSolver(lambda b: jnp.stack(solver.solve(tuple(b))), solver.rank)
+
+
+def _contract(a: Array, b: Array) -> Array:
+    """`a @ b`, over the last axis of `a` and the first of `b`, for small arrays in a way that XLA
+    fuses and compiles into a loop around it."""
+    if a.size * b.size > _SMALL:
+        return jnp.tensordot(a, b, axes=1, precision=lax.Precision.HIGHEST)
+    a = jnp.expand_dims(a, range(a.ndim, a.ndim + b.ndim - 1))
+    return jnp.sum(a * b, axis=a.ndim - b.ndim)
+
+
+_SMALL = 4096
 
 
 # The accuracy of one iterative solve. The iteration around it corrects what is left, so the total

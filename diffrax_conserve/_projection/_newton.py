@@ -107,7 +107,7 @@ class Newton(AbstractProjection):
         rank = at_y.gram_solver(weights).rank
         before = residual(candidate)
         failure = Failure.of(before, scales(candidate)[0], after, scale).unless(success)
-        info = report(success, count, candidate, y, before, after, scale, rank, failure)
+        info = report(count, candidate, y, before, after, scale, rank, failure)
         return y, tree_stop_gradient(info)
 
 

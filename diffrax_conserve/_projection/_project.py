@@ -23,7 +23,7 @@ from .._manifold import (
 from .._tree import tree_mul, tree_sub, working_dtype
 from ._base import AbstractProjection, Problem, ProjectionInfo
 from ._elimination import Vector
-from ._jacobian import UNROLLED_MAX, linearise
+from ._jacobian import linearise
 from ._newton import Newton
 
 
@@ -153,13 +153,9 @@ def _problem(
 ) -> Problem:
     dtype = working_dtype(candidate)
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
-    unrolled = sum(x.size for x in jtu.tree_leaves(outputs)) <= UNROLLED_MAX
 
     def vector(tree: PyTree[Array]) -> Vector:
-        leaves = [x.astype(dtype) for x in jtu.tree_leaves(tree)]
-        if not unrolled:
-            return jnp.concatenate([x.reshape(-1) for x in leaves])
-        return tuple(x.reshape(-1)[i] if x.ndim else x for x in leaves for i in range(x.size))
+        return jnp.concatenate([x.astype(dtype).reshape(-1) for x in jtu.tree_leaves(tree)])
 
     def residual(y: Y) -> Vector:
         out = evaluate(manifold, t, y, args)

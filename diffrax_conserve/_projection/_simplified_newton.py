@@ -1,7 +1,9 @@
 """The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4: one Jacobian, few
 iterations. For candidates that are as close as an integrator's local error."""
 
+import dataclasses
 import functools as ft
+from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
@@ -10,7 +12,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-from .._custom_types import BoolScalarLike, Y
+from .._custom_types import Y
+from .._scalars import elements_in_scalars
 from .._tree import tree_add, tree_all_finite, tree_mul, tree_scale
 from ._any_lane import continue_if_any
 from ._base import (
@@ -21,13 +24,14 @@ from ._base import (
     largest_relative,
     positive_weights,
     report,
+    tolerance,
     tolerances,
     within,
 )
 from ._elimination import GramSolver, Vector
-from ._jacobian import AbstractJacobian, Residual, linearise
+from ._jacobian import AbstractJacobian, Elements, Residual, as_array, few, linearise
 
-_Iterate = tuple[Y, Vector, Vector, Int[Array, ""]]
+_Iterate = tuple[Y, Vector, Int[Array, ""]]
 
 
 @final
@@ -118,6 +122,10 @@ def _displaced(jacobian: AbstractJacobian, multiplier: Vector, y: Y, weights: Y)
     return tree_add(y, tree_mul(jacobian.pullback(multiplier), weights))
 
 
+def _same(y: Y) -> Y:
+    return y
+
+
 class _Iteration(eqx.Module):
     """The iteration from one candidate, with its frozen Jacobian."""
 
@@ -128,19 +136,39 @@ class _Iteration(eqx.Module):
     rtol: float | Array | None
     atol: float | Array | None
 
+    def written_out(self) -> tuple["_Iteration", Callable[[Y], Y], Callable[[Y], Y]]:
+        """The same with scalars in the place of vectors, if there are few, and of states, if they
+        are small, and the maps to its states and back."""
+        if not few(self.residual, self.candidate):
+            return self, _same, _same
+        converted = elements_in_scalars(self.residual, self.candidate)
+        if converted is None:
+            elements = Elements.of(self.residual, self.candidate)
+            inline = dataclasses.replace(self, residual=elements, magnitude=tuple(self.magnitude))
+            return inline, _same, _same
+        fns, split, join = converted
+        inline = dataclasses.replace(
+            self,
+            residual=Elements(fns),
+            candidate=split(self.candidate),
+            weights=split(self.weights),
+            magnitude=tuple(self.magnitude),
+        )
+        return inline, split, join
+
     def stepper(self) -> tuple[Vector, AbstractJacobian, GramSolver]:
         g, jacobian = linearise(self.residual, self.candidate)
         return g, jacobian, jacobian.gram_solver(self.weights)
 
     def step(
-        self, jacobian: AbstractJacobian, gram_solver: GramSolver, iterate: _Iterate
+        self, jacobian: AbstractJacobian, gram_solver: GramSolver, g: Vector, iterate: _Iterate
     ) -> _Iterate:
         # The state is updated by increments, which shrink, rather than from the multipliers, which
         # can be large and cancel: so its roundoff is relative to its own size in the end.
-        y, multiplier, g, count = iterate
+        y, multiplier, count = iterate
         change = jtu.tree_map(jnp.negative, gram_solver.solve(g))
         y = _displaced(jacobian, change, y, self.weights)
-        return y, jtu.tree_map(jnp.add, multiplier, change), self.residual(y), count + 1
+        return y, jtu.tree_map(jnp.add, multiplier, change), count + 1
 
     def scales(self, jacobian: AbstractJacobian, y: Y) -> tuple[Vector, Vector]:
         """The scales of the constraints at `y`, and their tolerances."""
@@ -148,14 +176,14 @@ class _Iteration(eqx.Module):
             jacobian, y, self.candidate, self.weights, self.magnitude, self.rtol, self.atol
         )
 
-    def judge(
-        self, jacobian: AbstractJacobian, iterate: _Iterate, stalled: BoolScalarLike
-    ) -> tuple[Bool[Array, ""], Bool[Array, ""], Vector]:
-        """Whether it is done, whether it has succeeded, and the scales of the constraints."""
-        y, _, g, _ = iterate
-        scale, tolerance = self.scales(jacobian, y)
-        success = within(g, tolerance)
-        return success & (within(g, tree_scale(0.25, tolerance)) | stalled), success, scale
+    def obviously_done(self, jacobian: AbstractJacobian, g: Vector, y: Y) -> Bool[Array, ""]:
+        """Implies that it is done, by scales that are smaller and cheaper than the full ones."""
+        scale = jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
+        return within(g, tree_scale(_SAFELY, tolerance(scale, self.rtol, self.atol)))
+
+
+# Iterations end at this part of the tolerance, or where they no longer halve the residual.
+_SAFELY = 0.25
 
 
 @eqx.filter_custom_jvp
@@ -170,52 +198,66 @@ def _solve(
     max_steps: int,
 ) -> tuple[Y, Vector, ProjectionInfo]:
     iteration = _Iteration(residual, candidate, weights, magnitude, rtol, atol)
-    before, jacobian, gram_solver = iteration.stepper()
-    iterate = (candidate, jtu.tree_map(jnp.zeros_like, before), before, jnp.asarray(0))
+    inline, split, join = iteration.written_out()
+    before, jacobian, gram_solver = inline.stepper()
+    g = before
+    iterate = (inline.candidate, jtu.tree_map(jnp.zeros_like, g), jnp.asarray(0))
     for _ in range(min(jacobian.inline_steps, max_steps)):
-        iterate = iteration.step(jacobian, gram_solver, iterate)
-    done, success, scale = iteration.judge(jacobian, iterate, stalled=False)
+        iterate = inline.step(jacobian, gram_solver, g, iterate)
+        g = inline.residual(iterate[0])
+    y, multiplier, count = iterate
+    done = inline.obviously_done(jacobian, g, y)
     # Few steps need more, so the loop recomputes what it needs: if it shared the Jacobian, that
     # would be written to memory at every step of the solve.
-    state = (iterate, success, scale, Failure.none())
-    iterate, success, scale, failure = continue_if_any(
-        ft.partial(_loop, max_steps), ~done, state, iteration
+    state = ((y, as_array(multiplier), count), Failure.none())
+    (y, multiplier, count), failure = continue_if_any(
+        ft.partial(_loop, max_steps, split, join), ~done, state, iteration
     )
-    y, multiplier, after, count = iterate
-    rank = gram_solver.rank
-    info = report(success, count, candidate, y, before, after, scale, rank, failure)
-    return y, multiplier, info
+    y = join(y)
+    # What follows is computed only where somebody asks for it.
+    scale, _ = iteration.scales(linearise(residual, candidate)[1], y)
+    before, after, rank = as_array(before), residual(y), gram_solver.rank
+    return y, multiplier, report(count, candidate, y, before, after, scale, rank, failure)
 
 
-_State = tuple[_Iterate, Bool[Array, ""], Vector, Failure]
+_State = tuple[_Iterate, Failure]
+_Carry = tuple[Bool[Array, ""], _Iterate, Vector, Vector, Array, Bool[Array, ""]]
 
 
 def _loop(
-    max_steps: int, unfinished: Bool[Array, ""], state: _State, iteration: _Iteration
+    max_steps: int,
+    split: Callable[[Y], Y],
+    join: Callable[[Y], Y],
+    unfinished: Bool[Array, ""],
+    state: _State,
+    iteration: _Iteration,
 ) -> _State:
     """Iterates until `state` is finished, or hopeless; not at all unless `unfinished`."""
     before, jacobian, gram_solver = iteration.stepper()
 
-    def hopeful(iterate: _Iterate) -> Bool[Array, ""]:
-        _, _, g, count = iterate
-        return (count < max_steps) & tree_all_finite(g)
-
     # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
     # and then never ends: so the condition is evaluated once, and carried.
-    def body(carry: tuple[Array, _Iterate, Array, Vector]) -> tuple[Array, _Iterate, Array, Vector]:
-        _, old, _, _ = carry
-        new = iteration.step(jacobian, gram_solver, old)
-        scale, _ = iteration.scales(jacobian, new[0])
-        stalled = largest_relative(new[2], scale) > 0.5 * largest_relative(old[2], scale)
-        done, success, scale = iteration.judge(jacobian, new, stalled)
-        return ~done & hopeful(new), new, success, scale
+    def body(carry: _Carry) -> _Carry:
+        _, iterate, _, _, last, _ = carry
+        y, _, count = iterate
+        g = iteration.residual(y)
+        scale, allowed = iteration.scales(jacobian, y)
+        largest = largest_relative(g, scale)
+        success = within(g, allowed)
+        done = success & (within(g, tree_scale(_SAFELY, allowed)) | (largest > 0.5 * last))
+        unfinished = ~done & tree_all_finite(g) & (count < max_steps)
+        new = iteration.step(jacobian, gram_solver, g, iterate)
+        iterate = jtu.tree_map(lambda a, b: jnp.where(unfinished, b, a), iterate, new)
+        return unfinished, iterate, g, scale, largest, success
 
-    iterate, success, scale, _ = state
-    start = (unfinished & hopeful(iterate), iterate, success, scale)
-    _, iterate, success, scale = lax.while_loop(lambda carry: carry[0], body, start)
+    (y, multiplier, count), _ = state
+    last = jnp.asarray(jnp.inf, before.dtype)
+    start = (unfinished, (join(y), multiplier, count), before, before, last, ~unfinished)
+    _, iterate, after, scale, _, success = lax.while_loop(lambda carry: carry[0], body, start)
     scale_before, _ = iteration.scales(jacobian, iteration.candidate)
-    failure = Failure.of(before, scale_before, iterate[2], scale).unless(success)
-    return iterate, success, scale, failure
+    y, multiplier, count = iterate
+    failure = Failure.of(before, scale_before, after, scale).unless(success)
+    return (split(y), multiplier, count), failure
 
 
 @_solve.def_jvp

@@ -60,7 +60,8 @@ class Target(eqx.Module):
 def _untouched(candidate: Y, residual: Real[Array, ""]) -> ProjectionInfo:
     zero = jnp.asarray(0)
     residual = residual.astype(working_dtype(candidate))
-    none = Failure.none()
     # Traced, as in the other branch.
-    result = optx.RESULTS.where(zero == 0, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-    return ProjectionInfo(result, zero, residual, residual, jnp.zeros_like(residual), zero, none)
+    none = Failure(zero.astype(jnp.int32))
+    return ProjectionInfo(
+        none.result, zero, residual, residual, jnp.zeros_like(residual), zero, none
+    )

@@ -35,12 +35,12 @@ def failure(info: ProjectionInfo, manifold: Manifold, values: Values) -> dfx.RES
     if first is None:
         return dfx.RESULTS.promote(info.result)
     # Written out: this is computed at every step, needed or not.
-    entry = jnp.asarray(0)
+    entry = jnp.asarray(0, jnp.int32)
     for end in itertools.accumulate(sizes[:-1]):
-        entry = entry + (info.failure.index >= end).astype(int)
+        entry = entry + (info.failure.index >= end).astype(jnp.int32)
     unsatisfied = info.failure.decade - DECADES[0]
     kind = jnp.where(unsatisfied < 0, _TOO_FAR, _FIRST_DECADE + unsatisfied)
-    kind = jnp.where(info.result == optx.RESULTS.nonfinite, _NONFINITE, kind)
+    kind = jnp.where(info.failure.nonfinite, _NONFINITE, kind)
     return member(first + _KINDS * entry + kind)
 
 

@@ -1,0 +1,152 @@
+"""A function written out in scalars is the same function, or it is not written out at all."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve import _scalars
+from diffrax_conserve._scalars import elements_in_scalars, written_out
+
+from .problems import RIGID_BODY
+
+MATRIX = np.arange(6.0).reshape(2, 3) / 7
+
+
+def primitives(fn, y):
+    """The names of all primitives, with the largest number of axes of their outputs."""
+    eqns = jax.make_jaxpr(fn)(y).eqns
+    return {e.primitive.name: max(len(v.aval.shape) for v in e.outvars) for e in eqns}
+
+
+FUNCTIONS = {
+    "sum": lambda y: jnp.sum(y * MATRIX),
+    "sums along axes": lambda y: (jnp.sum(y, axis=0), jnp.sum(y, axis=1), jnp.max(y), jnp.prod(y)),
+    "matrix product": lambda y: y @ MATRIX.T,
+    "product of three axes": lambda y: jnp.tensordot(jnp.stack([y, 2 * y]), y, axes=([2], [1])),
+    "outer product": lambda y: jnp.tensordot(y, y, axes=0),
+    "slices": lambda y: (y[1:, ::2], y[:, -1], y[0, 1], y[::-1]),
+    "pairs": lambda y: y[:, None, 0] - y[None, :, 1] + jnp.eye(2, dtype=y.dtype),
+    "stacks": lambda y: jnp.concatenate([jnp.stack([y[0], y[1]]), y.T.reshape(2, 3)], axis=1),
+    "elementary functions": lambda y: (
+        jnp.exp(jnp.sin(y)) / jnp.hypot(y, 2.0) ** 3 + jnp.log1p(y**2)
+    ),
+    "comparisons": lambda y: jnp.where(y > 0, jnp.sqrt(jnp.abs(y)), jnp.clip(y, -0.5, 0.5)),
+    "a constant": lambda y: (y, jnp.ones(2, y.dtype)),
+    "an inner jit": lambda y: jax.jit(jnp.linalg.norm)(y),
+    "another dtype": lambda y: jnp.sum(y.astype(jnp.float16)),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_and_shapes_are_the_same(name, dtype):
+    y = jr.normal(jr.key(0), (2, 3), dtype)
+    fn = FUNCTIONS[name]
+    out, expected = jax.jit(lambda y: written_out(fn, y))(y), fn(y)
+    assert jtu.tree_structure(out) == jtu.tree_structure(expected)
+    for a, b in zip(jtu.tree_leaves(out), jtu.tree_leaves(expected), strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        tolerance = 8 * float(jnp.finfo(b.dtype).eps)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"a constant"}))
+def test_all_of_it_is_in_scalars(name):
+    found = primitives(lambda y: written_out(FUNCTIONS[name], y), jnp.ones((2, 3)))
+    arrays = {name for name, rank in found.items() if rank > 0}
+    assert arrays <= {"reshape", "slice", "stack", "concatenate", "broadcast_in_dim"}, arrays
+
+
+@pytest.mark.parametrize("name", [*dfc.systems.names()])
+def test_each_element_of_the_manifolds_of_the_catalogue(name):
+    system = dfc.systems.get(name)
+    y0 = system.y0
+    entries = jtu.tree_leaves(system.manifold, is_leaf=lambda x: hasattr(x, "fn"))
+
+    def residual(y):
+        outs = [entry.fn(0.0, y, system.args) for entry in entries]
+        return jnp.concatenate([jnp.ravel(x) for x in outs])
+
+    converted = elements_in_scalars(residual, y0)
+    if sum(jnp.size(x) for x in jtu.tree_leaves(y0)) > _scalars.MAX_SCALARS:
+        assert converted is None
+        return
+    if name == "toda-lattice":  # it pads its matrix
+        assert converted is None
+        return
+    assert converted is not None
+    fns, split, join = converted
+    jtu.tree_map(np.testing.assert_array_equal, join(split(y0)), y0)
+    values, gradients = residual(y0), jax.jacrev(residual)(y0)
+    size = float(jnp.max(jnp.abs(values))) + 1
+    for i, fn in enumerate(fns):
+        value, gradient = jax.value_and_grad(fn)(split(y0))
+        np.testing.assert_allclose(value, values[i], rtol=1e-14, atol=1e-15 * size)
+        jtu.tree_map(
+            lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=1e-13, atol=1e-14 * size),
+            join(gradient),
+            gradients,
+        )
+
+
+@jax.custom_jvp
+def own_derivative(x):
+    return x
+
+
+own_derivative.defjvp(lambda primals, tangents: (primals[0], 7 * tangents[0]))
+
+
+NOT_WRITTEN_OUT = {
+    "a derivative of one's own": lambda y: own_derivative(y) * 2,
+    "control flow": lambda y: jax.lax.fori_loop(0, 3, lambda _, x: x * y, y),
+    "a batched product": lambda y: jnp.einsum("ij,ij->i", y, y),
+    "too many operations": lambda y: jnp.tile(y, (20, 20)) ** 2 + 1,
+    "a random key": lambda y: y + jr.normal(jr.key(0), y.shape, y.dtype),
+}
+
+
+@pytest.mark.parametrize("name", NOT_WRITTEN_OUT)
+def test_what_is_not_known_stays_as_it_is(name):
+    fn = NOT_WRITTEN_OUT[name]
+    y = jr.normal(jr.key(0), (2, 3))
+    assert elements_in_scalars(lambda y: fn(y).reshape(-1), y) is None
+    np.testing.assert_array_equal(written_out(fn, y), fn(y))
+    # What was begun before the unknown primitive was met is dead code.
+    assert primitives(lambda y: written_out(fn, y), y).keys() >= primitives(fn, y).keys()
+
+
+def test_side_effects_happen_once(capsys):
+    def fn(y):
+        jax.debug.print("seen")
+        return 2 * y
+
+    np.testing.assert_array_equal(jax.jit(lambda y: written_out(fn, y))(jnp.ones(2)), [2, 2])
+    jax.effects_barrier()
+    assert capsys.readouterr().out == "seen\n"
+
+
+def test_what_it_closes_over_is_differentiated():
+    def fn(inertia, y):
+        return written_out(lambda y: jnp.sum(inertia * y**2), y)
+
+    inertia, y = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, 5.0, 6.0])
+    np.testing.assert_allclose(jax.jit(jax.grad(fn))(inertia, y), y**2, rtol=1e-15)
+
+
+def test_a_projection_is_the_same_without(monkeypatch):
+    """Where nothing can be written out, the algorithm is the same, so the result is."""
+    state = jnp.array([1.0, 1.01, 0.99])
+    value = {"energy": 0.3, "momentum": 0.14}
+
+    def projected():
+        return dfc.project(RIGID_BODY, state, value=value, projection=dfc.SimplifiedNewton())[0]
+
+    expected = projected()
+    monkeypatch.setattr(_scalars, "MAX_SCALARS", 0)
+    np.testing.assert_allclose(projected(), expected, rtol=4e-16)
