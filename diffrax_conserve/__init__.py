@@ -31,6 +31,7 @@ from ._solver import ManifoldProjection as ManifoldProjection
 from ._solver import PINNSolver as PINNSolver
 from ._solver import ProjectionStatistics as ProjectionStatistics
 from ._solver import RandomFeatureSolver as RandomFeatureSolver
+from ._solver import Unrolled as Unrolled
 from ._solver import statistics as statistics
 from ._training import SPRING as SPRING
 from ._training import FitLog as FitLog

@@ -31,11 +31,13 @@ MAX_OPERATIONS = 512
 
 
 def written_out(fn: Callable[[Y], PyTree[Array]], y: Y) -> PyTree[Array]:
-    """`fn(y)`, computed in scalars if that is possible."""
+    """`fn(y)`, computed in scalars if that is possible, and if it is so little that XLA may as
+    well compute all of it again for each element of the outcome, which it tends to do."""
     closed, out = jax.make_jaxpr(fn, return_shape=True)(y)
     leaves, treedef = jtu.tree_flatten(out)
+    limit = MAX_OPERATIONS // sum(x.size for x in leaves)
     try:
-        scalars = _WriteOut(closed, y)(*_components(jtu.tree_leaves(y)))
+        scalars = _WriteOut(closed, y, limit)(*_components(jtu.tree_leaves(y)))
     except _NotWrittenOut:
         return fn(y)
     return jtu.tree_unflatten(treedef, _stacked(scalars, [x.shape for x in leaves]))
@@ -183,7 +185,8 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
 class _WriteOut:
     """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
 
-    def __init__(self, closed: Any, y: Y):
+    def __init__(self, closed: Any, y: Y, limit: int = MAX_OPERATIONS):
+        self.limit = limit
         self.closed = closed
         self.shapes = [jnp.shape(x) for x in jtu.tree_leaves(y)]
         if sum(map(prod, self.shapes)) > MAX_SCALARS:
@@ -290,7 +293,7 @@ class _WriteOut:
 
     def _count(self, operations: int) -> None:
         self.num_operations += operations
-        if self.num_operations > MAX_OPERATIONS:
+        if self.num_operations > self.limit:
             raise _NotWrittenOut
 
 

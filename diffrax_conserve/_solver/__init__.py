@@ -7,3 +7,4 @@ from ._random_features import RandomFeatureSolver as RandomFeatureSolver
 from ._rk4 import RK4 as RK4
 from ._statistics import ProjectionStatistics as ProjectionStatistics
 from ._statistics import statistics as statistics
+from ._unrolled import Unrolled as Unrolled

@@ -77,18 +77,17 @@ class RK4(dfx.AbstractSolver[None]):
         def stage(t: RealScalarLike, y: Y) -> Y:
             return terms.vf_prod(t, y, args, control)
 
-        def end_and_first_stage(y0: Y) -> tuple[Y, Y]:
+        def end(y0: Y) -> Y:
             k1 = stage(t0, y0)
             k2 = stage(middle, _axpy(0.5, k1, y0))
             k3 = stage(middle, _axpy(0.5, k2, y0))
             k4 = stage(t1, _axpy(1.0, k3, y0))
-            y1 = jtu.tree_map(
+            return jtu.tree_map(
                 lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4
             )
-            return y1, k1
 
-        y1, k1 = written_out(end_and_first_stage, y0)
-        dense_info = dict(y0=y0, y1=y1, k0=k1, k1=stage(t1, y1))
+        y1 = written_out(end, y0)
+        dense_info = dict(y0=y0, y1=y1, k0=stage(t0, y0), k1=stage(t1, y1))
         return y1, None, dense_info, None, dfx.RESULTS.successful
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:

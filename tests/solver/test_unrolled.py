@@ -1,0 +1,78 @@
+"""`Unrolled` is the same method, only faster."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import KEPLER, KEPLER0, kepler
+
+SOLVERS = [dfx.Tsit5(), dfx.Dopri5(), dfx.Dopri8(), dfx.Bosh3(), dfx.Heun(), dfx.Ralston()]
+
+
+def solve(solver, y0=KEPLER0, t1=1.5, **kwargs):
+    options = dict(
+        dt0=None,
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 7), t1=True),
+    )
+    return dfx.diffeqsolve(dfx.ODETerm(kepler), solver, t0=0.0, t1=t1, y0=y0, **(options | kwargs))
+
+
+def close(a, b, tolerance):
+    jtu.tree_map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=tolerance), a, b)
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: type(s).__name__)
+def test_same_steps_and_dense_output(solver):
+    ours, theirs = solve(dfc.Unrolled(solver)), solve(solver)
+    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
+    close(ours.ys, theirs.ys, 1e-12)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(t1=-1.5),
+        dict(
+            stepsize_controller=dfx.ClipStepSizeController(
+                dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=[0.4, 1.1]
+            )
+        ),
+        dict(stepsize_controller=dfx.ConstantStepSize(), dt0=0.05),
+    ],
+    ids=["backwards", "jumps", "fixed steps"],
+)
+def test_same_as_the_wrapped_solver(kwargs):
+    ours, theirs = (solve(s, **kwargs) for s in (dfc.Unrolled(dfx.Tsit5()), dfx.Tsit5()))
+    close(ours.ys, theirs.ys, 1e-12)
+
+
+def test_projected_and_batched():
+    solver = dfc.ManifoldProjection(dfc.Unrolled(dfx.Bosh3()), KEPLER)
+    y0s = jtu.tree_map(lambda x: x * (1 + 0.02 * jr.normal(jr.key(0), (5, 2))), KEPLER0)
+    sol = jax.jit(jax.vmap(lambda y0: solve(solver, y0)))(y0s)
+    drift = jax.vmap(lambda sol: dfc.drift(sol, KEPLER))(sol)
+    assert max(float(jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(drift)) < 4e-15
+
+
+def test_gradients_agree():
+    def end(solver, y0):
+        return solve(solver, y0, saveat=dfx.SaveAt(t1=True)).ys[0][0, 0]
+
+    ours, theirs = (
+        jax.grad(lambda y0, s=solver: end(s, y0))(KEPLER0)
+        for solver in (dfc.Unrolled(dfx.Bosh3()), dfx.Bosh3())
+    )
+    close(ours, theirs, 1e-11)
+
+
+@pytest.mark.parametrize("solver", [dfx.Euler(), dfx.Kvaerno5(), "Tsit5", dfc.RK4()])
+def test_other_solvers_are_refused(solver):
+    with pytest.raises(TypeError, match="explicit Runge-Kutta"):
+        dfc.Unrolled(solver)
