@@ -12,6 +12,9 @@ FOLDER = Path(__file__).parent.parent / "benchmarks"
 
 
 def benchmark(name):
+    """The benchmark as a module, loaded by its path; it finds its neighbours as a script does."""
+    if str(FOLDER) not in sys.path:
+        sys.path.append(str(FOLDER))
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -30,7 +33,8 @@ def test_a_smoke_run_measures_verified_answers(overhead, tmp_path, capsys):
     assert len(tables) == 1
     rows = tables[0]["rows"]
     assert {"plain", "projected", "root_find by hand"} <= rows.keys()
-    assert all(row["ns"] > 0 and row["compile_seconds"] > 0 for row in rows.values())
+    assert all(row["ns"] > 0 for row in rows.values())
+    assert all(rows[name]["compile_seconds"] > 0 for name in ("plain", "projected"))
     assert rows["projected"]["drift"] <= overhead.MAX_DRIFT < rows["plain"]["drift"]
     assert json.loads(out.read_text())["tables"] == json.loads(json.dumps(tables))
     assert "rigid-body, RK4, batch of 8" in capsys.readouterr().out
