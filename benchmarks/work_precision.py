@@ -1,0 +1,359 @@
+"""Error against time: plain and projected solvers of diffrax, scipy, homproj, heyoka and CVODE.
+
+1. One trajectory of a rigid body and of a Kepler orbit, to t = 100, over a range of tolerances.
+2. A batch of rigid bodies.
+3. A batch of Kepler orbits that need different numbers of steps and iterations, against each alone.
+
+Every timed answer is judged at t = 100: its error against the exact solution, and its drift. How
+to read it, and what is left out where something is not installed: `benchmarks/README.md`.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.random as jr
+import measuring
+import numpy as np
+import peers
+
+import diffrax_conserve as dfc
+
+T1 = 100.0
+MAX_DRIFT = 1e-14
+SYSTEMS = {"rigid-body": dfc.systems.RigidBody(), "kepler": dfc.systems.Kepler()}
+
+Solve = peers.Solve
+
+
+class Settings(NamedTuple):
+    """How much is measured."""
+
+    rounds: int
+    tolerances: tuple[float, ...]
+    batch_tolerances: tuple[float, ...]
+    trajectories: int  # in the batch of rigid bodies
+    lanes: int  # in the batch of unlike orbits
+
+
+FULL = Settings(
+    rounds=5,
+    tolerances=tuple(10.0 ** (-k / 2) for k in range(10, 26)),
+    batch_tolerances=(1e-8, 1e-9, 1e-10, 1e-11),
+    trajectories=1_000,
+    lanes=100,
+)
+SMOKE = Settings(
+    rounds=1, tolerances=(1e-6, 1e-10), batch_tolerances=(1e-8, 1e-10), trajectories=16, lanes=8
+)
+
+
+class Contestant(NamedTuple):
+    """`solve(setting, initial states) -> states at t = 100`, for each of the `settings`, which are
+    tolerances, or steps where the steps are fixed."""
+
+    solve: Solve
+    settings: tuple[float, ...]
+    compile_seconds: float | None = None
+
+
+# ---- diffrax ----
+
+
+def diffeqsolve(
+    system: Any,
+    solver: dfx.AbstractSolver,
+    y0: Any,
+    setting: Any,
+    *,
+    adaptive: bool = True,
+    solver_state: bool = False,
+) -> dfx.Solution:
+    """To t = 100 with the tolerance, or the number of steps, `setting`."""
+    controller = dfx.PIDController(rtol=setting, atol=setting)
+    return dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field),
+        solver,
+        t0=0.0,
+        t1=T1,
+        dt0=None if adaptive else T1 / setting,
+        y0=y0,
+        saveat=dfx.SaveAt(t1=True, solver_state=solver_state),
+        stepsize_controller=controller if adaptive else dfx.ConstantStepSize(),
+        adjoint=dfx.ForwardMode(),
+        max_steps=None,
+        throw=False,
+    )
+
+
+def ours(
+    system: Any,
+    solver: dfx.AbstractSolver,
+    lanes: int,
+    settings: tuple[float, ...],
+    *,
+    adaptive: bool = True,
+) -> Contestant:
+    """Compiled once, for all settings; one trajectory is compiled without a batch axis."""
+    _, unravel = jfu.ravel_pytree(system.y0)
+
+    def one(setting: jax.Array, y0: jax.Array) -> jax.Array:
+        solution = diffeqsolve(system, solver, unravel(y0), setting, adaptive=adaptive)
+        ok = solution.result == dfx.RESULTS.successful
+        return jnp.where(ok, jfu.ravel_pytree(solution.ys)[0], jnp.nan)
+
+    like = jax.eval_shape(lambda: jfu.ravel_pytree(system.y0)[0])
+    if lanes == 1:
+        executable, seconds = measuring.compiled(one, settings[0], like)
+        return Contestant(lambda x, start: executable(x, start[0])[None], settings, seconds)
+    batch = jax.ShapeDtypeStruct((lanes, *like.shape), like.dtype)
+    executable, seconds = measuring.compiled(jax.vmap(one, (None, 0)), settings[0], batch)
+    return Contestant(executable, settings, seconds)
+
+
+def flattened(states: Any) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(states))
+
+
+# ---- Curves ----
+
+
+def curves(
+    system: Any, contestants: Mapping[str, Contestant], start: Any, rounds: int
+) -> dict[str, list[dict[str, float]]]:
+    """For each contestant and setting: seconds per trajectory, error and drift, the worst of all
+    trajectories."""
+    flat = flattened(start)
+    _, unravel = jfu.ravel_pytree(system.y0)
+    exact = jax.vmap(lambda y0: system.reference(jnp.array([T1]), y0))(start)
+    exact = flattened(jax.tree.map(lambda leaf: leaf[:, 0], exact))
+    runs = {
+        (name, setting): partial(contestant.solve, setting, flat)
+        for name, contestant in contestants.items()
+        for setting in contestant.settings
+    }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in contestants}
+    for (name, setting), (seconds, end) in measuring.take_turns(runs, rounds, long=0.5).items():
+        error = float(np.max(np.abs(np.asarray(end) - exact)))
+        drift = measuring.largest_drift(system, start, jax.vmap(unravel)(jnp.asarray(end)))
+        row = dict(setting=setting, seconds=seconds / len(flat), error=error, drift=drift)
+        found[name].append(row)
+        if name.startswith("projected") and not drift <= MAX_DRIFT:
+            raise AssertionError(f"{name} at {setting}: the drift is {drift:.1e}")
+    for name, rows in found.items():
+        if not rows[-1]["error"] <= rows[0]["error"]:
+            raise AssertionError(f"{name}: the error is not that of a solver that converges")
+    return found
+
+
+def time_to(rows: list[dict[str, float]], quantity: str, target: float) -> float | None:
+    """Seconds at which `quantity` gets, and stays, at most `target`, between two settings by
+    interpolation of the logarithms; `None` if it does not, the first setting if that suffices."""
+    above = [i for i, row in enumerate(rows) if not row[quantity] <= target]
+    if not above:
+        return rows[0]["seconds"]
+    if above[-1] == len(rows) - 1:
+        return None
+    a, b = rows[above[-1]], rows[above[-1] + 1]
+    x = math.log(a[quantity] / target) / math.log(a[quantity] / max(b[quantity], 1e-300))
+    return math.exp((1 - x) * math.log(a["seconds"]) + x * math.log(b["seconds"]))
+
+
+def times_to(
+    found: Mapping[str, list[dict[str, float]]], error: float
+) -> dict[str, dict[str, float | None]]:
+    """For each contestant: the time to `error` alone, and to `error` and `MAX_DRIFT`."""
+    out: dict[str, dict[str, float | None]] = {}
+    for name, rows in found.items():
+        to_error, to_drift = time_to(rows, "error", error), time_to(rows, "drift", MAX_DRIFT)
+        both = None if to_error is None or to_drift is None else max(to_error, to_drift)
+        out[name] = {"error": to_error, "error and drift": both}
+    return out
+
+
+# ---- The three parts ----
+
+
+def one_trajectory(name: str, settings: Settings) -> dict[str, Any]:
+    system, tolerances = SYSTEMS[name], settings.tolerances
+    equations = peers.EQUATIONS[name]
+    contestants = {}
+    for solver in (dfx.Tsit5(), dfx.Dopri8()):
+        label = type(solver).__name__
+        projected = dfc.ManifoldProjection(solver, system.manifold)
+        contestants[f"plain {label}"] = ours(system, solver, 1, tolerances)
+        contestants[f"projected {label}"] = ours(system, projected, 1, tolerances)
+    # heyoka's errors get down to roundoff; the Python programs are slow.
+    few = tolerances[::2] if len(tolerances) > 4 else tolerances
+    others = {
+        "CVODE, Adams": (peers.cvode(equations, T1, projected=False), tolerances),
+        "CVODE, BDF with projection": (peers.cvode(equations, T1, projected=True), tolerances),
+        "scipy DOP853": (peers.scipy_dop853(equations, T1), few),
+        "homproj DOP853": (peers.homproj(equations, T1), few),
+    }
+    contestants |= {label: Contestant(*x) for label, x in others.items() if x[0] is not None}
+    contestants |= heyoka(name, (*tolerances, 1e-14))
+    return part(name, system, contestants, 1, settings.rounds, error=1e-6)
+
+
+def batch(settings: Settings) -> dict[str, Any]:
+    system, lanes = SYSTEMS["rigid-body"], settings.trajectories
+    tolerances = settings.batch_tolerances
+
+    def projected(solver: dfx.AbstractSolver, values: tuple[float, ...], adaptive: bool = True):
+        solver = dfc.ManifoldProjection(solver, system.manifold)
+        return ours(system, solver, lanes, values, adaptive=adaptive)
+
+    contestants = {
+        "plain Dopri8": ours(system, dfx.Dopri8(), lanes, tolerances),
+        "projected Dopri8": projected(dfx.Dopri8(), tolerances),
+        "projected Tsit5": projected(dfx.Tsit5(), tolerances),
+        "projected Dopri8, fixed steps": projected(dfx.Dopri8(), (250, 350, 500, 700), False),
+        "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (1_000, 2_000, 4_000), False),
+        "projected RK4, fixed steps": projected(dfc.RK4(), (8_000, 16_000, 32_000), False),
+    }
+    for width in (8, 16):
+        contestants |= heyoka("rigid-body", (*tolerances, 1e-12, 1e-13, 1e-14), width)
+    return part("rigid-body", system, contestants, lanes, settings.rounds, error=1e-9)
+
+
+def heyoka(name: str, tolerances: tuple[float, ...], width: int = 1) -> dict[str, Contestant]:
+    make = partial(peers.heyoka, peers.EQUATIONS[name], T1, tolerances, width)
+    seconds, solve = measuring.timed(make)
+    label = "heyoka" if width == 1 else f"heyoka, {width} at a time"
+    return {} if solve is None else {label: Contestant(solve, tolerances, seconds)}
+
+
+def part(
+    name: str,
+    system: Any,
+    contestants: Mapping[str, Contestant],
+    trajectories: int,
+    rounds: int,
+    error: float,
+) -> dict[str, Any]:
+    start = measuring.initial_states(system, trajectories)
+    found = curves(system, contestants, start, rounds)
+    return dict(
+        system=name,
+        trajectories=trajectories,
+        target=error,
+        curves=found,
+        times=times_to(found, error),
+        compile_seconds={label: x.compile_seconds for label, x in contestants.items()},
+    )
+
+
+def unlike_lanes(settings: Settings) -> dict[str, Any]:
+    """Sampled Kepler orbits, adaptive, at a tolerance at which the projections need few to many
+    iterations: seconds per trajectory in the batch and alone, plain and projected.
+
+    A batch of adaptive solves goes on until its last lane has arrived, so the plain one, too, costs
+    more than the mean of its lanes.
+    """
+    system, lanes, tolerance = SYSTEMS["kepler"], settings.lanes, 1e-4
+    starts = jax.vmap(system.sample)(jr.split(jr.key(0), lanes))
+    flat = flattened(starts)
+    projected = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)
+    runs: dict[Any, Callable[[], Any]] = {}
+    for name, solver in {"plain": dfx.Tsit5(), "projected": projected}.items():
+        alone = ours(system, solver, 1, (tolerance,))
+        together = ours(system, solver, lanes, (tolerance,))
+        runs[name, "batch"] = partial(together.solve, tolerance, flat)
+        for i in range(lanes):
+            runs[name, i] = partial(alone.solve, tolerance, flat[i : i + 1])
+    best = measuring.take_turns(runs, settings.rounds)
+    steps, iterations, ends = _effort(system, projected, starts, tolerance)
+    if not np.all(np.isfinite(ends)):
+        raise AssertionError("an orbit failed")
+    for answer in (
+        best["projected", "batch"].answer,
+        np.concatenate([best["projected", i].answer for i in range(lanes)]),
+    ):
+        np.testing.assert_allclose(answer, ends, rtol=1e-6)
+    found = dict(lanes=lanes, tolerance=tolerance, steps=_spread(steps))
+    found["iterations of the longest projection"] = _spread(iterations)
+    for name in ("plain", "projected"):
+        each = float(np.mean([best[name, i].seconds for i in range(lanes)]))
+        found[name] = {"batch": best[name, "batch"].seconds / lanes, "alone": each}
+    return found
+
+
+def _effort(system: Any, solver: dfx.AbstractSolver, starts: Any, tolerance: float) -> list[Any]:
+    """The steps of each lane, the iterations of its longest projection, its final state."""
+
+    def one(y0: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+        solution = diffeqsolve(system, solver, y0, tolerance, solver_state=True)
+        iterations = dfc.statistics(solution).max_iterations
+        return solution.stats["num_steps"], iterations, jfu.ravel_pytree(solution.ys)[0]
+
+    return [np.asarray(x) for x in jax.jit(jax.vmap(one))(starts)]
+
+
+def _spread(x: np.ndarray) -> list[float]:
+    return [float(np.min(x)), float(np.mean(x)), float(np.max(x))]
+
+
+# ---- Reporting ----
+
+
+def milliseconds(seconds: float | None) -> str:
+    return "not reached" if seconds is None else f"{1e3 * seconds:.4g}"
+
+
+def print_part(result: dict[str, Any]) -> None:
+    count, target = result["trajectories"], result["target"]
+    print(f"\n{result['system']}, {count:,} trajectories: ms per trajectory, error, drift")
+    for name, rows in result["curves"].items():
+        compilation = result["compile_seconds"][name]
+        print(f"  {name}" + (f", compiled in {compilation:.1f} s" if compilation else ""))
+        for row in rows:
+            print(
+                f"    {row['setting']:8.1e} {1e3 * row['seconds']:10.4f} "
+                f"{row['error']:8.1e} {row['drift']:8.1e}"
+            )
+    print(f"  ms to error {target:.0e}; and drift below {MAX_DRIFT:.0e}")
+    for name, times in result["times"].items():
+        both = milliseconds(times["error and drift"])
+        print(f"    {name:30} {milliseconds(times['error']):>11} {both:>11}", flush=True)
+
+
+def print_unlike(result: dict[str, Any]) -> None:
+    print(f"\n{result['lanes']} unlike Kepler orbits, projected Tsit5 at {result['tolerance']:.0e}")
+    for quantity in ("steps", "iterations of the longest projection"):
+        low, mean, high = result[quantity]
+        print(f"  {quantity}: {low:.0f} to {high:.0f}, mean {mean:.1f}")
+    for name in ("plain", "projected"):
+        batch, alone = result[name]["batch"], result[name]["alone"]
+        print(
+            f"  {name}: {1e3 * batch:.4f} ms per orbit in the batch, {1e3 * alone:.4f} alone, "
+            f"ratio {batch / alone:.2f}"
+        )
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    options = measuring.parser(__doc__, "work_precision").parse_args(argv)
+    settings = SMOKE if options.smoke else FULL
+    about = measuring.machine("scipy", "homproj", "heyoka")
+    measuring.print_machine(about)
+    parts = {name: partial(one_trajectory, name, settings) for name in SYSTEMS}
+    parts |= {"batch": partial(batch, settings), "unlike": partial(unlike_lanes, settings)}
+    found = {}
+    for name, measure in parts.items():
+        if options.only in name:
+            found[name] = measure()
+            (print_unlike if name == "unlike" else print_part)(found[name])
+    left_out = peers.missing()
+    for text in left_out:
+        print("left out, not installed:", text)
+    measuring.write(options, about, parts=found, left_out=left_out)
+    return found
+
+
+if __name__ == "__main__":
+    main()
