@@ -146,7 +146,7 @@ def constraints(count: int, settings: Settings) -> dict[str, Any]:
         manifold, bonds = {"energy": dfc.FirstIntegral(many.chain_energy)}, 3
     else:
         manifold, bonds = many.CHAIN, count // 2
-    steps = 200 if count <= 20 else 20 if count <= 200 else 3
+    steps = 1000 if count <= 20 else 50 if count <= 200 else 3
     case = (f"chain, {bonds} bonds", many.chain_vector_field, manifold, many.chain(bonds), 1e-3)
     row = many.measure(*case, steps, plain_steps=1000)
     check(row)
