@@ -14,6 +14,8 @@ STYLES = {
     "projected Tsit5": (RED, "-", "o"),
     "plain Dopri8": (BLUE, "--", "s"),
     "projected Dopri8": (BLUE, "-", "s"),
+    "projected Dopri8, written out": (BLACK, "-", "s"),
+    "projected Tsit5, written out": (BLACK, ":", "o"),
     "projected Tsit5, fixed steps": (ORANGE, "-", "o"),
     "projected Dopri8, fixed steps": (SKY, "-", "s"),
     "projected RK4, fixed steps": (PURPLE, "-", "^"),

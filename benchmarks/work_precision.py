@@ -21,6 +21,7 @@ import jax.random as jr
 import measuring
 import numpy as np
 import peers
+from written_out import WrittenOut
 
 import diffrax_conserve as dfc
 
@@ -209,10 +210,13 @@ def batch(settings: Settings) -> dict[str, Any]:
         solver = dfc.ManifoldProjection(solver, system.manifold)
         return ours(system, solver, lanes, values, adaptive=adaptive)
 
+    finer = (*tolerances, 1e-12)
     contestants = {
-        "plain Dopri8": ours(system, dfx.Dopri8(), lanes, tolerances),
+        "plain Dopri8": ours(system, dfx.Dopri8(), lanes, finer),
         "projected Dopri8": projected(dfx.Dopri8(), tolerances),
         "projected Tsit5": projected(dfx.Tsit5(), tolerances),
+        "projected Dopri8, written out": projected(WrittenOut(dfx.Dopri8()), finer),
+        "projected Tsit5, written out": projected(WrittenOut(dfx.Tsit5()), finer),
         "projected Dopri8, fixed steps": projected(dfx.Dopri8(), (250, 350, 500, 700), False),
         "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (1_000, 2_000, 4_000), False),
         "projected RK4, fixed steps": projected(dfc.RK4(), (8_000, 16_000, 32_000), False),
