@@ -23,11 +23,11 @@ import measuring
 
 import diffrax_conserve as dfc
 
-MIN_STEPS = 5
+MIN_STEPS = 3
 
 
 class Settings(NamedTuple):
-    """What is measured. A run takes as many steps as fit into `seconds`, but at least five."""
+    """What is measured. A run takes as many steps as fit into `seconds`, but at least three."""
 
     batches: tuple[int, ...]
     constraints: tuple[int, ...]
