@@ -148,7 +148,7 @@ def bodies(count):
 
 def measure(name, vector_field, manifold, y0, dt, steps, plain_steps, rounds=3):
     state_bytes = sum(x.nbytes for x in jax.tree.leaves(y0))
-    row = {"problem": name, "unknowns": state_bytes // 8}
+    row = {"problem": name, "unknowns": sum(x.size for x in jax.tree.leaves(y0))}
     solvers = {"plain": dfc.RK4(), "projected": dfc.ManifoldProjection(dfc.RK4(), manifold)}
     for label, solver in solvers.items():
 

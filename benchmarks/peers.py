@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import measuring
 import numpy as np
 import scipy.integrate
+from curves import Solve
 
-Solve = Callable[[float, np.ndarray], np.ndarray]  # (tolerance, initial states) -> states at t1
 CVODE = ("sundials_cvode", "sundials_nvecserial", "sundials_sunnonlinsolfixedpoint")
 
 

@@ -44,7 +44,7 @@ FULL = Settings(
     seconds=0.1,
 )
 SMOKE = Settings(batches=(1, 16), constraints=(1, 6), bodies=(10, 100), rounds=1, seconds=0.01)
-MAX_DRIFT = 100 * float(jnp.finfo(float).eps)
+MAX_DRIFT = 100 * measuring.EPS
 
 
 # ---- 1. The batch ----
@@ -146,7 +146,7 @@ def constraints(count: int, settings: Settings) -> dict[str, Any]:
         manifold, bonds = {"energy": dfc.FirstIntegral(many.chain_energy)}, 3
     else:
         manifold, bonds = many.CHAIN, count // 2
-    steps = 1000 if count <= 20 else 50 if count <= 200 else 3
+    steps = 1000 if count <= 20 else 50 if count <= 100 else 3
     case = (f"chain, {bonds} bonds", many.chain_vector_field, manifold, many.chain(bonds), 1e-3)
     row = many.measure(*case, steps, plain_steps=1000)
     check(row)
