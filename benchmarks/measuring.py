@@ -35,8 +35,8 @@ _Name = TypeVar("_Name", bound=Hashable)
 
 # For float32: JAX_ENABLE_X64=0 python benchmarks/...
 jax.config.update("jax_enable_x64", os.environ.get("JAX_ENABLE_X64", "1") != "0")
-# The CPU time of a thread that still runs is counted only up to the last tick of the system's clock,
-# several milliseconds ago. So jax must compute on the thread that asks for the time, not on another.
+# The CPU time of another thread that still runs is known only up to the last tick of the system's
+# clock, milliseconds ago. So jax must compute on the thread that asks for the time.
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 EPS = float(jnp.finfo(jnp.result_type(float)).eps)
 
