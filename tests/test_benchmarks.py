@@ -77,6 +77,17 @@ def test_c_leaves_the_arithmetic_of_the_process_alone(overhead):
     assert np.finfo(np.float64).tiny / np.array(2.0) > 0  # subnormal
 
 
+def test_contestants_take_turns_and_long_ones_have_one():
+    measuring, calls = benchmark("measuring"), []
+    runs = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
+    best = measuring.take_turns(runs, rounds=2, long=-1.0)
+    assert calls == ["a", "b"]
+    assert all(result.seconds >= 0 for result in best.values())
+    calls.clear()
+    measuring.take_turns(runs, rounds=2)
+    assert calls == ["a", "b", "a", "a", "b", "b"]  # short ones are run twice, timed once
+
+
 # ---- Error against time, scaling, and what the pages show of it ----
 
 
