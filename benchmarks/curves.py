@@ -130,7 +130,8 @@ def times_to(
     """For each contestant: the time to `error` alone, and to `error` and `MAX_DRIFT`."""
     out: dict[str, dict[str, float | None]] = {}
     for name, rows in found.items():
-        to_error, to_drift = time_to(rows, "error", error), time_to(rows, "drift", MAX_DRIFT)
-        both = None if to_error is None or to_drift is None else max(to_error, to_drift)
-        out[name] = {"error": to_error, "error and drift": both}
+        excess = [max(row["error"] / error, row["drift"] / MAX_DRIFT) for row in rows]
+        with_excess = [row | {"excess": x} for row, x in zip(rows, excess, strict=True)]
+        both = time_to(with_excess, "excess", 1.0)
+        out[name] = {"error": time_to(rows, "error", error), "error and drift": both}
     return out

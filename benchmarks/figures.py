@@ -89,7 +89,7 @@ def scaling(results: dict[str, Any]) -> Figure:
     """The batch, the constraints and the bodies, a panel each."""
     parts = results["parts"]
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(9.6, 3.2), layout="constrained")
+        figure = Figure(figsize=(9.6, 3.8), layout="constrained")
         axes = figure.subplots(1, 3)
         for name in ("plain RK4", "projected RK4", "plain Tsit5", "projected Tsit5"):
             points = [(row["batch"], row["rows"][name]["ns"]) for row in parts["batch"]]
@@ -113,5 +113,5 @@ def scaling(results: dict[str, Any]) -> Figure:
         axes[2].set(xlabel="gravitating bodies", ylabel="s")
         for ax in axes:
             ax.set(xscale="log", yscale="log")
-            ax.legend()
+            ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2 if ax is axes[0] else 1)
         return figure

@@ -30,6 +30,7 @@ SYSTEMS = {"rigid-body": dfc.systems.RigidBody(), "kepler": dfc.systems.Kepler()
 class Settings(NamedTuple):
     """How much is measured."""
 
+    systems: tuple[str, ...]  # of which one trajectory is solved
     rounds: int
     tolerances: tuple[float, ...]
     batch_tolerances: tuple[float, ...]
@@ -38,6 +39,7 @@ class Settings(NamedTuple):
 
 
 FULL = Settings(
+    systems=tuple(SYSTEMS),
     rounds=4,
     tolerances=tuple(10.0 ** (-k / 2) for k in range(10, 26)),
     batch_tolerances=(1e-8, 1e-9, 1e-10, 1e-11),
@@ -45,7 +47,12 @@ FULL = Settings(
     lanes=100,
 )
 SMOKE = Settings(
-    rounds=1, tolerances=(1e-6, 1e-10), batch_tolerances=(1e-8, 1e-10), trajectories=16, lanes=8
+    systems=("rigid-body",),
+    rounds=1,
+    tolerances=(1e-6, 1e-10),
+    batch_tolerances=(1e-8, 1e-10),
+    trajectories=16,
+    lanes=8,
 )
 
 
@@ -219,7 +226,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     settings = SMOKE if options.smoke else FULL
     about = measuring.machine("scipy", "homproj", "heyoka")
     measuring.print_machine(about)
-    parts = {name: partial(one_trajectory, name, settings) for name in SYSTEMS}
+    parts = {name: partial(one_trajectory, name, settings) for name in settings.systems}
     parts |= {"batch": partial(batch, settings), "unlike": partial(unlike_lanes, settings)}
     found = {}
     for name, measure in parts.items():

@@ -108,6 +108,18 @@ def test_the_time_to_an_error_is_read_off_a_power_law(precision_curves):
     assert precision_curves.time_to(rows, "error", 1e-9) is None
 
 
+def test_a_drift_that_never_was_too_large_costs_nothing(precision_curves):
+    rows = [dict(seconds=10.0**k, error=100.0**-k, drift=0.0) for k in range(5)]
+    rows[0]["seconds"] = 1e6
+    drifting = [row | {"drift": 1e-10 * row["error"]} for row in rows]
+    found = precision_curves.times_to({"kept": rows, "drifts": drifting}, 1e-5)
+    assert found["kept"]["error"] == found["kept"]["error and drift"] == pytest.approx(10**2.5)
+    assert found["drifts"]["error and drift"] == pytest.approx(10**2.5)  # 1e-15 there
+    drifting = [row | {"drift": 1e-8 * row["error"]} for row in rows]
+    found = precision_curves.times_to({"drifts": drifting}, 1e-5)
+    assert found["drifts"]["error and drift"] == pytest.approx(10**3)
+
+
 def test_one_lucky_error_does_not_count(precision_curves):
     errors = [1e-2, 1e-9, 1e-4, 1e-6]
     rows = [dict(seconds=10.0**k, error=error) for k, error in enumerate(errors)]
@@ -207,7 +219,7 @@ def test_a_method_written_out_is_the_same_method(solver):
 def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
     out = tmp_path / "work_precision.json"
     found = precision.main(["--smoke", "--out", str(out)])
-    for part in ("rigid-body", "kepler", "batch"):
+    for part in ("rigid-body", "batch"):
         times = found[part]["times"]
         assert times["projected Tsit5"]["error and drift"] > 0
         assert times["plain Dopri8"]["error and drift"] is None
