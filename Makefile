@@ -46,6 +46,7 @@ PLOTS := $(VENV)/.installed-plots
 TEST := $(VENV)/.installed-test
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
+BENCH := $(VENV)/.installed-bench
 
 # ---- What a newcomer runs ----
 
@@ -89,14 +90,19 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	$(BIN)/python -m pytest -n $(WORKERS) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
-bench: $(PLOTS) ## measure the overhead of the projection
+bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	$(BIN)/python benchmarks/overhead.py
 	$(BIN)/python benchmarks/gradients.py
-	$(BIN)/python benchmarks/many_constraints.py --out benchmarks/results/many_constraints.json
+	$(BIN)/python benchmarks/work_precision.py
+	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/report.py --write
 
-bench-smoke: $(PLOTS) ## the same at toy sizes, to see that it runs
+bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/overhead.py --smoke
 	$(BIN)/python benchmarks/gradients.py --smoke
+	$(BIN)/python benchmarks/work_precision.py --smoke
+	$(BIN)/python benchmarks/scaling.py --smoke
+	$(BIN)/python benchmarks/report.py
 	$(BIN)/python benchmarks/many_constraints.py --smoke
 	$(BIN)/python benchmarks/random_features.py --smoke
 

@@ -1,28 +1,26 @@
 """What a gradient through a projected solve costs, against that through the plain one.
 
 The gradient of the squared final state with respect to the initial state, three point vortices,
-Tsit5, reverse mode with `RecursiveCheckpointAdjoint`. Plain and projected take turns; each counts
-with its best round. Seconds of CPU time, so that a busy machine matters less.
+Tsit5, reverse mode with `RecursiveCheckpointAdjoint`.
 """
 
-import argparse
-import time
+from functools import partial
+from typing import Any
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import measuring
 
 import diffrax_conserve as dfc
-
-jax.config.update("jax_enable_x64", True)
 
 SYSTEM = dfc.systems.PointVortices()
 
 
-def gradient(solver, adaptive):
+def gradient(solver: dfx.AbstractSolver, adaptive: bool) -> Any:
     controller = dfx.PIDController(rtol=1e-8, atol=1e-8) if adaptive else dfx.ConstantStepSize()
 
-    def loss(y0, t1):
+    def loss(y0: Any, t1: Any) -> jax.Array:
         sol = dfx.diffeqsolve(
             dfx.ODETerm(SYSTEM.vector_field),
             solver,
@@ -36,40 +34,51 @@ def gradient(solver, adaptive):
         )
         return sum(jnp.sum(y**2) for y in jax.tree.leaves(sol.ys))
 
-    return jax.grad(loss)
+    return jax.vmap(jax.grad(loss), (0, None))
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--smoke", action="store_true", help="one round, short solves")
-    smoke = parser.parse_args().smoke
-    t1 = jnp.asarray(1.0 if smoke else 20.0)
+def measure(adaptive: bool, batch: int, t1: float, rounds: int) -> dict[str, Any]:
+    y0 = jax.tree.map(lambda y: jnp.tile(y, (batch,) + (1,) * y.ndim), SYSTEM.y0)
     solvers = {
         "plain": dfx.Tsit5(),
         "projected": dfc.ManifoldProjection(dfx.Tsit5(), SYSTEM.manifold),
     }
-    print("gradient, s of CPU: plain, projected, ratio; compile time, s: plain, projected")
+    runs, compile_seconds = {}, {}
+    for name, solver in solvers.items():
+        executable, compile_seconds[name] = measuring.compiled(gradient(solver, adaptive), y0, t1)
+        runs[name] = partial(executable, y0, t1)
+    best = measuring.take_turns(runs, rounds)
+    if not all(jnp.all(jnp.isfinite(result.answer)) for result in best.values()):
+        raise AssertionError("a gradient is not finite")
+    seconds = {name: result.seconds for name, result in best.items()}
+    return dict(
+        adaptive=adaptive,
+        batch=batch,
+        seconds=seconds,
+        ratio=seconds["projected"] / seconds["plain"],
+        compile_seconds=compile_seconds,
+    )
+
+
+def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
+    options = measuring.parser(__doc__, "gradients").parse_args(argv)
+    smoke = options.smoke
+    about = measuring.machine()
+    measuring.print_machine(about)
+    print("gradient, s: plain, projected, ratio; compilation, s: plain, projected")
+    rows = []
     for adaptive in (True,) if smoke else (False, True):
         for batch in (8,) if smoke else (1, 100):
-            y0 = jax.tree.map(lambda y, n=batch: jnp.tile(y, (n,) + (1,) * y.ndim), SYSTEM.y0)
-            compiled, compile_seconds, best = {}, {}, {}
-            for name, solver in solvers.items():
-                started = time.process_time()
-                batched = jax.jit(jax.vmap(gradient(solver, adaptive), (0, None)))
-                compiled[name] = batched.lower(y0, t1).compile()
-                compile_seconds[name] = time.process_time() - started
-            for _ in range(1 if smoke else 7):
-                for name, run in compiled.items():
-                    started = time.process_time()
-                    jax.block_until_ready(run(y0, t1))
-                    seconds = time.process_time() - started
-                    best[name] = min(best.get(name, seconds), seconds)
             label = f"{'adaptive' if adaptive else 'fixed':8} steps, batch of {batch:3d}"
-            print(
-                f"{label}: {best['plain']:.4f} {best['projected']:.4f} "
-                f"{best['projected'] / best['plain']:.2f}; "
-                f"{compile_seconds['plain']:.1f} {compile_seconds['projected']:.1f}"
-            )
+            if options.only not in label:
+                continue
+            rows.append(measure(adaptive, batch, 1.0 if smoke else 20.0, 1 if smoke else 7))
+            row = rows[-1]
+            cells = [f"{x:.4f}" for x in row["seconds"].values()]
+            compilation = [f"{x:.1f}" for x in row["compile_seconds"].values()]
+            print(f"{label}: {' '.join(cells)} {row['ratio']:.2f}; {' '.join(compilation)}")
+    measuring.write(options, about, rows=rows)
+    return rows
 
 
 if __name__ == "__main__":

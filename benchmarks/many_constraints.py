@@ -9,20 +9,16 @@ For each size: seconds per RK4 step, plain and projected, the memory that the co
 besides its arguments (in multiples of the state: constant if memory is linear), and the residuals.
 """
 
-import argparse
-import json
-import time
-from pathlib import Path
+import functools as ft
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
-
-jax.config.update("jax_enable_x64", True)
 
 GRAVITY = jnp.array([0.0, 0.0, -9.81])
 
@@ -62,6 +58,11 @@ def bond_velocities(t, y, args):
     return jnp.sum(differences(y[0]) * differences(y[1]), -1)
 
 
+def chain_energy(t, y, args):
+    q, v = y
+    return jnp.sum(v * v) / 2 - jnp.sum(q @ GRAVITY)
+
+
 CHAIN = {"length": dfc.Constraint(bond_lengths), "velocity": dfc.Constraint(bond_velocities)}
 
 
@@ -80,7 +81,7 @@ CHUNK = 100
 
 
 def over_rows(fn, q):
-    return jax.lax.map(jax.checkpoint(fn), q.reshape(-1, CHUNK, 3))
+    return jax.lax.map(jax.checkpoint(fn), q.reshape(-1, min(CHUNK, len(q)), 3))
 
 
 def inverse_distances(rows, q):
@@ -145,9 +146,9 @@ def bodies(count):
 # ---- Measuring ----
 
 
-def measure(name, vector_field, manifold, y0, dt, steps):
+def measure(name, vector_field, manifold, y0, dt, steps, plain_steps, rounds=3):
     state_bytes = sum(x.nbytes for x in jax.tree.leaves(y0))
-    row = {"problem": name, "unknowns": state_bytes // 8}
+    row = {"problem": name, "unknowns": sum(x.size for x in jax.tree.leaves(y0))}
     solvers = {"plain": dfc.RK4(), "projected": dfc.ManifoldProjection(dfc.RK4(), manifold)}
     for label, solver in solvers.items():
 
@@ -158,16 +159,15 @@ def measure(name, vector_field, manifold, y0, dt, steps):
             )
 
         # The difference of two solves: without what is done once.
-        t1s = [jnp.asarray(dt), jnp.asarray((1 + steps) * dt)]
+        count = steps if label == "projected" else plain_steps
+        t1s = [jnp.asarray(dt), jnp.asarray((1 + count) * dt)]
+        begin = measuring.clock()
         compiled = solve.lower(y0, t1s[0]).compile()
-        jax.block_until_ready(compiled(y0, t1s[0]).ys)
-        seconds = []
-        for t1 in t1s:
-            started = time.perf_counter()
-            sol = compiled(y0, t1)
-            jax.block_until_ready(sol.ys)
-            seconds.append(time.perf_counter() - started)
-        row[f"{label} s/step"] = (seconds[1] - seconds[0]) / steps
+        row[f"{label} compile seconds"] = measuring.clock() - begin
+        runs = {i: ft.partial(compiled, y0, t1) for i, t1 in enumerate(t1s)}
+        one, all_ = measuring.take_turns(runs, rounds, long=0.5).values()
+        sol = all_.answer
+        row[f"{label} s/step"] = (all_.seconds - one.seconds) / count
         memory = compiled.compiled.memory_analysis()
         row[f"{label} memory/state"] = memory.temp_size_in_bytes / state_bytes
         row[f"{label} succeeded"] = bool(sol.result == dfx.RESULTS.successful)
@@ -180,23 +180,22 @@ def measure(name, vector_field, manifold, y0, dt, steps):
     return row
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes, the same code paths")
-    parser.add_argument("--out", type=Path, help="JSON")
-    options = parser.parse_args()
+def main(argv=None):
+    options = measuring.parser(__doc__, "many_constraints").parse_args(argv)
     chains, counts = ([100], [100]) if options.smoke else ([500, 1000, 2000], [1000, 10_000])
-    rows = [
-        measure(f"chain, {n} bonds", chain_vector_field, CHAIN, chain(n), 1e-3, 5) for n in chains
+    cases = [
+        (f"chain, {n} bonds", chain_vector_field, CHAIN, chain(n), 1e-3, 5, 100) for n in chains
     ]
-    rows += [
-        measure(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2) for n in counts
-    ]
-    for row in rows:
-        cells = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()]
-        print(", ".join(cells))
-    if options.out:
-        options.out.write_text(json.dumps(rows, indent=2) + "\n")
+    cases += [(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2, 2) for n in counts]
+    rows = []
+    for case in cases:
+        if options.only in case[0]:
+            rows.append(measure(*case))
+            items = rows[-1].items()
+            cells = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in items]
+            print(", ".join(cells), flush=True)
+    measuring.write(options, measuring.machine(), rows=rows)
+    return rows
 
 
 if __name__ == "__main__":

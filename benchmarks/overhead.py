@@ -1,78 +1,77 @@
 """What a projection costs: ns per step and trajectory, against plain solvers, a loop with
 `optimistix.root_find` written by hand, and hand-written C.
 
-Every timed answer is checked: projected ones for their drift, C's against ours. Within a table the
-contestants take turns, and each counts with its best round, so that a noisy machine slows all of
-them alike. How to run and read it: `benchmarks/README.md`.
+Every timed answer is checked: projected ones for their drift, C's against ours. How to run and read
+it: `benchmarks/README.md`.
 """
 
-import argparse
 import ctypes
-import datetime
-import importlib.metadata
-import json
 import math
-import os
-import platform
-import shutil
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
-
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.random as jr
+import measuring
 import numpy as np
 import optimistix as optx
 
 import diffrax_conserve as dfc
 
-jax.config.update("jax_enable_x64", True)
-
-HERE = Path(__file__).parent
-MAX_DRIFT = 4e-15  # of whatever is projected by this package or by C
-MAX_DRIFT_BY_HAND = 1e-12  # a root finder stops at the tolerances that a user would write
+MAX_DRIFT = 18 * measuring.EPS  # of whatever is projected by this package or by C
+MAX_DRIFT_BY_HAND = 4500 * measuring.EPS  # a root finder stops where a user would let it stop
 MAX_DIFFERENCE = 1e-10  # between C's states and ours
 MIN_STEPS = 10
-MAX_SECONDS = 2.0  # of a run that is repeated in every round
+MAX_BATCH_BY_HAND = 1_000
+MAX_BATCH_TSIT5 = 1_000  # scaling.py has the larger ones
 LANES = 8  # of float64 in the vectors of the C program: one AVX-512 register
-C_FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp-simd")
 
 
 class Problem(NamedTuple):
-    """A system of the catalogue, the step, and how to tell the C program which one it is."""
+    """A system of the catalogue, the step, how to tell the C program which one it is, and what is
+    measured of it."""
 
     system: Any
     dt: float
     define: str
+    methods: tuple[str, ...] = ("RK4", "Tsit5 adaptive")
+    max_batch: int = 100_000
 
 
 PROBLEMS = {
     "rigid-body": Problem(dfc.systems.RigidBody(), 0.05, "-DRIGID_BODY"),
     "three-vortices": Problem(dfc.systems.PointVortices(), 0.1, "-DVORTICES=3"),
+    "ten-vortices": Problem(
+        dfc.systems.PointVortices([1.0] * 10), 0.02, "-DVORTICES=10", ("RK4",), 1_000
+    ),
 }
 
 
 class Settings(NamedTuple):
     """How much is measured. Contestants take as many steps as fit into `seconds`."""
 
+    systems: tuple[str, ...]
     batches: tuple[int, ...]
     rounds: int
     seconds: float
-    horizon: float  # t1 of the adaptive solves, in batches of up to a thousand
+    horizon: float  # t1 of the adaptive solves
     check_steps: int  # after which C and we are compared
 
 
-FULL = Settings(batches=(1, 1_000, 100_000), rounds=5, seconds=0.5, horizon=100.0, check_steps=100)
-SMOKE = Settings(batches=(1, 8), rounds=2, seconds=0.01, horizon=2.0, check_steps=10)
+FULL = Settings(
+    systems=tuple(PROBLEMS),
+    batches=(1, 1_000, 100_000),
+    rounds=5,
+    seconds=0.2,
+    horizon=100.0,
+    check_steps=100,
+)
+SMOKE = Settings(
+    systems=("rigid-body",), batches=(1, 8), rounds=2, seconds=0.01, horizon=2.0, check_steps=10
+)
 
 
 class Contestant(NamedTuple):
@@ -83,31 +82,13 @@ class Contestant(NamedTuple):
     compile_seconds: float | None = None
 
 
-# ---- The initial states, and how well they are kept ----
-
-
 def initial_states(problem: Problem, batch: int) -> np.ndarray:
-    """`y0` alone, or perturbed by 5 %, so that lanes need about as many iterations as `y0`."""
-    y0 = problem.system.y0
-    factors = 1 + 0.05 * jr.normal(jr.key(0), (batch, *y0.shape))
-    return np.asarray(y0 * factors if batch > 1 else y0[None])
+    return np.asarray(measuring.initial_states(problem.system, batch))
 
 
 def conserved(problem: Problem, y: jax.Array) -> jax.Array:
-    manifold = problem.system.manifold
-    return jfu.ravel_pytree({name: entry.fn(0.0, y, None) for name, entry in manifold.items()})[0]
-
-
-def largest_drift(problem: Problem, start: np.ndarray, end: np.ndarray) -> float:
-    """The largest change of an integral, relative to its value and the terms that it sums."""
-
-    def relative(a, b):
-        value = conserved(problem, a)
-        gradient = jax.jacfwd(lambda y: conserved(problem, y))(a)
-        scale = jnp.abs(value) + jnp.abs(gradient).reshape(value.size, -1) @ jnp.abs(a).ravel()
-        return jnp.max(jnp.abs(conserved(problem, b) - value) / scale)
-
-    return float(jnp.max(jax.jit(jax.vmap(relative))(start, end)))
+    entries = problem.system.manifold.items()
+    return jfu.ravel_pytree({name: entry.fn(0.0, y, None) for name, entry in entries})[0]
 
 
 # ---- The contestants ----
@@ -137,7 +118,7 @@ def root_find_by_hand(problem: Problem, solver: dfx.AbstractSolver, t1, y0, *, a
     del adaptive
     term = dfx.ODETerm(problem.system.vector_field)
     target = conserved(problem, y0)
-    newton = optx.Newton(rtol=1e-12, atol=1e-14)
+    newton = optx.Newton(rtol=MAX_DRIFT_BY_HAND, atol=MAX_DRIFT_BY_HAND / 100)
 
     def body(step, carry):
         y, state = carry
@@ -178,9 +159,7 @@ def compiled(
 
     alone = len(start) == 1
     y0 = jnp.asarray(start[0] if alone else start)
-    begin = time.perf_counter()
-    function = jax.jit(one if alone else jax.vmap(one, (None, 0))).lower(1.0, y0).compile()
-    seconds = time.perf_counter() - begin
+    function, seconds = measuring.compiled(one if alone else jax.vmap(one, (None, 0)), 1.0, y0)
 
     def run(steps: int) -> tuple[np.ndarray, int]:
         states, made = jax.block_until_ready(function(steps * problem.dt, y0))
@@ -190,24 +169,15 @@ def compiled(
 
 
 def hand_written_c(problem: Problem, start: np.ndarray) -> dict[str, Contestant]:
-    """Compiled on the spot; nothing where there is no compiler."""
-    compiler = shutil.which(os.environ.get("CC", "cc"))
-    if compiler is None:
+    """Compiled on the spot; nothing where there is no compiler, or where it would be no match."""
+    if measuring.suffix():
         return {}
     lanes = 1 if len(start) == 1 else LANES
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "projected_rk4.so"
-        source = HERE / "projected_rk4.c"
-        compile_ = [compiler, *C_FLAGS, "-Wno-psabi", "-c", "-fPIC", problem.define]
-        compile_ += [f"-DLANES={lanes}", str(source), "-o", f"{library}.o"]
-        # Linked without `-ffast-math`: a library that is linked with it flushes subnormal numbers
-        # to zero in the whole process that loads it.
-        link = [compiler, "-shared", f"{library}.o", "-o", str(library), "-lm"]
-        begin = time.perf_counter()
-        subprocess.run(compile_, check=True)
-        subprocess.run(link, check=True)
-        seconds = time.perf_counter() - begin
-        integrate = ctypes.CDLL(str(library)).integrate
+    source = measuring.HERE / "projected_rk4.c"
+    library = measuring.c_library(source, problem.define, f"-DLANES={lanes}")
+    if library is None:
+        return {}
+    integrate = library.integrate
     pointer = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
     integrate.argtypes = [pointer, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_int]
     integrate.restype = None
@@ -218,7 +188,7 @@ def hand_written_c(problem: Problem, start: np.ndarray) -> dict[str, Contestant]
             integrate(states, len(start), steps, problem.dt, projected)
             return states, steps
 
-        return Contestant(run, MAX_DRIFT if projected else math.inf, seconds)
+        return Contestant(run, MAX_DRIFT if projected else math.inf)
 
     return {"plain, C": contestant(False), "projected, C": contestant(True)}
 
@@ -227,12 +197,13 @@ def fixed_step_contestants(
     problem: Problem, solver: dfx.AbstractSolver, start: np.ndarray
 ) -> dict[str, Contestant]:
     projected = dfc.ManifoldProjection(solver, problem.system.manifold)
-    by_hand = compiled(root_find_by_hand, problem, solver, start, MAX_DRIFT_BY_HAND)
     contestants = {
         "plain": compiled(solve, problem, solver, start),
         "projected": compiled(solve, problem, projected, start, MAX_DRIFT),
-        "root_find by hand": by_hand,
     }
+    if len(start) <= MAX_BATCH_BY_HAND:
+        by_hand = compiled(root_find_by_hand, problem, solver, start, MAX_DRIFT_BY_HAND)
+        contestants["root_find by hand"] = by_hand
     if isinstance(solver, dfc.RK4):
         contestants |= hand_written_c(problem, start)
     return contestants
@@ -262,17 +233,12 @@ def check_states(contestants: dict[str, Contestant], steps: int) -> None:
                 raise AssertionError(f"{name}: C and we differ by {difference:.1e}")
 
 
-def timed(contestant: Contestant, steps: int) -> tuple[float, np.ndarray, int]:
-    begin = time.perf_counter()
-    states, made = contestant.run(steps)
-    return time.perf_counter() - begin, states, made
-
-
 def steps_within(contestant: Contestant, seconds: float) -> int:
     """How many steps fit into `seconds`, but at least so many that a solve's start is no matter."""
     steps = MIN_STEPS
+    contestant.run(steps)  # the first run is slower
     while True:
-        duration, _, made = timed(contestant, steps)
+        duration, (_, made) = measuring.timed(partial(contestant.run, steps))
         if duration > seconds / 4:
             return max(MIN_STEPS, round(made * seconds / duration))
         steps *= 4
@@ -290,16 +256,11 @@ def measure(
         name: steps_within(c, settings.seconds) if horizon is None else round(horizon / problem.dt)
         for name, c in contestants.items()
     }
-    best = {name: (math.inf, start, 1) for name in contestants}
     rounds = settings.rounds if horizon is None else 4 * settings.rounds  # shorter ones
-    for _ in range(rounds):
-        for name, contestant in contestants.items():
-            if MAX_SECONDS < best[name][0] < math.inf:
-                continue
-            best[name] = min(best[name], timed(contestant, steps[name]), key=lambda run: run[0])
+    runs = {name: partial(c.run, steps[name]) for name, c in contestants.items()}
     rows = {}
-    for name, (seconds, states, made) in best.items():
-        drift = largest_drift(problem, start, states)
+    for name, (seconds, (states, made)) in measuring.take_turns(runs, rounds).items():
+        drift = measuring.largest_drift(problem.system, start, states)
         if not (drift <= contestants[name].max_drift and np.all(np.isfinite(states))):
             raise AssertionError(f"{name}: the drift after {made} steps is {drift:.1e}")
         rows[name] = dict(
@@ -324,8 +285,7 @@ def table(name: str, problem: Problem, method: str, batch: int, settings: Settin
     solver = dfc.RK4() if method == "RK4" else dfx.Tsit5()
     if method.endswith("adaptive"):
         contestants = adaptive_contestants(problem, solver, start)
-        horizon = settings.horizon * min(1, 1000 / batch)
-        rows = measure(problem, contestants, start, settings, horizon)
+        rows = measure(problem, contestants, start, settings, settings.horizon)
     else:
         contestants = fixed_step_contestants(problem, solver, start)
         check_states(contestants, settings.check_steps)
@@ -335,40 +295,12 @@ def table(name: str, problem: Problem, method: str, batch: int, settings: Settin
         for label, (a, b) in RATIOS.items()
         if a in rows and b in rows
     }
+    compilation = [rows[name]["compile_seconds"] for name in ("projected", "plain")]
+    ratios["compilation, projected / plain"] = compilation[0] / compilation[1]
     return dict(system=name, method=method, batch=batch, dt=problem.dt, rows=rows, ratios=ratios)
 
 
 # ---- Reporting ----
-
-
-def machine() -> dict[str, Any]:
-    packages = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "diffrax-conserve")
-    return dict(
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        cpu=_cpu_model(),
-        cores=os.cpu_count(),
-        device=jax.devices()[0].platform,
-        python=platform.python_version(),
-        versions={name: importlib.metadata.version(name) for name in packages},
-        compiler=_compiler(),
-    )
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((x.split(":")[1].strip() for x in lines if "model name" in x), platform.machine())
-
-
-def _compiler() -> str:
-    compiler = shutil.which(os.environ.get("CC", "cc"))
-    if compiler is None:
-        return "not available: no figures for C"
-    return subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout.split(
-        "\n"
-    )[0]
 
 
 def print_table(result: dict[str, Any]) -> None:
@@ -378,47 +310,31 @@ def print_table(result: dict[str, Any]) -> None:
     )
     print(columns)
     for name, row in result["rows"].items():
+        compilation = row["compile_seconds"]
         print(
             f"  {name:18} {row['ns']:11,.1f} {row['seconds']:9.4f} {row['steps']:9,d} "
-            f"{row['drift']:9.1e} {row['compile_seconds']:12.2f}"
+            f"{row['drift']:9.1e} " + ("" if compilation is None else f"{compilation:12.2f}")
         )
     print("  " + "; ".join(f"{label} {ratio:.2f}" for label, ratio in result["ratios"].items()))
 
 
-def arguments(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes, the same code paths")
-    parser.add_argument(
-        "--only", default="", metavar="TEXT", help="tables whose 'SYSTEM METHOD BATCH' holds TEXT"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        help="JSON (default: benchmarks/results/overhead.json, none for a smoke run)",
-    )
-    return parser.parse_args(argv)
-
-
 def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
-    options = arguments(argv)
+    options = measuring.parser(__doc__, "overhead").parse_args(argv)
     settings = SMOKE if options.smoke else FULL
-    about = machine()
-    print("\n".join(f"{key}: {value}" for key, value in about.items()))
-    print("ns/step: per step and trajectory, float64; best of", settings.rounds, "rounds")
+    about = measuring.machine()
+    measuring.print_machine(about)
+    print("ns/step: per step and trajectory; best of", settings.rounds, "rounds")
     jax.jit(lambda x: x + 1).lower(1.0).compile()  # the first compilation also loads the compiler
     results = []
-    for name, problem in PROBLEMS.items():
-        for method in ("RK4", "Tsit5", "Tsit5 adaptive"):
+    for name in settings.systems:
+        problem = PROBLEMS[name]
+        for method in problem.methods:
             for batch in settings.batches:
-                if options.only in f"{name} {method} {batch}":
+                largest = problem.max_batch if method == "RK4" else MAX_BATCH_TSIT5
+                if batch <= largest and options.only in f"{name} {method} {batch}":
                     results.append(table(name, problem, method, batch, settings))
                     print_table(results[-1])
-                    sys.stdout.flush()
-    out = options.out or (None if options.smoke else HERE / "results" / "overhead.json")
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(dict(machine=about, tables=results), indent=1) + "\n")
-        print(f"\nwrote {out}")
+    measuring.write(options, about, tables=results)
     return results
 
 

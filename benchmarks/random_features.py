@@ -12,7 +12,6 @@ import argparse
 import functools as ft
 import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
@@ -79,15 +79,11 @@ def solvers(smoke):
 
 def timed(function, *arguments, rounds):
     """What the compiled function returns, its CPU seconds, and those of its compilation."""
-    started = time.process_time()
+    begin = measuring.clock()
     compiled = eqx.filter_jit(function).lower(*arguments).compile()
-    compilation = time.process_time() - started
-    best = np.inf
-    for _ in range(rounds):
-        started = time.process_time()
-        out = jax.block_until_ready(compiled(*arguments))
-        best = min(best, time.process_time() - started)
-    return out, best, compilation
+    compilation = measuring.clock() - begin
+    best = measuring.take_turns({"": lambda: compiled(*arguments)}, rounds)[""]
+    return best.answer, best.seconds, compilation
 
 
 def adaptive(problem, solver, rtol, atol):
@@ -264,7 +260,6 @@ def print_row(row):
 
 
 def main(argv=None):
-    jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     parser.add_argument("--out", type=Path, help="where to write the figures")

@@ -14,7 +14,6 @@ whole numbers of pieces.
 import argparse
 import dataclasses
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
@@ -121,13 +121,7 @@ def compile_solve(solver, system, y0s, max_steps):
 
 
 def seconds(call, repeats):
-    """The least time of the processor: that of the clock depends on what else the machine does."""
-    best = float("inf")
-    for _ in range(repeats + 1):
-        started = time.process_time()
-        jax.block_until_ready(call())
-        best = min(best, time.process_time() - started)
-    return best
+    return measuring.take_turns({"": call}, repeats + 1)[""].seconds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,7 +241,6 @@ def show_estimates(found):
 
 
 def main(argv=None):
-    jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("networks", nargs="*", metavar="NAME", help="shipped networks")
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")

@@ -5,13 +5,22 @@ import json
 import sys
 from pathlib import Path
 
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
 import numpy as np
 import pytest
+
+import diffrax_conserve as dfc
 
 FOLDER = Path(__file__).parent.parent / "benchmarks"
 
 
 def benchmark(name):
+    """The benchmark as a module, loaded by its path; it finds its neighbours as a script does."""
+    if str(FOLDER) not in sys.path:
+        sys.path.append(str(FOLDER))
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -30,7 +39,8 @@ def test_a_smoke_run_measures_verified_answers(overhead, tmp_path, capsys):
     assert len(tables) == 1
     rows = tables[0]["rows"]
     assert {"plain", "projected", "root_find by hand"} <= rows.keys()
-    assert all(row["ns"] > 0 and row["compile_seconds"] > 0 for row in rows.values())
+    assert all(row["ns"] > 0 for row in rows.values())
+    assert all(rows[name]["compile_seconds"] > 0 for name in ("plain", "projected"))
     assert rows["projected"]["drift"] <= overhead.MAX_DRIFT < rows["plain"]["drift"]
     assert json.loads(out.read_text())["tables"] == json.loads(json.dumps(tables))
     assert "rigid-body, RK4, batch of 8" in capsys.readouterr().out
@@ -60,14 +70,223 @@ def test_another_answer_from_c_is_refused(overhead):
         overhead.check_states({"plain": ours, "plain, C": theirs}, 1)
 
 
-# ---- Learned solvers ----
-
-
 @pytest.mark.slow
 def test_c_leaves_the_arithmetic_of_the_process_alone(overhead):
     problem = overhead.PROBLEMS["rigid-body"]
     overhead.hand_written_c(problem, overhead.initial_states(problem, 1))
     assert np.finfo(np.float64).tiny / np.array(2.0) > 0  # subnormal
+
+
+def test_contestants_take_turns_and_long_ones_have_one():
+    measuring, calls = benchmark("measuring"), []
+    runs = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
+    best = measuring.take_turns(runs, rounds=2, long=-1.0)
+    assert calls == ["a", "b"]
+    assert all(result.seconds >= 0 for result in best.values())
+    calls.clear()
+    measuring.take_turns(runs, rounds=2)
+    assert calls == ["a", "b", "a", "a", "b", "b"]  # short ones are run twice, timed once
+
+
+# ---- Error against time, scaling, and what the pages show of it ----
+
+
+@pytest.fixture(scope="module")
+def precision():
+    return benchmark("work_precision")
+
+
+@pytest.fixture(scope="module")
+def precision_curves(precision):
+    return sys.modules["curves"]
+
+
+def test_the_time_to_an_error_is_read_off_a_power_law(precision_curves):
+    rows = [dict(seconds=10.0**k, error=100.0**-k) for k in range(5)]
+    assert precision_curves.time_to(rows, "error", 1e-5) == pytest.approx(10**2.5)
+    assert precision_curves.time_to(rows, "error", 2.0) == 1.0  # the first is accurate enough
+    assert precision_curves.time_to(rows, "error", 1e-9) is None
+
+
+def test_a_drift_that_never_was_too_large_costs_nothing(precision_curves):
+    rows = [dict(seconds=10.0**k, error=100.0**-k, drift=0.0) for k in range(5)]
+    rows[0]["seconds"] = 1e6
+    drifting = [row | {"drift": 1e-10 * row["error"]} for row in rows]
+    found = precision_curves.times_to({"kept": rows, "drifts": drifting}, 1e-5)
+    assert found["kept"]["error"] == found["kept"]["error and drift"] == pytest.approx(10**2.5)
+    assert found["drifts"]["error and drift"] == pytest.approx(10**2.5)  # 1e-15 there
+    drifting = [row | {"drift": 1e-8 * row["error"]} for row in rows]
+    found = precision_curves.times_to({"drifts": drifting}, 1e-5)
+    assert found["drifts"]["error and drift"] == pytest.approx(10**3)
+
+
+def test_one_lucky_error_does_not_count(precision_curves):
+    errors = [1e-2, 1e-9, 1e-4, 1e-6]
+    rows = [dict(seconds=10.0**k, error=error) for k, error in enumerate(errors)]
+    assert 100 < precision_curves.time_to(rows, "error", 1e-5) < 1000
+
+
+def test_every_timed_answer_is_judged(precision):
+    system = precision.SYSTEMS["rigid-body"]
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)
+    contestants = {
+        "projected Tsit5": precision.ours(system, solver, 1, (1e-5, 1e-8)),
+        "scipy DOP853": precision.Contestant(
+            precision.peers.scipy_dop853(precision.peers.EQUATIONS["rigid-body"], precision.T1),
+            (1e-5, 1e-8),
+        ),
+    }
+    start = precision.measuring.initial_states(system, 1)
+    found = precision.curves(system, contestants, start, rounds=1)
+    for coarse, fine in found.values():
+        assert fine["error"] < 1e-5 < 0.1 * coarse["error"]
+    coarse, fine = found["scipy DOP853"]
+    assert 1e-10 < fine["drift"] < 0.1 * coarse["drift"]
+    still = precision.Contestant(lambda tolerance, y0: y0 * (1 + tolerance), (1e-5, 1e-8))
+    with pytest.raises(AssertionError, match="the drift is"):
+        precision.curves(system, {"projected": still}, start, rounds=1)
+    worse = precision.Contestant(lambda tolerance, y0: y0 / tolerance, (1e-5, 1e-8))
+    with pytest.raises(AssertionError, match="not that of a solver that converges"):
+        precision.curves(system, {"a peer": worse}, start, rounds=1)
+
+
+@pytest.mark.parametrize("name", ["rigid-body", "kepler"])
+def test_the_others_solve_our_equations(precision, name):
+    system, equations = precision.SYSTEMS[name], precision.peers.EQUATIONS[name]
+    state = np.random.default_rng(0).uniform(0.5, 1.5, equations.size)
+    y = jfu.ravel_pytree(system.y0)[1](jnp.asarray(state))
+    ours, _ = jfu.ravel_pytree(system.vector_field(0.0, y, None))
+    np.testing.assert_allclose(equations.vector_field(0.0, state), ours, rtol=1e-14)
+    entries = zip(system.manifold.values(), equations.integrals, equations.gradients, strict=True)
+    for entry, integral, gradient in entries:
+        np.testing.assert_allclose(integral(*state), entry.fn(0.0, y, None), rtol=1e-14)
+        ours, _ = jfu.ravel_pytree(jax.grad(lambda y, fn=entry.fn: fn(0.0, y, None))(y))
+        np.testing.assert_allclose(gradient(*state), ours, rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["rigid-body", "kepler"])
+@pytest.mark.parametrize("program", ["CVODE", "CVODE with projection", "heyoka", "homproj"])
+def test_the_others_arrive_where_we_do(precision, name, program):
+    system, equations, t1 = precision.SYSTEMS[name], precision.peers.EQUATIONS[name], 2.0
+    solve = {
+        "CVODE": lambda: precision.peers.cvode(equations, t1, projected=False),
+        "CVODE with projection": lambda: precision.peers.cvode(equations, t1, projected=True),
+        "heyoka": lambda: precision.peers.heyoka(equations, t1, [1e-10], width=2),
+        "homproj": lambda: precision.peers.homproj(equations, t1),
+    }[program]()
+    if solve is None:
+        pytest.skip(f"{program} is not installed")
+    start = precision.measuring.initial_states(system, 3)
+    exact = jax.vmap(lambda y0: system.reference(jnp.array([t1]), y0))(start)
+    exact = precision.flattened(jax.tree.map(lambda leaf: leaf[:, 0], exact))
+    np.testing.assert_allclose(solve(1e-10, precision.flattened(start)), exact, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        dfx.Tsit5(),
+        pytest.param(dfx.Dopri8(), marks=pytest.mark.slow),
+        pytest.param(dfx.Bosh3(), marks=pytest.mark.slow),
+    ],
+)
+def test_a_method_written_out_is_the_same_method(solver):
+    system = dfc.systems.Kepler()
+    written_out = benchmark("written_out").WrittenOut(solver)
+    controller = dfx.ClipStepSizeController(
+        dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=jnp.array([1.0])
+    )
+
+    def states(solver):
+        return dfx.diffeqsolve(
+            dfx.ODETerm(system.vector_field),
+            solver,
+            0.0,
+            2.0,
+            None,
+            system.y0,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 7)),
+            stepsize_controller=controller,
+        )
+
+    ours, theirs = states(written_out), states(solver)
+    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
+    for a, b in zip(ours.ys, theirs.ys, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
+    out = tmp_path / "work_precision.json"
+    found = precision.main(["--smoke", "--out", str(out)])
+    for part in ("rigid-body", "batch"):
+        times = found[part]["times"]
+        assert times["projected Tsit5"]["error and drift"] > 0
+        assert times["plain Dopri8"]["error and drift"] is None
+    assert found["unlike"]["steps"][0] < found["unlike"]["steps"][2]
+    assert json.loads(out.read_text())["parts"] == json.loads(json.dumps(found))
+
+
+def test_the_cost_of_one_constraint_is_measured():
+    scaling = benchmark("scaling")
+    row = scaling.constraints(1, scaling.SMOKE)
+    assert row["projected s/step"] > 0
+    assert row["projected drift"] < scaling.MAX_DRIFT < row["plain drift"]
+    with pytest.raises(AssertionError, match="the drift is"):
+        scaling.check(row | {"projected drift": row["plain drift"]})
+
+
+def test_shares_of_the_limits_of_a_device():
+    scaling = benchmark("scaling")
+    row = {"flops": 300.0, "bytes": 50.0}
+    shares = scaling.Limits(flops=1e12, bandwidth=1e11).share(row, seconds=1e-9)
+    assert shares == pytest.approx(
+        {"flops, share of the limit": 0.3, "bytes, share of the limit": 0.5}
+    )
+    assert scaling.Limits(None, None).share(row, 1e-9) == {}
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_the_scaling():
+    found = benchmark("scaling").main(["--smoke"])
+    for table in found["batch"]:
+        assert all(row["ns"] > 0 for row in table["rows"].values())
+    assert [row["constraints"] for row in found["constraints"]] == [1, 6]
+    assert all(row["without energy"] < row["projection"] for row in found["bodies"])
+
+
+def test_the_results_are_what_the_pages_show():
+    report = benchmark("report")
+    results = report.read_results()
+    pages = [page.read_text(encoding="utf-8") for page in report.PAGES]
+    for page in pages:
+        assert report.filled(page, results) == page
+    for name in report.tables(results):
+        assert any(f"<!-- begin: {name} -->" in page for page in pages)
+
+
+def test_a_goal_is_reached_or_missed():
+    goal = benchmark("report").Goal
+    assert goal("", 2, 1.9).reached
+    assert not goal("", 2, 2.1).reached
+    assert goal("", 10, 11, most=False).reached
+    assert not goal("", 10, 9, most=False).reached
+    assert not goal("", 2, None).reached
+
+
+def test_the_figures_show_every_curve(tmp_path):
+    report = benchmark("report")
+    results = report.read_results()
+    report.write_figures(results, tmp_path)
+    assert {x.name for x in tmp_path.iterdir()} == {"work-precision.png", "scaling.png"}
+    figure = report.figures.work_precision(results["work_precision"])
+    (legend,) = figure.legends
+    parts = results["work_precision"]["parts"]
+    names = {name for part in parts.values() for name in part.get("curves", ())}
+    assert {text.get_text() for text in legend.get_texts()} == names
+
+
+# ---- Learned solvers ----
 
 
 def test_a_smoke_run_of_the_cost_of_learning(capsys):
