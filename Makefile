@@ -92,6 +92,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	$(BIN)/python benchmarks/overhead.py
+	XLA_FLAGS= $(BIN)/python benchmarks/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
 	$(BIN)/python benchmarks/gradients.py
 	$(BIN)/python benchmarks/work_precision.py
 	$(BIN)/python benchmarks/scaling.py

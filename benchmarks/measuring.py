@@ -2,9 +2,9 @@
 machine they ran on, and how far an answer is off its manifold.
 
 Where jax computes on the CPU, times are CPU seconds: what else the machine does is not counted, and
-the second thread that jax takes for large batches is no advantage over C and heyoka, which have
-one. On an accelerator they are seconds of the clock. Contestants take turns, and each counts with
-its best round, so that a machine that slows down slows all of them alike.
+everything has one core, as C and heyoka have. On an accelerator they are seconds of the clock.
+Contestants take turns, and each counts with its best round, so that a machine that slows down slows
+all of them alike.
 """
 
 import argparse
@@ -16,11 +16,22 @@ import os
 import platform
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
+
+if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # not in a test
+    # What the documentation recommends for single trajectories: XLA compiles the loop over the
+    # steps into one kernel if a step accesses less than this, by default 1 kB. An `XLA_FLAGS` that
+    # is set, and be it to nothing, stays.
+    threshold = "xla_cpu_small_while_loop_byte_threshold=65536"
+    os.environ.setdefault("XLA_FLAGS", f"--xla_backend_extra_options={threshold}")
+    # One core, as C and heyoka: XLA divides the larger loops between the cores that it sees.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 import jax
 import jax.flatten_util as jfu

@@ -20,7 +20,6 @@ import measuring
 import numpy as np
 import peers
 from curves import MAX_DRIFT, T1, Contestant, curves, diffeqsolve, flattened, ours, times_to
-from written_out import WrittenOut
 
 import diffrax_conserve as dfc
 
@@ -68,8 +67,8 @@ def one_trajectory(name: str, settings: Settings) -> dict[str, Any]:
         projected = dfc.ManifoldProjection(solver, system.manifold)
         contestants[f"plain {label}"] = ours(system, solver, 1, tolerances)
         contestants[f"projected {label}"] = ours(system, projected, 1, tolerances)
-        written_out = dfc.ManifoldProjection(WrittenOut(solver), system.manifold)
-        contestants[f"projected {label}, written out"] = ours(system, written_out, 1, tolerances)
+        unrolled = dfc.ManifoldProjection(dfc.Unrolled(solver), system.manifold)
+        contestants[f"projected {label}, unrolled"] = ours(system, unrolled, 1, tolerances)
     # heyoka's errors get down to roundoff; the Python programs are slow.
     few = tolerances[::2] if len(tolerances) > 4 else tolerances
     others = {
@@ -96,8 +95,8 @@ def batch(settings: Settings) -> dict[str, Any]:
         "plain Dopri8": ours(system, dfx.Dopri8(), lanes, finer),
         "projected Dopri8": projected(dfx.Dopri8(), tolerances),
         "projected Tsit5": projected(dfx.Tsit5(), tolerances),
-        "projected Dopri8, written out": projected(WrittenOut(dfx.Dopri8()), finer),
-        "projected Tsit5, written out": projected(WrittenOut(dfx.Tsit5()), finer),
+        "projected Dopri8, unrolled": projected(dfc.Unrolled(dfx.Dopri8()), finer),
+        "projected Tsit5, unrolled": projected(dfc.Unrolled(dfx.Tsit5()), finer),
         "projected Dopri8, fixed steps": projected(dfx.Dopri8(), (250, 350, 500, 700), False),
         "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (1_000, 2_000, 4_000), False),
         "projected RK4, fixed steps": projected(dfc.RK4(), (8_000, 16_000, 32_000), False),

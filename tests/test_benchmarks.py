@@ -182,39 +182,6 @@ def test_the_others_arrive_where_we_do(precision, name, program):
     np.testing.assert_allclose(solve(1e-10, precision.flattened(start)), exact, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [
-        dfx.Tsit5(),
-        pytest.param(dfx.Dopri8(), marks=pytest.mark.slow),
-        pytest.param(dfx.Bosh3(), marks=pytest.mark.slow),
-    ],
-)
-def test_a_method_written_out_is_the_same_method(solver):
-    system = dfc.systems.Kepler()
-    written_out = benchmark("written_out").WrittenOut(solver)
-    controller = dfx.ClipStepSizeController(
-        dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=jnp.array([1.0])
-    )
-
-    def states(solver):
-        return dfx.diffeqsolve(
-            dfx.ODETerm(system.vector_field),
-            solver,
-            0.0,
-            2.0,
-            None,
-            system.y0,
-            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 7)),
-            stepsize_controller=controller,
-        )
-
-    ours, theirs = states(written_out), states(solver)
-    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
-    for a, b in zip(ours.ys, theirs.ys, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12)
-
-
 @pytest.mark.slow
 def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
     out = tmp_path / "work_precision.json"
