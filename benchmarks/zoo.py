@@ -304,7 +304,7 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
         "system": name,
         "seed": seed,
         "weights": sum(x.size for x in jax.tree.leaves(weights_of(network))),
-        "epochs": len(log.losses),
+        "epochs": len(log.losses) + (spec.epochs if spec.polish else 0),
         "best_loss": number(log.best),
         "skipped_updates": log.skipped,
         "seconds": round(seconds, 1),
