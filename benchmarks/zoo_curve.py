@@ -21,7 +21,7 @@ import zoo
 import diffrax_conserve as dfc
 
 RESULTS = zoo.ROOT / "results" / "zoo-curve"
-EPOCHS = {"conservative-lorenz": [200, 400, 800], "point-vortices": [50, 100, 200, 400]}
+EPOCHS = {"conservative-lorenz": [200, 400, 800], "point-vortices": [100, 200, 400]}
 SEED = 0
 ERRORS = {"one_step_rms": "one step", "largest_state_error": "500 steps, projected"}
 
