@@ -126,7 +126,8 @@ def error_of_training(
                 ax.plot(
                     seconds, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
                 )
-            ax.set_xscale("log")
+            ax.set_xlim(left=0)
+            ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_yscale("log")
             ax.set_title(title)
             ax.set_xlabel("processor time of the training (s)")

@@ -237,7 +237,7 @@ def test_every_pretrained_network(name, kind):
         np.testing.assert_allclose(y, system.y0, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", SYSTEMS[:4])
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_every_network_of_the_zoo(name):
     network = dfc.load_pretrained(name)
     file = dfc.pretrained_path(name)
