@@ -9,6 +9,8 @@ from ._network import PINN as PINN
 from ._network import Box as Box
 from ._network import ConservativeLayer as ConservativeLayer
 from ._network import DeepONet as DeepONet
+from ._network import Frame as Frame
+from ._network import Repeated as Repeated
 from ._network import Taylor as Taylor
 from ._projection import AbstractProjection as AbstractProjection
 from ._projection import ClosedForm as ClosedForm

@@ -1,4 +1,4 @@
-"""The figures of `reproduce`, for print. The one place that imports matplotlib."""
+"""The figures of `reproduce` and of the zoo, for print. The one place that imports matplotlib."""
 
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,29 @@ def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
         ax.set_xlabel("epoch")
         ax.set_ylabel("training loss")
         _legend(figure, *ax.get_legend_handles_labels())
+        return figure
+
+
+def error_of_training(
+    panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]],
+) -> Figure:
+    """Errors against the seconds of training: one panel for each problem, one curve for each kind
+    of error."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(3.5 * len(panels), 2.7), layout="constrained")
+        axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        for ax, (title, curves) in zip(axes, panels.items(), strict=True):
+            for name, (seconds, errors) in curves.items():
+                ax.plot(
+                    seconds, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
+                )
+            ax.set_xlim(left=0)
+            ax.xaxis.set_major_locator(MaxNLocator(5))
+            ax.set_yscale("log")
+            ax.set_title(title)
+            ax.set_xlabel("processor time of the training (s)")
+        axes[0].set_ylabel("error")
+        _legend(figure, *axes[0].get_legend_handles_labels())
         return figure
 
 

@@ -32,7 +32,9 @@ from ._network import (
     ConservativeLayer,
     DeepONet,
     Gated,
+    MakeFrame,
     Product,
+    Repeated,
     Taylor,
     activation_name,
     output_layer,
@@ -46,7 +48,9 @@ _SUFFIX = ".network"
 _PathLike = str | os.PathLike[str]
 
 
-def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None = None) -> None:
+def save(
+    path: _PathLike, model: PINN | DeepONet | Repeated, *, info: dict[str, Any] | None = None
+) -> None:
     """Writes a network with its configuration into one file.
 
     The file is replaced as a whole: whoever reads it sees the old one or the new one.
@@ -54,10 +58,11 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
     **Arguments:**
 
     - `path`: where to write.
-    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. Of a conservative
-        layer whose manifold is that of a system of the catalogue, the system is written, and
-        likewise of a Taylor polynomial; other manifolds and vector fields are functions, which no
-        file can hold: give the layer or the polynomial again to [`diffrax_conserve.load`][].
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter
+        perhaps in a [`diffrax_conserve.Repeated`][]. Of a conservative layer whose manifold is that
+        of a system of the catalogue, the system is written, and likewise of a Taylor polynomial and
+        of a frame; other manifolds, vector fields and frames are functions, which no file can hold:
+        give the layer, the polynomial or the frame again to [`diffrax_conserve.load`][].
     - `info`: what else to note, such as the system, the sampling domain, the recipe and the
         measured errors: anything that JSON can express. [`diffrax_conserve.read_info`][] reads it.
 
@@ -78,8 +83,11 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
         assert dfc.load("pinn.network")(2.0)[0] == pinn(2.0)[0]
         ```
     """
-    header = {**_describe(model), "versions": _versions(), "info": info or {}}
-    arrays = [np.asarray(x) for x in _arrays(model)]
+    repeated = isinstance(model, Repeated)
+    inner = model.flow_map if repeated else model
+    header = {**_describe(inner), "repeats": model.count if repeated else 1}
+    header |= {"versions": _versions(), "info": info or {}}
+    arrays = [np.asarray(x) for x in _arrays(inner)]
     header["arrays"] = [{"shape": list(x.shape), "dtype": x.dtype.name} for x in arrays]
     try:
         text = json.dumps(header, allow_nan=False).encode()
@@ -95,8 +103,12 @@ def save(path: _PathLike, model: PINN | DeepONet, *, info: dict[str, Any] | None
 
 
 def load(
-    path: _PathLike, *, layer: ConservativeLayer | None = None, taylor: Taylor | None = None
-) -> PINN | DeepONet:
+    path: _PathLike,
+    *,
+    layer: ConservativeLayer | None = None,
+    taylor: Taylor | None = None,
+    frame: MakeFrame | None = None,
+) -> PINN | DeepONet | Repeated:
     """Reads a network that [`diffrax_conserve.save`][] wrote.
 
     **Arguments:**
@@ -104,7 +116,7 @@ def load(
     - `path`: the file.
     - `layer`: the conservative layer, where the file cannot hold it: see
         [`diffrax_conserve.save`][].
-    - `taylor`: likewise the Taylor polynomial.
+    - `taylor`, `frame`: likewise the Taylor polynomial, and the function that finds the frame.
 
     **Returns:**
 
@@ -113,24 +125,34 @@ def load(
     **Raises:**
 
     `ValueError` if the file is not one of ours, is truncated or damaged, was written by another
-    version, or needs a `layer` or `taylor`; `OSError` if it cannot be read.
+    version, or needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
     """
     header, raw = _read(Path(path))
     arrays = _split(header["arrays"], raw)
-    own, static = eqx.partition(_skeleton(header), eqx.is_array)
-    leaves, treedef = jtu.tree_flatten(own)
-    model = eqx.combine(jtu.tree_unflatten(treedef, arrays[: len(leaves)]), static)
-    rest = iter(arrays[len(leaves) :])
-    for part, given in {"layer": layer, "taylor": taylor}.items():
-        built = _part(path, part, header[part], given, rest)
-        if built is not None:
-            where = operator.attrgetter(part)
-            model = eqx.tree_at(where, model, built, is_leaf=lambda x: x is None)
-    return model
+    # The parts that hold functions come last. A network cannot be built without its frame.
+    given = {"layer": layer, "taylor": taylor, "frame": frame}
+    count = len(arrays) - sum(_system_size(header.get(part)) for part in given)
+    rest = iter(arrays[count:])
+    parts = {name: _part(path, name, header.get(name), x, rest) for name, x in given.items()}
+    own, static = eqx.partition(_without(_skeleton(header, parts["frame"])), eqx.is_array)
+    model = eqx.combine(jtu.tree_unflatten(jtu.tree_structure(own), arrays[:count]), static)
+    for name, part in parts.items():
+        if part is not None:
+            where = operator.attrgetter(_PLACES[name])
+            model = eqx.tree_at(where, model, part, is_leaf=lambda x: x is None)
+    repeats = header.get("repeats", 1)
+    return model if repeats == 1 else Repeated(model, repeats)
+
+
+def _system_size(found: Any) -> int:
+    """How many arrays the system of a part has."""
+    if found is None or found["system"] is None:
+        return 0
+    return len(jtu.tree_leaves(systems.get(found["system"])))
 
 
 def _part(path: _PathLike, name: str, found: Any, given: Any, arrays: Iterator[jax.Array]) -> Any:
-    """The layer or the Taylor polynomial: the one that was given, or that of a system."""
+    """The layer, Taylor polynomial or frame: the one that was given, or that of a system."""
     what, example = _PARTS[name]
     if found is None:
         if given is not None:
@@ -149,6 +171,8 @@ def _part(path: _PathLike, name: str, found: Any, given: Any, arrays: Iterator[j
         return given
     if name == "layer":
         return ConservativeLayer(system.manifold, steps=found["steps"])
+    if name == "frame":
+        return system.frame  # pyright: ignore[reportAttributeAccessIssue]
     return Taylor(system.vector_field, found["order"])
 
 
@@ -156,7 +180,10 @@ def _part(path: _PathLike, name: str, found: Any, given: Any, arrays: Iterator[j
 _PARTS = {
     "layer": ("conservative layer", "ConservativeLayer(manifold, steps={steps})"),
     "taylor": ("Taylor polynomial", "Taylor(vector_field, {order})"),
+    "frame": ("frame", "frame"),
 }
+# Where in a network they are.
+_PLACES = {"layer": "layer", "taylor": "taylor", "frame": "domain.frame"}
 
 
 def read_info(path: _PathLike) -> dict[str, Any]:
@@ -209,12 +236,12 @@ def pretrained_path(name: str) -> Path:
     return path
 
 
-def load_pretrained(name: str) -> PINN | DeepONet:
+def load_pretrained(name: str) -> PINN | DeepONet | Repeated:
     """A network that comes with the package.
 
     For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
-    trained by the paper's recipe, the latter with a conservative layer; and for all but the
-    vortices `SYSTEM`, small and trained by [`diffrax_conserve.second_order`][].
+    trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
+    trained by [`diffrax_conserve.second_order`][].
     [`diffrax_conserve.read_info`][] tells the command that made it and its measured errors.
 
     **Arguments:**
@@ -255,13 +282,13 @@ def _describe(model: PINN | DeepONet) -> dict[str, Any]:
         net = output_layer(model.core)
         config = {
             "max_step": model.max_step,
-            "state": _describe_state(model.domain.lower),
+            "state": _describe_state(model.state),
             **_describe_core(model),
         }
     else:
         raise TypeError(
-            f"`save` writes a `PINN` or a `DeepONet`, but was given a {type(model).__name__}. For "
-            "other Modules use `equinox.tree_serialise_leaves`."
+            "`save` writes a `PINN` or a `DeepONet`, also in a `Repeated`, but was given a "
+            f"{type(model).__name__}. For other Modules use `equinox.tree_serialise_leaves`."
         )
     activation = activation_name(net.activation)
     if activation is None:
@@ -275,13 +302,14 @@ def _describe(model: PINN | DeepONet) -> dict[str, Any]:
         "config": config,
         "layer": _describe_layer(model.layer),
         "taylor": _describe_taylor(getattr(model, "taylor", None)),
+        "frame": _describe_frame(getattr(model, "frame", None)),
     }
 
 
 def _describe_core(model: DeepONet) -> dict[str, Any]:
     match model.core:
         case Product(branch=net):
-            latent = net.weights[-1].shape[1] // model.scale.size
+            latent = net.weights[-1].shape[1] // model.core.size
             sizes = {"inputs": "product", "depth": len(net.weights) - 1, "latent": latent}
         case Concatenated(net=net):
             sizes = {"inputs": "concatenated", "depth": len(net.weights) - 1}
@@ -296,6 +324,13 @@ def _describe_taylor(taylor: Taylor | None) -> dict[str, Any] | None:
         return None
     system = _field_system(taylor)
     return {"order": taylor.order, "system": None if system is None else system.name}
+
+
+def _describe_frame(frame: MakeFrame | None) -> dict[str, Any] | None:
+    if frame is None:
+        return None
+    system = _owner(frame)
+    return {"system": None if system is None else system.name}
 
 
 def _describe_layer(layer: ConservativeLayer | None) -> dict[str, Any] | None:
@@ -361,8 +396,9 @@ def _build_state(description: Any) -> Any:
     return jnp.zeros(description["shape"], dtype)
 
 
-def _skeleton(header: dict[str, Any]) -> PINN | DeepONet:
-    """A network of the right shape, with other weights."""
+def _skeleton(header: dict[str, Any], frame: MakeFrame | None) -> PINN | DeepONet:
+    """A network of the right shape, with other weights, and without what holds functions but for
+    the frame."""
     config = dict(header["config"])
     key = jr.key(0)
     if header["kind"] == "PINN":
@@ -370,7 +406,7 @@ def _skeleton(header: dict[str, Any]) -> PINN | DeepONet:
         return PINN(y0, t0, t1, key=key, **config)
     if header["kind"] == "DeepONet":
         states = jtu.tree_map(lambda x: x[None], _build_state(config.pop("state")))
-        return DeepONet(states, config.pop("max_step"), key=key, **config)
+        return DeepONet(states, config.pop("max_step"), frame=frame, key=key, **config)
     raise ValueError(f"The file holds a network of the unknown kind {header['kind']!r}.")
 
 
@@ -391,23 +427,26 @@ def _version(name: str) -> str:
 
 
 def _arrays(model: PINN | DeepONet) -> list[Any]:
-    """Those of the network itself, then the parameters of the system of its layer and of that of
-    its Taylor polynomial."""
-    layer, taylor = model.layer, getattr(model, "taylor", None)
+    """Those of the network itself, then the parameters of the systems of its layer, of its Taylor
+    polynomial and of its frame."""
+    layer, taylor, frame = (getattr(model, name, None) for name in _PARTS)
+    owners = [
+        None if layer is None else _system_of(layer),
+        None if taylor is None else _field_system(taylor),
+        None if frame is None else _owner(frame),
+    ]
     own = jtu.tree_leaves(eqx.filter(_without(model), eqx.is_array))
-    of_layer = None if layer is None else _system_of(layer)
-    of_taylor = None if taylor is None else _field_system(taylor)
-    return [*own, *jtu.tree_leaves(of_layer), *jtu.tree_leaves(of_taylor)]
+    return [*own, *(x for owner in owners for x in jtu.tree_leaves(owner))]
 
 
 def _without(model: PINN | DeepONet) -> Any:
     """The network without those parts that hold functions."""
-    parts = ["layer", "taylor"] if isinstance(model, DeepONet) else ["layer"]
+    names = [name for name in _PARTS if getattr(model, name, None) is not None]
 
     def where(model: Any) -> list[Any]:
-        return [getattr(model, part) for part in parts]
+        return [operator.attrgetter(_PLACES[name])(model) for name in names]
 
-    return eqx.tree_at(where, model, [None] * len(parts), is_leaf=lambda x: x is None)
+    return eqx.tree_at(where, model, [None] * len(names)) if names else model
 
 
 class _Entry(NamedTuple):

@@ -286,6 +286,24 @@ def test_the_zoos_results_are_what_the_documentation_shows():
     assert zoo.tables(zoo.read_results()) in page
 
 
+@pytest.mark.slow
+def test_a_smoke_run_of_the_zoos_curve(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    point = benchmark("zoo_curve").main(["--smoke"])
+    assert 0 < point["one_step_rms"] < 1
+    assert point["cpu_seconds"] > 0
+
+
+def test_the_zoos_curve_is_what_the_documentation_shows(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(FOLDER)
+    curve = benchmark("zoo_curve")
+    results = curve.read_results()
+    page = (FOLDER.parent / "docs" / "zoo.md").read_text(encoding="utf-8")
+    assert curve.table(results) in page
+    curve.draw(results, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
 def test_a_smoke_run_of_the_paper():
     standard, conservative = benchmark("paper").main(["--smoke"])
     assert standard["plain"]["drift"] > 1e-6

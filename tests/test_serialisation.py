@@ -11,7 +11,15 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator, solution
+from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator, solution, states
+
+VORTICES = dfc.systems.PointVortices()
+
+
+def vortices(**options):
+    y0s = states(system=VORTICES)
+    return dfc.DeepONet(y0s, 0.5, frame=VORTICES.frame, key=jr.key(0), **(SMALL | options))
+
 
 NETWORKS = {
     "pinn": solution(activation="sin"),
@@ -26,6 +34,8 @@ NETWORKS = {
         layer=dfc.ConservativeLayer(LORENZ.manifold),
     ),
     "conservative deeponet": flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold)),
+    "framed": vortices(taylor=dfc.Taylor(VORTICES.vector_field)),
+    "repeated": dfc.Repeated(vortices(inputs="concatenated"), 3),
 }
 
 
@@ -77,6 +87,18 @@ def test_a_vector_field_of_the_users_own_is_given_again(path):
     with pytest.raises(ValueError, match=r"taylor=Taylor\(vector_field, 3\)"):
         dfc.load(path)
     assert eqx.tree_equal(dfc.load(path, taylor=taylor), network)
+
+
+def test_a_frame_of_the_users_own_is_given_again(path):
+    def polar(y):
+        across = jnp.stack([-y[1], y[0]])
+        return dfc.Frame(jnp.sum(y**2)[None], jnp.stack([y, across], axis=1))
+
+    network = dfc.DeepONet(EAST[None], 1.0, key=jr.key(0), frame=polar, **SMALL)
+    dfc.save(path, network)
+    with pytest.raises(ValueError, match="frame=frame"):
+        dfc.load(path)
+    assert eqx.tree_equal(dfc.load(path, frame=polar), network)
 
 
 def test_the_info(path):
@@ -215,7 +237,7 @@ def test_every_pretrained_network(name, kind):
         np.testing.assert_allclose(y, system.y0, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", SYSTEMS[:4])
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_every_network_of_the_zoo(name):
     network = dfc.load_pretrained(name)
     file = dfc.pretrained_path(name)

@@ -4,9 +4,13 @@ from ._cores import Product as Product
 from ._cores import output_layer as output_layer
 from ._deeponet import DeepONet as DeepONet
 from ._domain import Box as Box
+from ._domain import FramedBox as FramedBox
+from ._frame import Frame as Frame
+from ._frame import MakeFrame as MakeFrame
 from ._layer import ConservativeLayer as ConservativeLayer
 from ._mlp import MLP as MLP
 from ._mlp import activation_name as activation_name
 from ._pinn import PINN as PINN
 from ._pinn import Window as Window
+from ._repeated import Repeated as Repeated
 from ._taylor import Taylor as Taylor

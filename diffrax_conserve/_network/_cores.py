@@ -1,7 +1,7 @@
 """What a flow map's network does with its two inputs, the initial state and the step.
 
 Each core maps the normalised initial state, a vector of `n` numbers, and the normalised step to a
-vector of `n` numbers.
+vector of `m` numbers.
 """
 
 from typing import final
@@ -20,10 +20,12 @@ class Product(eqx.Module):
 
     branch: MLP
     trunk: MLP
+    size: int = eqx.field(static=True)
 
     def __init__(
         self,
         n: int,
+        m: int,
         width: int,
         depth: int,
         latent: int,
@@ -33,11 +35,12 @@ class Product(eqx.Module):
         key: PRNGKeyArray,
     ):
         branch_key, trunk_key = jr.split(key)
-        self.branch = MLP(n, n * latent, width, depth, activation, dtype, key=branch_key)
-        self.trunk = MLP(1, n * latent, width, depth, activation, dtype, key=trunk_key)
+        self.branch = MLP(n, m * latent, width, depth, activation, dtype, key=branch_key)
+        self.trunk = MLP(1, m * latent, width, depth, activation, dtype, key=trunk_key)
+        self.size = m
 
-    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " n"]:
-        b = self.branch(state).reshape(state.size, -1)
+    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
+        b = self.branch(state).reshape(self.size, -1)
         tau = self.trunk(step[None]).reshape(b.shape)
         return jnp.sum(b * tau, axis=1) / b.shape[1] ** 0.5
 
@@ -51,6 +54,7 @@ class Concatenated(eqx.Module):
     def __init__(
         self,
         n: int,
+        m: int,
         width: int,
         depth: int,
         activation: str | Activation,
@@ -58,9 +62,9 @@ class Concatenated(eqx.Module):
         *,
         key: PRNGKeyArray,
     ):
-        self.net = MLP(n + 1, n, width, depth, activation, dtype, key=key)
+        self.net = MLP(n + 1, m, width, depth, activation, dtype, key=key)
 
-    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " n"]:
+    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         return self.net(jnp.append(state, step))
 
 
@@ -79,6 +83,7 @@ class Gated(eqx.Module):
     def __init__(
         self,
         n: int,
+        m: int,
         width: int,
         depth: int,
         activation: str | Activation,
@@ -94,9 +99,9 @@ class Gated(eqx.Module):
         self.encoders = (layer(n + 1, width, keys[0]), layer(n + 1, width, keys[1]))
         sizes = [n + 1, *([width] * (depth - 1))]
         self.hidden = tuple(layer(s, width, k) for s, k in zip(sizes, keys[3:], strict=True))
-        self.last = layer(width, n, keys[2])
+        self.last = layer(width, m, keys[2])
 
-    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " n"]:
+    def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         activation = self.last.activation
         z = jnp.append(state, step)
         a, b = (activation(encoder(z)) for encoder in self.encoders)

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._custom_types import RealScalarLike, Y
 from .._tree import working_dtype
 from ._cores import Concatenated, Core, Gated, Product
-from ._domain import Box
+from ._domain import Box, FramedBox
 from ._flat import as_state, flatten, unflatten
+from ._frame import MakeFrame, check_frame
 from ._layer import ConservativeLayer
 from ._mlp import Activation, check_sizes
 from ._taylor import Taylor
@@ -34,7 +35,8 @@ class DeepONet(eqx.Module):
     Other networks than this product take the state and the step together: `inputs="concatenated"`
     is a fully connected one, `inputs="gated"` has the input in each of its layers. They are more
     accurate at the same size. With `taylor` it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see
-    [`diffrax_conserve.Taylor`][].
+    [`diffrax_conserve.Taylor`][]. With a `frame` it commutes with the symmetries of the equations,
+    and need not learn them: see [`diffrax_conserve.Frame`][].
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -60,11 +62,11 @@ class DeepONet(eqx.Module):
     core: Core
     layer: ConservativeLayer | None
     max_step: float = eqx.field(static=True)
-    shift: Float[Array, " n"]
-    scale: Float[Array, " n"]
+    shift: Float[Array, " k"]
+    scale: Float[Array, " k"]
     normalise: bool = eqx.field(static=True)
     taylor: Taylor | None
-    domain: Box
+    domain: Box | FramedBox
 
     def __init__(
         self,
@@ -79,29 +81,33 @@ class DeepONet(eqx.Module):
         activation: str | Activation = "tanh",
         normalise: bool = True,
         taylor: Taylor | None = None,
+        frame: MakeFrame | None = None,
         layer: ConservativeLayer | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
         vectors = _vectors(states)
-        dtype, n = vectors.dtype, vectors.shape[1]
+        if frame is None:
+            self.domain, seen, m = Box.around(states), vectors, vectors.shape[1]
+        else:
+            self.domain, seen, m = _framed(frame, states, layer)
+        dtype, n = vectors.dtype, seen.shape[1]
         if inputs == "product":
-            self.core = Product(n, width, depth, latent, activation, dtype, key=key)
+            self.core = Product(n, m, width, depth, latent, activation, dtype, key=key)
         elif inputs in _CORES:
-            self.core = _CORES[inputs](n, width, depth, activation, dtype, key=key)
+            self.core = _CORES[inputs](n, m, width, depth, activation, dtype, key=key)
         else:
             raise ValueError(
                 f'`inputs` is {inputs!r}, but must be "product", "concatenated" or "gated".'
             )
         self.layer = layer
         self.taylor = taylor
-        self.domain = Box.around(states)
         self.max_step = float(max_step)
         self.normalise = normalise
         if normalise:
-            deviation = jnp.std(vectors, axis=0)
-            self.shift = jnp.mean(vectors, axis=0)
+            deviation = jnp.std(seen, axis=0)
+            self.shift = jnp.mean(seen, axis=0)
             self.scale = jnp.where(deviation > 0, deviation, 1)
         else:
             self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
@@ -116,24 +122,51 @@ class DeepONet(eqx.Module):
 
     def candidate(self, y0: Y, h: RealScalarLike) -> Y:
         """The same before the conservative layer."""
-        start = flatten(y0).astype(self.scale.dtype)
-        if start.shape != self.scale.shape:
+        start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
+        if start.size != size:
             raise ValueError(
-                f"This `DeepONet` is for states of {self.scale.size} numbers, but was given one of "
+                f"This `DeepONet` is for states of {size} numbers, but was given one of "
                 f"{start.size}."
             )
-        h = jnp.asarray(h).astype(self.scale.dtype)
-        fraction = h / self.max_step
-        inputs = (start - self.shift) / self.scale
-        learned = self.scale * self.core(inputs, 2 * fraction - 1 if self.normalise else h)
+        h = jnp.asarray(h).astype(start.dtype)
+        fraction, learned = self._learned(start, y0, h)
         if self.taylor is not None:
-            start = flatten(self.taylor(y0, h)).astype(self.scale.dtype)
+            start = flatten(self.taylor(y0, h)).astype(start.dtype)
         return unflatten(start + fraction ** (self.order + 1) * learned, y0)
+
+    def _learned(
+        self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+        """The fraction of the longest step, and what the network adds."""
+        if isinstance(self.domain, Box):
+            fraction = h / self.max_step
+            return fraction, self.scale * self._network(start, h, fraction)
+        frame = self.domain.frame(y0)
+        inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
+        own = (h * frame.clock).astype(start.dtype)
+        fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
+        return fraction, basis @ self._network(inputs, own, fraction)
+
+    def _network(
+        self, inputs: Float[Array, " k"], step: Float[Array, ""], fraction: Float[Array, ""]
+    ) -> Float[Array, " m"]:
+        inputs = (inputs - self.shift) / self.scale
+        return self.core(inputs, 2 * fraction - 1 if self.normalise else step)
 
     @property
     def order(self) -> int:
         """The order that it has whatever its weights: that of its Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
+
+    @property
+    def state(self) -> Y:
+        """A state of the structure, shapes and dtypes of those it is for."""
+        return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
+
+    @property
+    def frame(self) -> MakeFrame | None:
+        """The function that finds the frame of a state, if there is one."""
+        return None if isinstance(self.domain, Box) else self.domain.frame
 
     def radius(self) -> Float[Array, ""]:
         """How far the conservative layer may move a state in one iteration."""
@@ -155,11 +188,15 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
     `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.Taylor`][].
+- `frame`: a function from a state to its [`diffrax_conserve.Frame`][]. The network then sees the
+    frame's inputs, and `normalise` is for these; the domain consists of all states whose inputs are
+    in the box around those of `states` and whose clock is not faster than theirs.
 - `layer`: a [`diffrax_conserve.ConservativeLayer`][].
 
 **Raises:**
 
-`ValueError` or `TypeError` if a size, the step or the states are not what they must be.
+`ValueError` or `TypeError` if a size, the step, the states or the frame are not what they must be,
+or if there are both a frame and a layer.
 """
 
 
@@ -174,3 +211,20 @@ def _vectors(states: Y) -> Float[Array, "samples n"]:
             "`jax.tree.map(lambda x: x[None], y0)`."
         )
     return jax.vmap(flatten)(states).astype(working_dtype(states))
+
+
+def _framed(
+    frame: MakeFrame, states: Y, layer: ConservativeLayer | None
+) -> tuple[FramedBox, Float[Array, "samples k"], int]:
+    """The domain, the inputs of all states, and how many functions are to be learned."""
+    if layer is not None:
+        raise ValueError(
+            "A flow map with a `frame` cannot have a `layer`, which measures how far it may go in "
+            "the units of a whole state. Leave it out, and wrap the solver in "
+            "`diffrax_conserve.ManifoldProjection`."
+        )
+    states = as_state(states)
+    one = jtu.tree_map(lambda x: x[0], states)
+    check_frame(frame, one)
+    frames = jax.vmap(frame)(states)
+    return FramedBox.around(frame, states), frames.inputs, frames.basis.shape[-1]

@@ -3,12 +3,14 @@
 from typing import final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, PyTree, Real, Shaped
 
 from .._custom_types import Y
 from ._flat import as_state
+from ._frame import MakeFrame
 
 
 @final
@@ -84,3 +86,41 @@ Box.__init__.__doc__ = """**Arguments:**
 
 `ValueError` or `TypeError` if they are not alike, or not real.
 """
+
+
+@final
+class FramedBox(eqx.Module):
+    """The states that look, from their frames, like those that a flow map was made with.
+
+    Their inputs are in a box, and their clocks are not faster: of slower ones only the beginning of
+    a step is seen.
+    """
+
+    frame: MakeFrame
+    box: Box  # of pairs of the inputs and the clock
+    example: Y  # one of the states, for their structure
+
+    @classmethod
+    def around(cls, frame: MakeFrame, states: Y) -> "FramedBox":
+        frames = jax.vmap(frame)(states)
+        clocks = jnp.broadcast_to(frames.clock, frames.inputs.shape[:1])
+        box = Box.around((frames.inputs, clocks))
+        # The same state, moved by a symmetry, looks the same only up to roundoff.
+        slack = jtu.tree_map(lambda a, b: _SLACK * (b - a), box.lower, box.upper)
+        lower = (box.lower[0] - slack[0], jnp.zeros_like(box.lower[1]))
+        upper = (box.upper[0] + slack[0], box.upper[1] + slack[1])
+        example = jtu.tree_map(lambda x: x[0], as_state(states))
+        return cls(frame, Box(lower, upper), example)
+
+    @property
+    def fastest(self) -> Array:
+        """The largest clock."""
+        return self.box.upper[1]
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is one of these states, up to symmetries."""
+        frame = self.frame(y)
+        return self.box.contains((frame.inputs, jnp.asarray(frame.clock)))
+
+
+_SLACK = 1e-6

@@ -73,7 +73,9 @@ def pretrained(system: AbstractSystem) -> dict[str, Learned]:
     for kind in KINDS:
         path = pretrained_path(f"{system.name}-{kind}")
         history = read_info(path)["info"]["history"]
-        found[kind] = Learned(load(path), np.array(history["epochs"]), np.array(history["losses"]))
+        network = load(path)
+        assert isinstance(network, Network)
+        found[kind] = Learned(network, np.array(history["epochs"]), np.array(history["losses"]))
     return found
 
 

@@ -79,7 +79,7 @@ def defects(
     p: Int[Array, ""],
     s: Array,
 ) -> Float[Array, "points n"]:
-    """`du/dt - f(t, u)` at every point, as vectors.
+    """`du/dt - f(t, u)` at every point, as vectors; for a model with frames, in those.
 
     The time derivative is one forward-mode pass over the whole batch: half the time of a `vmap` of
     forward passes, and a sixth of that of reverse mode.
@@ -87,8 +87,18 @@ def defects(
     states = path(model, points, p, s)
     y, derivative = jax.jvp(states, (points.ts,), (jnp.ones_like(points.ts),))
     defect = tree_sub(derivative, _field(vector_field, args, points.ts, y))
-    leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(defect)]
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)
+    return _measured(model, points.y0s, defect)
+
+
+def _measured(model: Any, y0s: Y, rates: Y) -> Float[Array, "points n"]:
+    """Rates of change of the states as vectors, in the frames of their initial states if the model
+    has frames."""
+    leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(rates)]
+    vectors = leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)
+    frame = model.frame if isinstance(model, DeepONet) else None
+    if frame is None:
+        return vectors
+    return jax.vmap(lambda y0, rate: frame(y0).measure(rate))(y0s, vectors)
 
 
 def typical_square(
@@ -99,7 +109,8 @@ def typical_square(
         y0s = jtu.tree_map(lambda x: x[None], model.y0)
         return squared_norms(_field(vector_field, args, model.start[None], y0s))[0]
     ts = jnp.zeros_like(points.ts)
-    return jnp.median(squared_norms(_field(vector_field, args, ts, points.y0s)))
+    fields = _field(vector_field, args, ts, points.y0s)
+    return jnp.median(squared_norms(_measured(model, points.y0s, fields)))
 
 
 def _field(vector_field: VectorField, args: Args, ts: Array, ys: Y) -> Y:

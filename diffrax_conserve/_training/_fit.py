@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 
 from .._custom_types import Args, Manifold
 from .._manifold import check_manifold
-from .._network import PINN
+from .._network import PINN, Repeated
 from ._defect import Sampler, VectorField
 from ._epochs import Carry, advance, start
 from ._recipe import Recipe, second_order
@@ -216,6 +216,11 @@ def _check(model: eqx.Module, sample: Sampler | None, manifold: Manifold) -> Non
         raise TypeError(
             f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
             "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
+        )
+    if isinstance(model, Repeated):
+        raise ValueError(
+            "`fit` was given a `Repeated`, which has no weights of its own. Train its inner "
+            "`flow_map`, and repeat that."
         )
     if sample is None:
         raise ValueError(

@@ -4,12 +4,15 @@ from typing import ClassVar, final
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
+from .._network import Frame
 from ._base import real
 from ._reference import AbstractIntegratedSystem
 from ._sampling import annulus
@@ -104,6 +107,39 @@ class PointVortices(AbstractIntegratedSystem):
 
         return jax.lax.while_loop(is_too_close, again, again((key, draw(key))))[1]
 
+    def frame(self, y: State) -> Frame:
+        r"""The frame of three vortices of equal strengths, for a [`diffrax_conserve.DeepONet`][].
+
+        Their flow commutes with translations, rotations, permutations, and changes of scale by $c$
+        together with those of time by $c^2$. What is left of six numbers are two: with $r$ from one
+        to the other of the closest pair, $d = |r|$, and $q$ from their middle to the third vortex,
+        they are the ratio $d / |q|$ and the angle between $r$ and $q$. The third input and the sine
+        and cosine of twice the angle do not depend on which of the pair is the first. The basis
+        stretches and turns $r$ and a vector of length $d$ along $q$, and the clock is $1 / d^2$.
+
+        It is discontinuous where another pair becomes the closest.
+
+        **Raises:**
+
+        `ValueError` unless there are three vortices of equal strengths.
+        """
+        _check_three_equal(self.strengths)
+        third = jnp.argmax(jnp.sum((y - jnp.mean(y, axis=0)) ** 2, axis=1))
+        # The one that is farthest from the centre is opposite the closest pair.
+        alone = jnp.arange(3) == third
+        second, first = jnp.roll(alone, 1), jnp.roll(alone, -1)
+        r, q = second @ y - first @ y, alone @ y - (first @ y + second @ y) / 2
+        d, e = jnp.linalg.norm(r), q / jnp.linalg.norm(q)
+        cosine, sine = r @ e / d, r @ _quarter_turn(e) / d
+        inputs = [cosine**2 - sine**2, 2 * sine * cosine, d / jnp.linalg.norm(q)]
+        # A change of `q` moves all three, one of `r` only the pair: neither moves the centre.
+        of_q, of_r = alone - 1 / 3, (second * 1.0 - first) / 2
+        columns = [
+            *(jnp.outer(of_q, d * x).reshape(-1) for x in (e, _quarter_turn(e))),
+            *(jnp.outer(of_r, x).reshape(-1) for x in (r, _quarter_turn(r))),
+        ]
+        return Frame(jnp.stack(inputs), jnp.stack(columns, axis=1).astype(y.dtype), 1 / d**2)
+
     def trajectories(
         self, ys: Float[Array, "times vortices 2"]
     ) -> dict[str, Float[Array, "times 2"]]:
@@ -114,6 +150,19 @@ PointVortices.__init__.__doc__ = r"""**Arguments:**
 
 - `strengths`: the strengths $\Gamma_1, \dots, \Gamma_N$, whose number is that of the vortices.
 """
+
+
+def _quarter_turn(x: Float[Array, "2"]) -> Float[Array, "2"]:
+    return jnp.stack([-x[1], x[0]])
+
+
+def _check_three_equal(strengths: Float[Array, " vortices"]) -> None:
+    known = not isinstance(strengths, jax.core.Tracer)
+    if strengths.size != 3 or (known and np.ptp(np.asarray(strengths)) > 0):
+        raise ValueError(
+            f"`frame` is for three vortices of equal strengths, but these are {strengths}. For "
+            "others leave the frame out."
+        )
 
 
 def _separations(
