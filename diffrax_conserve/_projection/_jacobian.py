@@ -71,10 +71,13 @@ class AbstractJacobian(eqx.Module):
 
 def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
     """`g(y)` and `G(y)`."""
-    if isinstance(residual, Elements):
+    struct = eqx.filter_eval_shape(residual, y)
+    if isinstance(struct, tuple):
         # One reverse pass per constraint, each of which touches only what that constraint depends
         # on; XLA merges the forward passes.
-        outs, rows = zip(*(jax.value_and_grad(fn)(y) for fn in residual.fns), strict=True)
+        fns = [lambda y, i=i: residual(y)[i] for i in range(len(struct))]
+        fns = residual.fns if isinstance(residual, Elements) else fns
+        outs, rows = zip(*(jax.value_and_grad(fn)(y) for fn in fns), strict=True)
         return outs, _Unrolled(rows)
     out, vjp = jax.vjp(residual, y)
     if out.size > DENSE_MAX:
@@ -89,15 +92,30 @@ def few(residual: Residual, y: Y) -> bool:
     return eqx.filter_eval_shape(residual, y).size <= UNROLLED_MAX
 
 
+class Joined(eqx.Module):
+    """A residual of shape `(m,)`, joined from the arrays that `parts` returns."""
+
+    parts: Callable[[Y], list[Array]]
+
+    def __call__(self, y: Y) -> Real[Array, " m"]:
+        return jnp.concatenate([x.reshape(-1) for x in self.parts(y)])
+
+
 class Elements(eqx.Module):
     """A residual given as a list of functions, whose values are a tuple of scalars."""
 
     fns: list[Residual]
 
     @classmethod
-    def of(cls, residual: Residual, y: Y) -> "Elements":
-        size = eqx.filter_eval_shape(residual, y).size
-        return cls([lambda y, i=i: residual(y)[i] for i in range(size)])
+    def of(cls, residual: Joined, y: Y) -> "Elements":
+        # Of the parts, not of the whole: the gradient of an element of that would be made of the
+        # gradients of all parts, most of them times zero.
+        sizes = [x.size for x in eqx.filter_eval_shape(residual.parts, y)]
+
+        def element(part: int, i: int) -> Residual:
+            return lambda y: residual.parts(y)[part].reshape(-1)[i]
+
+        return cls([element(part, i) for part, size in enumerate(sizes) for i in range(size)])
 
     def __call__(self, y: Y) -> tuple[Array, ...]:
         return tuple(fn(y) for fn in self.fns)

@@ -22,8 +22,7 @@ from .._manifold import (
 )
 from .._tree import tree_mul, tree_sub, working_dtype
 from ._base import AbstractProjection, Problem, ProjectionInfo
-from ._elimination import Vector
-from ._jacobian import linearise
+from ._jacobian import Joined, linearise
 from ._newton import Newton
 
 
@@ -154,16 +153,16 @@ def _problem(
     dtype = working_dtype(candidate)
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
 
-    def vector(tree: PyTree[Array]) -> Vector:
-        return jnp.concatenate([x.astype(dtype).reshape(-1) for x in jtu.tree_leaves(tree)])
-
-    def residual(y: Y) -> Vector:
+    def parts(y: Y) -> list[Array]:
         out = evaluate(manifold, t, y, args)
-        return vector(jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values))
+        residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
+        return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
 
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
-    residual = eqx.filter_closure_convert(residual, candidate)
-    magnitude = vector(jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values))
+    residual = Joined(eqx.filter_closure_convert(parts, candidate))
+    magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)
+    leaves = jtu.tree_leaves(magnitudes)
+    magnitude = jnp.concatenate([x.astype(dtype).reshape(-1) for x in leaves])
     weights = _inverse(projection.metric, candidate)
     return Problem(residual, magnitude, weights, t, args, values)
 

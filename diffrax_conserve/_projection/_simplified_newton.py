@@ -29,7 +29,7 @@ from ._base import (
     within,
 )
 from ._elimination import GramSolver, Vector
-from ._jacobian import AbstractJacobian, Elements, Residual, as_array, few, linearise
+from ._jacobian import AbstractJacobian, Elements, Joined, Residual, as_array, few, linearise
 
 _Iterate = tuple[Y, Vector, Int[Array, ""]]
 
@@ -139,7 +139,7 @@ class _Iteration(eqx.Module):
     def written_out(self) -> tuple["_Iteration", Callable[[Y], Y], Callable[[Y], Y]]:
         """The same with scalars in the place of vectors, if there are few, and of states, if they
         are small, and the maps to its states and back."""
-        if not few(self.residual, self.candidate):
+        if not isinstance(self.residual, Joined) or not few(self.residual, self.candidate):
             return self, _same, _same
         converted = elements_in_scalars(self.residual, self.candidate)
         if converted is None:
