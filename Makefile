@@ -104,7 +104,6 @@ bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
 	$(BIN)/python benchmarks/work_precision.py --smoke
 	$(BIN)/python benchmarks/scaling.py --smoke
 	$(BIN)/python benchmarks/report.py
-	$(BIN)/python benchmarks/many_constraints.py --smoke
 	$(BIN)/python benchmarks/random_features.py --smoke
 
 bench-learned: $(PLOTS) ## measure what learned solvers cost

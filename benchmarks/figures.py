@@ -70,6 +70,8 @@ def work_precision(results: dict[str, Any]) -> Figure:
             for name, rows in results["parts"][part]["curves"].items():
                 legend.setdefault(name, _curve(ax, name, rows))
             ax.set(xscale="log", yscale="log", title=title, xlabel="ms per trajectory to t = 100")
+            if ax.get_xlim()[1] < 100 * ax.get_xlim()[0]:
+                ax.xaxis.set_minor_formatter("")  # of powers of ten, which would overlap
         axes[0].set_ylabel("error at t = 100")
         figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4)
         return figure
