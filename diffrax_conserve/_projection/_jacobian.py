@@ -220,8 +220,9 @@ def _contract(a: Array, b: Array) -> Array:
     fuses and compiles into a loop around it."""
     if a.size * b.size > _SMALL:
         return jnp.tensordot(a, b, axes=1, precision=lax.Precision.HIGHEST)
-    a = jnp.expand_dims(a, range(a.ndim, a.ndim + b.ndim - 1))
-    return jnp.sum(a * b, axis=a.ndim - b.ndim)
+    axis = a.ndim - 1
+    a = jnp.expand_dims(a, range(a.ndim, axis + b.ndim))
+    return jnp.sum(a * jnp.expand_dims(b, range(axis)), axis=axis)
 
 
 _SMALL = 4096
