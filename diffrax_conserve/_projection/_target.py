@@ -12,6 +12,10 @@ from ._base import AbstractProjection, Failure, ProjectionInfo
 from ._project import apply, relative_residual
 
 
+# diffrax traces a step three times, but what is compiled on its own is traced once.
+_apply = eqx.filter_jit(apply)
+
+
 class Target(eqx.Module):
     """Everything that a projection needs but the time and the candidate.
 
@@ -48,7 +52,7 @@ class Target(eqx.Module):
         )
 
     def _project(self, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        y, info = apply(self.projection, self.manifold, self.values, t, candidate, self.args)
+        y, info = _apply(self.projection, self.manifold, self.values, t, candidate, self.args)
         if self.limit is None:
             return y, info
         too_far = (info.result == optx.RESULTS.successful) & ~(info.correction <= self.limit)
