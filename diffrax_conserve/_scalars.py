@@ -86,8 +86,7 @@ def _stacked(scalars: Iterable[Array], shapes: list[tuple[int, ...]]) -> list[Ar
 
 
 def _components(leaves: list[Array]) -> Scalars:
-    flat = [jnp.reshape(x, -1) for x in leaves]
-    return tuple(lax.index_in_dim(x, i, keepdims=False) for x in flat for i in range(x.size))
+    return tuple(x for leaf in leaves for x in jnp.unstack(jnp.reshape(leaf, -1)))
 
 
 _Places = np.ndarray  # of integers
@@ -182,6 +181,27 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
 }
 
 
+# XLA computes a sine again in each loop that uses it, which in a gradient are dozens, but not a
+# quotient: so these are divided by one, which it cannot know.
+@jax.custom_jvp
+def _sin(x: Array) -> Array:
+    return lax.sin(x) / _one(x)
+
+
+@jax.custom_jvp
+def _cos(x: Array) -> Array:
+    return lax.cos(x) / _one(x)
+
+
+def _one(x: Array) -> Array:
+    return lax.stop_gradient(x) * 0 + 1
+
+
+_sin.defjvps(lambda t, _, x: t * _cos(x))
+_cos.defjvps(lambda t, _, x: -t * _sin(x))
+_KEPT = {"sin": _sin, "cos": _cos}
+
+
 class _WriteOut:
     """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
 
@@ -227,7 +247,8 @@ class _WriteOut:
         if name == "unstack":
             return [*np.moveaxis(inputs[0], params["axis"], 0)]
         if name in _ELEMENTWISE:
-            return [self._elementwise(ft.partial(eqn.primitive.bind, **params), inputs)]
+            fn = _KEPT.get(name, ft.partial(eqn.primitive.bind, **params))
+            return [self._elementwise(fn, inputs)]
         if name in _REDUCTIONS:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
         if name in _STRUCTURAL:

@@ -68,3 +68,8 @@ def tree_shapes(a: Any) -> Any:
 def tree_stop_gradient(a: Any) -> Any:
     """`a`, whose arrays count as constants for every derivative."""
     return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, a)
+
+
+def tree_tangents(a: Any, t_a: Any) -> Any:
+    """`t_a`, the tangents of `a`, with zeros in the place of those that are `None`."""
+    return jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, a, t_a)

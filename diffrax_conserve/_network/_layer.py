@@ -1,18 +1,34 @@
 """The conservative layer: a few iterations towards the manifold, as the last layer of a network."""
 
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import check_manifold, conserved_values, evaluate
-from .._projection._jacobian import UNROLLED_MAX, Residual, Vector, linearise
-from .._tree import tree_add, tree_dot, tree_scale, tree_stop_gradient, tree_sub, working_dtype
+from .._projection._jacobian import (
+    Elements,
+    Joined,
+    Residual,
+    Vector,
+    joined,
+    linearise,
+    written_out,
+)
+from .._tree import (
+    tree_add,
+    tree_dot,
+    tree_scale,
+    tree_stop_gradient,
+    tree_sub,
+    tree_tangents,
+    working_dtype,
+)
 from ._mlp import check_sizes
 
 
@@ -90,19 +106,24 @@ class ConservativeLayer(eqx.Module):
         """
         dtype = working_dtype(candidate)
 
-        def residual(y: Y) -> Vector:
+        def parts(y: Y) -> list[Array]:
             out = evaluate(self.manifold, t, y, self.args)
-            return _vector(jtu.tree_map(lambda a, b: a - b.astype(a.dtype), out, values), dtype)
+            out = jtu.tree_map(lambda a, b: a - b.astype(a.dtype), out, values)
+            return [x.astype(dtype) for x in jtu.tree_leaves(out)]
 
-        # Whatever the functions close over becomes part of `residual`'s PyTree.
-        residual = eqx.filter_closure_convert(residual, candidate)
-        magnitude = _vector(jtu.tree_map(jnp.abs, values), dtype)
+        residual, split, join = written_out(Joined(parts), candidate)
+        magnitude = joined([jnp.abs(x).astype(dtype) for x in jtu.tree_leaves(values)])
+        if isinstance(residual, Elements):
+            magnitude = tuple(magnitude)
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
+        start = _stored(split(candidate), p)
+        # Whatever the functions close over becomes part of `residual`'s PyTree.
+        residual = eqx.filter_closure_convert(residual, start)
         fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
-        y, _ = _conserve(residual, candidate, fixed, steps=self.steps)
-        return y
+        y, _ = _conserve(residual, start, fixed, steps=self.steps)
+        return join(y)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
@@ -169,7 +190,9 @@ def _conserve_jvp(primals, tangents, *, steps):
         state = tree_add(candidate, direction)
         return state, residual(state)
 
-    _, (t_y, t_g) = eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
+    t_y, t_g = tree_tangents(
+        *eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
+    )
     _, at_candidate = linearise(*tree_stop_gradient((residual, candidate)))
     _, at_y = linearise(*tree_stop_gradient((residual, y)))
     weights = jtu.tree_map(jnp.ones_like, candidate)
@@ -191,17 +214,15 @@ def _conserve_jvp(primals, tangents, *, steps):
     return (y, multipliers), (tree_add(t_y, direction), t_multipliers)
 
 
+def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:
+    """`tree`, which XLA cannot know. So it stores it, and its cotangent, where it would otherwise
+    compute, element by element, what is stacked to an array."""
+    return lax.cond(p >= 0, lambda x: x, lambda x: jtu.tree_map(jnp.zeros_like, x), tree)
+
+
 def _relative_square(g: Vector, scale: Vector) -> Array:
     def square(a: Array, b: Array) -> Array:
         positive = b > 0
         return jnp.sum(jnp.square(jnp.where(positive, a / jnp.where(positive, b, 1), a)))
 
     return sum(jtu.tree_leaves(jtu.tree_map(square, g, scale)))  # pyright: ignore
-
-
-def _vector(tree: Any, dtype: jnp.dtype) -> Vector:
-    """The constraints as the linear solves want them: few as scalars, many as one array."""
-    leaves = [x.astype(dtype) for x in jtu.tree_leaves(tree)]
-    if sum(x.size for x in leaves) > UNROLLED_MAX:
-        return jnp.concatenate([x.reshape(-1) for x in leaves])
-    return tuple(x.reshape(-1)[i] if x.ndim else x for x in leaves for i in range(x.size))

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._tree import tree_all_finite, tree_dot, tree_sub, working_dtype
 from ._elimination import Vector
-from ._jacobian import AbstractJacobian, Residual
+from ._jacobian import AbstractJacobian, Joined
 
 
 class Failure(eqx.Module):
@@ -127,7 +127,7 @@ class Problem(eqx.Module):
         manifold, from which `residual` was made.
     """
 
-    residual: Residual
+    residual: Joined
     magnitude: Vector
     weights: Y
     t: RealScalarLike

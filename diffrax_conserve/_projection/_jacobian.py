@@ -22,6 +22,7 @@ from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import Y
 from .._manifold import DENSE_MAX, estimated_norms
+from .._scalars import elements_in_scalars
 from .._tree import tree_dot, tree_mul, working_dtype
 from ._elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
@@ -87,9 +88,8 @@ def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
     return out, _Dense(rows)
 
 
-def few(residual: Residual, y: Y) -> bool:
-    """Whether a residual of shape `(m,)` is worth writing out as `m` scalars."""
-    return eqx.filter_eval_shape(residual, y).size <= UNROLLED_MAX
+def joined(parts: list[Array]) -> Real[Array, " m"]:
+    return jnp.concatenate([x.reshape(-1) for x in parts])
 
 
 class Joined(eqx.Module):
@@ -98,7 +98,7 @@ class Joined(eqx.Module):
     parts: Callable[[Y], list[Array]]
 
     def __call__(self, y: Y) -> Real[Array, " m"]:
-        return jnp.concatenate([x.reshape(-1) for x in self.parts(y)])
+        return joined(self.parts(y))
 
 
 class Elements(eqx.Module):
@@ -119,6 +119,24 @@ class Elements(eqx.Module):
 
     def __call__(self, y: Y) -> tuple[Array, ...]:
         return tuple(fn(y) for fn in self.fns)
+
+
+def written_out(
+    residual: Joined, y: Y
+) -> tuple[Joined | Elements, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same residual with scalars in the place of its values, if they are few, and of states,
+    if they are small, and the maps to its states and back."""
+    if eqx.filter_eval_shape(residual, y).size > UNROLLED_MAX:
+        return residual, _same, _same
+    converted = elements_in_scalars(residual, y)
+    if converted is None:
+        return Elements.of(residual, y), _same, _same
+    fns, split, join = converted
+    return Elements(fns), split, join
+
+
+def _same(y: Y) -> Y:
+    return y
 
 
 def as_array(vector: Vector) -> Real[Array, " m"]:

@@ -21,6 +21,7 @@ from .._tree import (
     working_dtype,
 )
 from ._base import (
+    ROUNDOFF_MULTIPLE,
     AbstractProjection,
     Failure,
     Problem,
@@ -216,7 +217,11 @@ def _nearest(
         return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
 
     size = tree_size((candidate, multiplier))
-    tolerance = float(jnp.finfo(working_dtype(candidate)).eps) ** (2 / 3)
+    eps = float(jnp.finfo(working_dtype(candidate)).eps)
+    tolerance = eps ** (2 / 3)
+    # The multipliers of nearly parallel gradients are large and cancel, up to their roundoff.
+    largest = lax.stop_gradient(optx.max_norm(multiplier))
+    atol = tolerance + ROUNDOFF_MULTIPLE * eps * largest
     if size <= _DENSE_MAX:
         # Dependent constraints make the system singular but consistent.
         linear_solver = lx.AutoLinearSolver(well_posed=False)
@@ -224,7 +229,7 @@ def _nearest(
         linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
     solution = optx.root_find(
         optimality,
-        optx.Newton(rtol=tolerance, atol=tolerance, norm=_state_norm, linear_solver=linear_solver),
+        optx.Newton(rtol=tolerance, atol=atol, norm=_state_norm, linear_solver=linear_solver),
         (start, multiplier),
         (residual, candidate, weights, norms),
         adjoint=optx.ImplicitAdjoint(linear_solver=linear_solver),

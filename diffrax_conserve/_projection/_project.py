@@ -22,7 +22,7 @@ from .._manifold import (
 )
 from .._tree import tree_mul, tree_sub, working_dtype
 from ._base import AbstractProjection, Problem, ProjectionInfo
-from ._jacobian import Joined, linearise
+from ._jacobian import Joined, joined, linearise
 from ._newton import Newton
 
 
@@ -161,8 +161,7 @@ def _problem(
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
     residual = Joined(eqx.filter_closure_convert(parts, candidate))
     magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)
-    leaves = jtu.tree_leaves(magnitudes)
-    magnitude = jnp.concatenate([x.astype(dtype).reshape(-1) for x in leaves])
+    magnitude = joined([x.astype(dtype) for x in jtu.tree_leaves(magnitudes)])
     weights = _inverse(projection.metric, candidate)
     return Problem(residual, magnitude, weights, t, args, values)
 

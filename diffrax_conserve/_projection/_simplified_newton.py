@@ -13,8 +13,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._scalars import elements_in_scalars
-from .._tree import tree_add, tree_all_finite, tree_mul, tree_scale
+from .._tree import tree_add, tree_all_finite, tree_mul, tree_scale, tree_tangents
 from ._any_lane import continue_if_any
 from ._base import (
     AbstractProjection,
@@ -29,7 +28,15 @@ from ._base import (
     within,
 )
 from ._elimination import GramSolver, Vector
-from ._jacobian import AbstractJacobian, Elements, Joined, Residual, as_array, few, linearise
+from ._jacobian import (
+    AbstractJacobian,
+    Elements,
+    Joined,
+    Residual,
+    as_array,
+    linearise,
+    written_out,
+)
 
 _Iterate = tuple[Y, Vector, Int[Array, ""]]
 
@@ -122,14 +129,10 @@ def _displaced(jacobian: AbstractJacobian, multiplier: Vector, y: Y, weights: Y)
     return tree_add(y, tree_mul(jacobian.pullback(multiplier), weights))
 
 
-def _same(y: Y) -> Y:
-    return y
-
-
 class _Iteration(eqx.Module):
     """The iteration from one candidate, with its frozen Jacobian."""
 
-    residual: Residual
+    residual: Joined | Elements
     candidate: Y
     weights: Y
     magnitude: Vector
@@ -139,20 +142,14 @@ class _Iteration(eqx.Module):
     def written_out(self) -> tuple["_Iteration", Callable[[Y], Y], Callable[[Y], Y]]:
         """The same with scalars in the place of vectors, if there are few, and of states, if they
         are small, and the maps to its states and back."""
-        if not isinstance(self.residual, Joined) or not few(self.residual, self.candidate):
-            return self, _same, _same
-        converted = elements_in_scalars(self.residual, self.candidate)
-        if converted is None:
-            elements = Elements.of(self.residual, self.candidate)
-            inline = dataclasses.replace(self, residual=elements, magnitude=tuple(self.magnitude))
-            return inline, _same, _same
-        fns, split, join = converted
+        assert isinstance(self.residual, Joined)
+        residual, split, join = written_out(self.residual, self.candidate)
         inline = dataclasses.replace(
             self,
-            residual=Elements(fns),
+            residual=residual,
             candidate=split(self.candidate),
             weights=split(self.weights),
-            magnitude=tuple(self.magnitude),
+            magnitude=tuple(self.magnitude) if isinstance(residual, Elements) else self.magnitude,
         )
         return inline, split, join
 
@@ -188,7 +185,7 @@ _SAFELY = 0.25
 
 @eqx.filter_custom_jvp
 def _solve(
-    residual: Residual,
+    residual: Joined,
     candidate: Y,
     weights: Y,
     magnitude: Vector,
@@ -277,10 +274,7 @@ def _solve_jvp(primals, tangents, *, max_steps):
         y = tree_add(candidate, tree_mul(direction, weights))
         return y, residual(y)
 
-    out, t_out = eqx.filter_jvp(displaced, primals[:3], tangents[:3])
-    t_y, t_g = jtu.tree_map(
-        lambda x, t: jnp.zeros_like(x) if t is None else t, out, t_out, is_leaf=lambda t: t is None
-    )
+    t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, primals[:3], tangents[:3]))
     _, at_candidate = linearise(residual, candidate)
     _, at_y = linearise(residual, y)
     gram_solver = at_y.gram_solver(weights, at_candidate)

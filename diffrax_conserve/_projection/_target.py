@@ -11,7 +11,6 @@ from .._tree import tree_all_finite, working_dtype
 from ._base import AbstractProjection, Failure, ProjectionInfo
 from ._project import apply, relative_residual
 
-
 # diffrax traces a step three times, but what is compiled on its own is traced once.
 _apply = eqx.filter_jit(apply)
 

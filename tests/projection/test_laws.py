@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
@@ -120,6 +120,12 @@ def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
 
 
 @given(y=vectors(4, 10.0), matrix=vectors((2, 4), 1.0), b=vectors(2, 10.0), weights=vectors(4, 1.0))
+@example(
+    y=np.zeros(4),
+    matrix=np.array([[1, 0, 2**-9, 0], [1, 0, 0, 2**-9]]),
+    b=np.array([0.0, 2.0]),
+    weights=np.array([0.0, 0.0, 1.0, 1.0]),
+)
 def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weights):
     assume(np.linalg.cond(matrix) < 1e3 and np.linalg.norm(matrix) > 0.1)
     metric = np.exp(weights)
