@@ -15,7 +15,9 @@ from .._custom_types import Args, Manifold
 from .._manifold import check_manifold
 from .._network import PINN, Repeated
 from ._defect import Sampler, VectorField
-from ._epochs import Carry, advance, start
+from ._epochs import advance
+from ._pool import Pool, check_pool, with_domain
+from ._problem import Carry, start
 from ._recipe import Recipe, second_order
 from ._windows import Joint, with_window
 
@@ -33,7 +35,9 @@ class FitLog(eqx.Module):
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
         what was compared: the loss on the first collocation points with all iterations of the
-        conservative layer, so that epochs with different iterations are comparable.
+        conservative layer, so that epochs with different iterations are comparable. With a
+        [`diffrax_conserve.Pool`][] the loss on where the pool goes next: each time on other states,
+        the same for both models.
     - `best_epoch`, `best`: the epoch of the model that was returned, and its criterion.
     - `skipped`: how many updates were not finite. Each of them was replaced by a return to the best
         model so far, with a new state of the optimiser.
@@ -80,7 +84,8 @@ def fit(
         `(y0, h) -> y` with an attribute `max_step`, all of whose arrays are then trained.
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time.
     - `key`: a random key. The same key gives the same result.
-    - `sample`: for a flow map, a function from a random key to an initial state.
+    - `sample`: for a flow map, a function from a random key to an initial state, or a
+        [`diffrax_conserve.Pool`][], which follows the solutions from there.
     - `args`: passed to `vector_field`.
     - `recipe`: a [`diffrax_conserve.Recipe`][]. Default:
         [`diffrax_conserve.second_order`][]`(model)`.
@@ -117,6 +122,8 @@ def fit(
     """
     _check(model, sample, manifold)
     recipe = second_order(model) if recipe is None else recipe
+    if isinstance(sample, Pool):
+        check_pool(sample, model, args, recipe.refresh, recipe.epochs)
     windows = model.windows if isinstance(model, PINN) else 1
     trainer = _Trainer(vector_field, sample, args, recipe, progress, windows)
     if not isinstance(model, PINN):
@@ -181,7 +188,8 @@ class _Trainer:
             seconds=time.perf_counter() - begun - compile_seconds,
             compile_seconds=compile_seconds,
         )
-        return eqx.combine(carry.best_weights, problem.static), log
+        trained = eqx.combine(carry.best_weights, problem.static)
+        return with_domain(trained, carry.best_domain), log
 
 
 def _joined(logs: list[FitLog], epochs: int) -> FitLog:
