@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .._custom_types import Args, Manifold
-from .._manifold import check_manifold
-from .._network import PINN, Repeated
+from .._network import PINN
+from ._arguments import check_arguments, check_pool
 from ._defect import Sampler, VectorField
 from ._epochs import advance
-from ._pool import Pool, check_pool, with_domain
+from ._pool import Pool, with_domain
 from ._problem import Carry, start
 from ._recipe import Recipe, second_order
 from ._windows import Joint, with_window
@@ -120,10 +120,10 @@ def fit(
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
-    _check(model, sample, manifold)
+    check_arguments(model, sample, manifold)
     recipe = second_order(model) if recipe is None else recipe
     if isinstance(sample, Pool):
-        check_pool(sample, model, args, recipe.refresh, recipe.epochs)
+        check_pool(sample, model, args, recipe)
     windows = model.windows if isinstance(model, PINN) else 1
     trainer = _Trainer(vector_field, sample, args, recipe, progress, windows)
     if not isinstance(model, PINN):
@@ -205,36 +205,6 @@ def _joined(logs: list[FitLog], epochs: int) -> FitLog:
         seconds=sum(log.seconds for log in logs),
         compile_seconds=sum(log.compile_seconds for log in logs),
     )
-
-
-def _check(model: eqx.Module, sample: Sampler | None, manifold: Manifold) -> None:
-    if manifold is not None:
-        check_manifold(manifold)
-        if not (isinstance(model, PINN) and model.windows > 1):
-            raise ValueError(
-                "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "
-                "network has no windows. To conserve its integrals give the network a `layer`, or "
-                "wrap its solver in `ManifoldProjection`."
-            )
-    if isinstance(model, PINN):
-        if sample is not None:
-            raise ValueError("A `PINN` has one initial state, its own: leave `sample` out.")
-        return
-    if not (callable(model) and hasattr(model, "max_step")):
-        raise TypeError(
-            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
-            "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
-        )
-    if isinstance(model, Repeated):
-        raise ValueError(
-            "`fit` was given a `Repeated`, which has no weights of its own. Train its inner "
-            "`flow_map`, and repeat that."
-        )
-    if sample is None:
-        raise ValueError(
-            "A flow map is trained on many initial states: pass `sample`, a function from a random "
-            "key to one of them, for example `sample=system.sample`."
-        )
 
 
 def _report(progress: bool | Progress, done: int, before: int, epochs: int, carry: Carry) -> None:

@@ -12,10 +12,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
-from .._manifold import check_manifold, check_outputs, conserved_values
+from .._manifold import check_manifold, conserved_values
 from .._network import Box, FramedBox
-from .._projection import check_state, project
-from .._solver._learned import check_output
+from .._projection import project
 from .._tree import tree_all_finite
 from ._defect import Points, Sampler
 
@@ -167,18 +166,3 @@ def domain_of(model: Any) -> Box | FramedBox | None:
 
 def with_domain(model: Any, domain: Box | FramedBox | None) -> Any:
     return model if domain is None else eqx.tree_at(lambda m: m.domain, model, domain)
-
-
-def check_pool(pool: Pool, model: Any, args: Args, refresh: int | None, epochs: int) -> None:
-    """Raises unless a pool can grow, and its states are what model and manifold are for."""
-    if refresh is None or refresh >= epochs:
-        raise ValueError(
-            f"A `Pool` grows when points are drawn anew, but with `refresh={refresh}` in a recipe "
-            f"of {epochs} epochs that is never. Write for example "
-            "`recipe=dataclasses.replace(recipe, refresh=1)`."
-        )
-    y0 = jtu.tree_map(jnp.asarray, pool.sample(jr.key(0)))
-    check_state(y0, "a `Pool`")
-    check_output(model, (y0, float(model.max_step)), y0, "model")
-    if pool.manifold is not None:
-        check_outputs(pool.manifold, 0.0, y0, args)
