@@ -26,7 +26,7 @@ def advance(
     Both may be traced, so that all rounds share one compilation.
     """
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(problem, carry, e), carry)
-    criterion, best = _compared(problem, carry, stop)
+    criterion, best = _compared(problem, carry)
     better = criterion < best
     carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
@@ -37,56 +37,53 @@ def advance(
     return carry, criterion
 
 
-def _compared(
-    problem: Problem, carry: Carry, epoch: Int[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _compared(problem: Problem, carry: Carry) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The criterion of the model, and that of the best one so far."""
     if not isinstance(problem.sample, Pool):
         return problem.criterion(carry.weights, problem.first_points), carry.best
-    # The first states are not those that it goes to, and those that it has just been trained on
-    # favour the last update. So both models are judged on where the pool goes next.
-    points = _anew(problem, carry, epoch)
-    best = problem.criterion(carry.best_weights, points)
+    # The first states are not those that it goes to. On those of the next epoch neither model has
+    # been trained.
+    best = problem.criterion(carry.best_weights, carry.points)
     best = jnp.where(jnp.isfinite(carry.best), best, jnp.inf).astype(carry.best.dtype)
-    return problem.criterion(carry.weights, points), best
+    return problem.criterion(carry.weights, carry.points), best
 
 
 def _epoch(problem: Problem, carry: Carry, epoch: Int[Array, ""]) -> Carry:
-    """One update."""
-    points = _refreshed(problem, carry, epoch)
+    """One update, and the points for the next one."""
     p, s = problem.schedule(epoch)
     update = _by_least_squares if isinstance(problem.optimiser, SecondOrder) else _by_gradient
-    weights, optimiser_state, loss = update(problem, carry, points, p, s, epoch)
+    weights, optimiser_state, loss = update(problem, carry, p, s, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # A model that is not finite stays so if only this update is left out: every point is used in
     # every epoch. So go back to the best one.
     fresh = problem.optimiser.init(carry.best_weights)
-    return carry._replace(
+    carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
-        points=points,
-        domain=_seen(problem, carry.domain, points, epoch),
+        domain=_seen(problem, carry, epoch),
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
+    return carry._replace(points=_refreshed(problem, carry, epoch + 1))
 
 
 def _by_gradient(
-    problem: Problem, carry: Carry, points: Points, p: Array, s: Array, epoch: Array
+    problem: Problem, carry: Carry, p: Array, s: Array, epoch: Array
 ) -> tuple[Any, Any, Float[Array, ""]]:
     del epoch
-    loss, gradient = eqx.filter_value_and_grad(problem.loss)(carry.weights, points, p, s)
+    loss, gradient = eqx.filter_value_and_grad(problem.loss)(carry.weights, carry.points, p, s)
     assert not isinstance(problem.optimiser, SecondOrder)
     updates, state = problem.optimiser.update(gradient, carry.optimiser_state, carry.weights)
     return eqx.apply_updates(carry.weights, updates), state, loss
 
 
 def _by_least_squares(
-    problem: Problem, carry: Carry, points: Points, p: Array, s: Array, epoch: Array
+    problem: Problem, carry: Carry, p: Array, s: Array, epoch: Array
 ) -> tuple[Any, Any, Float[Array, ""]]:
     """The same by a second-order method, for which the weights are one vector."""
     assert isinstance(problem.optimiser, SecondOrder)
     vector, restore = ravel_pytree(carry.weights)
+    points = carry.points
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
@@ -106,10 +103,10 @@ def _by_least_squares(
 
 
 def _refreshed(problem: Problem, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    recipe = problem.recipe
-    if recipe.refresh is None:
+    """The points for that epoch."""
+    if problem.recipe.refresh is None:
         return carry.points
-    due = (epoch % recipe.refresh == 0) & (epoch > 0)
+    due = epoch % problem.recipe.refresh == 0
     return lax.cond(due, lambda: _anew(problem, carry, epoch), lambda: carry.points)
 
 
@@ -130,13 +127,13 @@ def _anew(problem: Problem, carry: Carry, epoch: Int[Array, ""]) -> Points:
     return points._replace(y0s=y0s)
 
 
-def _seen(problem: Problem, domain: Any, points: Points, epoch: Int[Array, ""]) -> Any:
-    """The domain extended by the states of a pool."""
-    if domain is None:
+def _seen(problem: Problem, carry: Carry, epoch: Int[Array, ""]) -> Any:
+    """The domain, extended by the states of a pool."""
+    if carry.domain is None:
         return None
     # Before that the network may have gone where no solution does.
     late = 2 * epoch >= problem.recipe.epochs
-    return _where(late, domain.extended(points.y0s), domain)
+    return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
 
 
 def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:

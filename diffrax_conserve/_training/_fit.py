@@ -36,8 +36,8 @@ class FitLog(eqx.Module):
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
         what was compared: the loss on the first collocation points with all iterations of the
         conservative layer, so that epochs with different iterations are comparable. With a
-        [`diffrax_conserve.Pool`][] the loss on where the pool goes next: each time on other states,
-        the same for both models.
+        [`diffrax_conserve.Pool`][] the loss on its states for the next epoch: each time others, the
+        same for both models.
     - `best_epoch`, `best`: the epoch of the model that was returned, and its criterion.
     - `skipped`: how many updates were not finite. Each of them was replaced by a return to the best
         model so far, with a new state of the optimiser.

@@ -137,7 +137,7 @@ def moved(
     domain = domain_of(model)
 
     def state(y0: Y, h: Array, fresh: Y, goes_on: Array) -> Y:
-        end = jtu.tree_map(lambda a, b: a.astype(b.dtype), model(y0, h), y0)
+        end = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), model(y0, h), y0)
         end, good = _projected(pool.manifold, args, y0, end)
         good = good & goes_on & tree_all_finite(end)
         if pool.keep is not None:
