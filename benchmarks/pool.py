@@ -27,7 +27,6 @@ EPOCHS = {"double-pendulum": 400, "conservative-lorenz": 600}
 WHERE = {
     "sample": "where solves start",
     "pool": "`Pool`",
-    "unguarded": "`Pool`, `max_defect=inf`",
     "reachable": "`reachable_states`",
 }
 
@@ -40,9 +39,8 @@ def train(system, spec, where, seed):
     if where == "reachable":
         states = zoo.reachable(system, spec, spec.pool, seed)
         sample = dfc.from_states(states)
-    elif where != "sample":
-        guard = {} if where == "pool" else {"max_defect": jnp.inf}
-        sample = dfc.Pool(system.sample, manifold=system.manifold, **guard)
+    elif where == "pool":
+        sample = dfc.Pool(system.sample, manifold=system.manifold)
     network = dfc.DeepONet(
         states, system.dt,
         width=spec.width, depth=spec.depth, inputs=spec.inputs,

@@ -31,11 +31,14 @@ class Pool(eqx.Module):
     of one epoch are the pool, and whenever the recipe draws points anew, each state goes where the
     network takes it in a step of random length, projected onto the manifold through it. Every state
     starts again from `sample` after `mean_steps` steps in the mean. That costs an evaluation of the
-    network; nothing is solved, other than by [`diffrax_conserve.reachable_states`][].
+    network; unlike for [`diffrax_conserve.reachable_states`][] nothing is solved.
 
-    A step is taken only if its defect is small. In the beginning hardly any is, so the network
-    first learns the states of `sample`, then those around, and what it does not resolve it does not
-    go on from.
+    A step is taken only if its defect at the end is small. In the beginning few are, so the network
+    first learns the states of `sample`, then those around them, and never those to which it was
+    led by a step that it has not learned.
+
+    Make the network with `states` that are spread about as far as the solutions will be: they
+    normalise its inputs.
 
     The `domain` of the network that is trained covers the states that the pool held in the second
     half of the epochs, besides those that the network was made with. (With a frame its largest
@@ -106,8 +109,8 @@ Pool.__init__.__doc__ = r"""**Arguments:**
 - `sample`: a function from a random key to an initial state, where solves start.
 - `manifold`: where the states are projected; each keeps the values of its integrals from its
     start. Default: nothing is projected.
-- `mean_steps`: after how many steps a state starts again, in the mean: about twice as many as a
-    solve takes, since steps have any length up to the longest.
+- `mean_steps`: after how many steps a state starts again, in the mean. They have any length up to
+    the longest, so solutions are followed for about half as many of these.
 - `max_defect`: the largest defect at the end of a step that is taken, relative to the median of
     $|f|$ over the first states.
 - `keep`: which states to go on from: a function of one state. Others start again.

@@ -237,7 +237,7 @@ def fitted(network, sample, epochs=300, field=oscillator):
     return dfc.fit(network, field, key=KEY, sample=sample, recipe=recipe)
 
 
-def test_it_learns_where_it_was_never_told_to_look():
+def test_it_learns_where_it_was_never_told_to_look(tmp_path):
     """On the other side of the circle, from samples on this one: no solution is given."""
     there = -Y0S
     turn = jnp.array([[jnp.cos(1.0), -jnp.sin(1.0)], [jnp.sin(1.0), jnp.cos(1.0)]])
@@ -246,11 +246,14 @@ def test_it_learns_where_it_was_never_told_to_look():
         ends = jax.jit(jax.vmap(network, (0, None)))(there, 1.0)
         return float(jnp.max(radii(ends - there @ turn)))
 
-    near, _ = fitted(small_network(), near_east)
-    far, log = fitted(small_network(), dfc.Pool(near_east, manifold=RADIUS))
+    near, _ = fitted(small_network(), near_east, epochs=200)
+    far, log = fitted(small_network(), dfc.Pool(near_east, manifold=RADIUS), epochs=200)
     assert error(far) < 0.02 < 0.2 < error(near)
-    assert float(jnp.mean(jax.vmap(far.domain.contains)(there))) > 0.9
     assert log.skipped == 0
+    dfc.save(tmp_path / "far.network", far)
+    domain = dfc.load(tmp_path / "far.network").domain
+    assert float(jnp.mean(jax.vmap(domain.contains)(there))) > 0.9
+    assert not np.any(jax.vmap(near.domain.contains)(there))
 
 
 def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
@@ -270,6 +273,16 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
     before, after = next_states(wild)
     assert not np.any(np.asarray(before == after))
     assert float(jnp.max(radii(after))) <= 2
+
+
+@pytest.mark.slow
+def test_a_pool_goes_where_the_whole_network_leads():
+    """Its conservative layer included: without a projection the states stay on the circle."""
+    layer = dfc.ConservativeLayer(RADIUS, steps=4)
+    trained, log = fitted(small_network(layer=layer), dfc.Pool(near_east), epochs=60)
+    assert log.best < 0.01 * log.criteria[0]
+    corners = jnp.stack([trained.domain.lower, trained.domain.upper])
+    assert float(jnp.max(jnp.abs(corners))) < 2.001
 
 
 # ---- Frames ----
