@@ -67,7 +67,7 @@ def judge(system, spec, network, steps, states):
         "one_step_rms": zoo.one_step(system, solver, fresh, exact)[0],
         "largest_state_error": rollout["largest_state_error"],
         "failed": rollout["failed"],
-        "outside": float(1 - jnp.mean(inside)),
+        "outside": float(np.mean(~np.asarray(inside))),
     }
 
 
