@@ -307,9 +307,9 @@ def test_the_zoos_curve_is_what_the_documentation_shows(monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_a_smoke_run_of_the_pool(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
-    sample, grown, reachable = benchmark("pool").main(["--smoke"])
+    sample, grown = benchmark("pool").main(["--smoke"])
     assert grown["outside"] < sample["outside"]
-    assert all(0 < row["one_step_rms"] < 1 for row in (sample, grown, reachable))
+    assert 0 < grown["one_step_rms"] < 1
 
 
 def test_the_pools_results_are_what_the_documentation_shows(monkeypatch):

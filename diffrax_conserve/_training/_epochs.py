@@ -41,8 +41,8 @@ def _compared(problem: Problem, carry: Carry) -> tuple[Float[Array, ""], Float[A
     """The criterion of the model, and that of the best one so far."""
     if not isinstance(problem.sample, Pool):
         return problem.criterion(carry.weights, problem.first_points), carry.best
-    # The first states are not those that it goes to. With `refresh=1` neither model has been trained
-    # on those of the next epoch.
+    # The first states are not those that it goes to. With `refresh=1` neither model has been
+    # trained on those of the next epoch.
     best = problem.criterion(carry.best_weights, carry.points)
     best = jnp.where(jnp.isfinite(carry.best), best, jnp.inf).astype(carry.best.dtype)
     return problem.criterion(carry.weights, carry.points), best

@@ -33,9 +33,9 @@ class Pool(eqx.Module):
     starts again from `sample` after `mean_steps` steps in the mean. That costs an evaluation of the
     network; unlike for [`diffrax_conserve.reachable_states`][] nothing is solved.
 
-    A step is taken only if its defect at the end is small. In the beginning few are, so the network
-    first learns the states of `sample`, then those around them, and never those to which it was
-    led by a step that it has not learned.
+    A step is taken only if its defect at the end is not large. While the network is wrong few are,
+    so that it first learns the states of `sample`, and is never led to where no solution goes or
+    the step cannot resolve what happens.
 
     Make the network with `states` that are spread about as far as the solutions will be: they
     normalise its inputs.
@@ -77,7 +77,7 @@ class Pool(eqx.Module):
         *,
         manifold: Manifold = None,
         mean_steps: RealScalarLike = 20,
-        max_defect: RealScalarLike = 0.1,
+        max_defect: RealScalarLike = 1.0,
         keep: Callable[[Any], Bool[Array, ""]] | None = None,
     ):
         self.sample = sample
@@ -112,7 +112,7 @@ Pool.__init__.__doc__ = r"""**Arguments:**
 - `mean_steps`: after how many steps a state starts again, in the mean. They have any length up to
     the longest, so solutions are followed for about half as many of these.
 - `max_defect`: the largest defect at the end of a step that is taken, relative to the median of
-    $|f|$ over the first states.
+    $|f|$ over the first states. That of a network that stands still is about one.
 - `keep`: which states to go on from: a function of one state. Others start again.
 
 **Raises:**
