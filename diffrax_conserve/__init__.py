@@ -38,6 +38,7 @@ from ._solver import statistics as statistics
 from ._training import SPRING as SPRING
 from ._training import FitLog as FitLog
 from ._training import LevenbergMarquardt as LevenbergMarquardt
+from ._training import Pool as Pool
 from ._training import Recipe as Recipe
 from ._training import bounded as bounded
 from ._training import constant_weight as constant_weight

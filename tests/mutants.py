@@ -107,6 +107,18 @@ MUTANTS = {
         "            unsolved(found | True),",
         ("tests/solver/test_random_features_in_diffrax.py", "-k", "say_so"),
     ),
+    "follow the network wherever it goes": Mutant(
+        "_training/_pool.py",
+        "goes_on = small & ~jr.bernoulli(",
+        "goes_on = ~jr.bernoulli(",
+        ("tests/training/test_pool.py", "-k", "leads_nowhere"),
+    ),
+    "judge the best model on the states of its time": Mutant(
+        "_training/_epochs.py",
+        "best = problem.criterion(carry.best_weights, carry.points)",
+        "best = carry.best",
+        ("tests/training/test_pool.py", "-k", "compared_on_the_same"),
+    ),
 }
 
 

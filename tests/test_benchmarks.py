@@ -304,6 +304,21 @@ def test_the_zoos_curve_is_what_the_documentation_shows(monkeypatch, tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
+def test_a_smoke_run_of_the_pool(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    sample, grown = benchmark("pool").main(["--smoke"])
+    assert grown["outside"] < sample["outside"]
+    assert 0 < grown["one_step_rms"] < 1
+
+
+def test_the_pools_results_are_what_the_documentation_shows(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    pool = benchmark("pool")
+    page = (FOLDER.parent / "docs" / "training.md").read_text(encoding="utf-8")
+    assert pool.table(json.loads(pool.OUT.read_text())) in page
+
+
 def test_a_smoke_run_of_the_paper():
     standard, conservative = benchmark("paper").main(["--smoke"])
     assert standard["plain"]["drift"] > 1e-6

@@ -1,5 +1,6 @@
 """The states that a flow map was trained for."""
 
+from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
@@ -65,6 +66,16 @@ class Box(eqx.Module):
         lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
         return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
 
+    def extended(self, states: Y) -> "Box":
+        """The smallest box around this one and `states`, which are stacked along a leading axis."""
+        other = Box.around(states)
+
+        def joined(choose: Callable[..., Array], a: Y, b: Y) -> Y:
+            return jtu.tree_map(lambda x, y: choose(x, y.astype(x.dtype)), a, b)
+
+        lower = joined(jnp.minimum, self.lower, other.lower)
+        return Box(lower, joined(jnp.maximum, self.upper, other.upper))
+
     def contains(self, y: Y) -> Bool[Array, ""]:
         """Whether `y` is in the box, its boundary included. NaN is not."""
         if jtu.tree_structure(y) != jtu.tree_structure(self.lower):
@@ -111,6 +122,17 @@ class FramedBox(eqx.Module):
         upper = (box.upper[0] + slack[0], box.upper[1] + slack[1])
         example = jtu.tree_map(lambda x: x[0], as_state(states))
         return cls(frame, Box(lower, upper), example)
+
+    def extended(self, states: Y) -> "FramedBox":
+        """The same with the inputs of `states`, too.
+
+        The largest clock stays: the network measures its time by it.
+        """
+        seen = FramedBox.around(self.frame, states).box
+        inputs = self.box.lower[0], self.box.upper[0]
+        around = Box(*inputs).extended(jnp.stack([seen.lower[0], seen.upper[0]]))
+        box = Box((around.lower, self.box.lower[1]), (around.upper, self.box.upper[1]))
+        return FramedBox(self.frame, box, self.example)
 
     @property
     def fastest(self) -> Array:

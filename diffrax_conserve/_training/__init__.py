@@ -2,6 +2,7 @@ from ._fit import FitLog as FitLog
 from ._fit import fit as fit
 from ._loss import bounded as bounded
 from ._loss import mean_square as mean_square
+from ._pool import Pool as Pool
 from ._reachable import from_states as from_states
 from ._reachable import reachable_states as reachable_states
 from ._recipe import Recipe as Recipe

@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .._custom_types import Args, Manifold
-from .._manifold import check_manifold
-from .._network import PINN, Repeated
+from .._network import PINN
+from ._arguments import check_arguments, check_pool
 from ._defect import Sampler, VectorField
-from ._epochs import Carry, advance, start
+from ._epochs import advance
+from ._pool import Pool, with_domain
+from ._problem import Carry, start
 from ._recipe import Recipe, second_order
 from ._windows import Joint, with_window
 
@@ -33,7 +35,9 @@ class FitLog(eqx.Module):
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
         what was compared: the loss on the first collocation points with all iterations of the
-        conservative layer, so that epochs with different iterations are comparable.
+        conservative layer, so that epochs with different iterations are comparable. With a
+        [`diffrax_conserve.Pool`][] the loss on its states for the next epoch: each time others, the
+        same for both models.
     - `best_epoch`, `best`: the epoch of the model that was returned, and its criterion.
     - `skipped`: how many updates were not finite. Each of them was replaced by a return to the best
         model so far, with a new state of the optimiser.
@@ -80,7 +84,8 @@ def fit(
         `(y0, h) -> y` with an attribute `max_step`, all of whose arrays are then trained.
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time.
     - `key`: a random key. The same key gives the same result.
-    - `sample`: for a flow map, a function from a random key to an initial state.
+    - `sample`: for a flow map, a function from a random key to an initial state, or a
+        [`diffrax_conserve.Pool`][], which follows the solutions from there.
     - `args`: passed to `vector_field`.
     - `recipe`: a [`diffrax_conserve.Recipe`][]. Default:
         [`diffrax_conserve.second_order`][]`(model)`.
@@ -115,8 +120,10 @@ def fit(
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
-    _check(model, sample, manifold)
+    check_arguments(model, sample, manifold)
     recipe = second_order(model) if recipe is None else recipe
+    if isinstance(sample, Pool):
+        check_pool(sample, model, args, recipe)
     windows = model.windows if isinstance(model, PINN) else 1
     trainer = _Trainer(vector_field, sample, args, recipe, progress, windows)
     if not isinstance(model, PINN):
@@ -181,7 +188,8 @@ class _Trainer:
             seconds=time.perf_counter() - begun - compile_seconds,
             compile_seconds=compile_seconds,
         )
-        return eqx.combine(carry.best_weights, problem.static), log
+        trained = eqx.combine(carry.best_weights, problem.static)
+        return with_domain(trained, carry.best_domain), log
 
 
 def _joined(logs: list[FitLog], epochs: int) -> FitLog:
@@ -197,36 +205,6 @@ def _joined(logs: list[FitLog], epochs: int) -> FitLog:
         seconds=sum(log.seconds for log in logs),
         compile_seconds=sum(log.compile_seconds for log in logs),
     )
-
-
-def _check(model: eqx.Module, sample: Sampler | None, manifold: Manifold) -> None:
-    if manifold is not None:
-        check_manifold(manifold)
-        if not (isinstance(model, PINN) and model.windows > 1):
-            raise ValueError(
-                "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "
-                "network has no windows. To conserve its integrals give the network a `layer`, or "
-                "wrap its solver in `ManifoldProjection`."
-            )
-    if isinstance(model, PINN):
-        if sample is not None:
-            raise ValueError("A `PINN` has one initial state, its own: leave `sample` out.")
-        return
-    if not (callable(model) and hasattr(model, "max_step")):
-        raise TypeError(
-            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
-            "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
-        )
-    if isinstance(model, Repeated):
-        raise ValueError(
-            "`fit` was given a `Repeated`, which has no weights of its own. Train its inner "
-            "`flow_map`, and repeat that."
-        )
-    if sample is None:
-        raise ValueError(
-            "A flow map is trained on many initial states: pass `sample`, a function from a random "
-            "key to one of them, for example `sample=system.sample`."
-        )
 
 
 def _report(progress: bool | Progress, done: int, before: int, epochs: int, carry: Carry) -> None:

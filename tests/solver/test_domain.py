@@ -68,6 +68,14 @@ def test_a_box_contains_what_it_was_built_around_and_nothing_beyond(seed):
     assert not box.contains({**highest, "p": (jnp.array(jnp.nan),)})
 
 
+@given(st.integers(0, 10**6))
+def test_an_extended_box_is_the_one_around_all(seed):
+    rng = np.random.default_rng(seed)
+    points = {"q": rng.normal(size=(7, 2)), "p": (rng.normal(size=7),)}
+    first, others = (jax.tree.map(lambda x, s=s: x[s], points) for s in (np.s_[:3], np.s_[3:]))
+    assert eqx.tree_equal(dfc.Box.around(first).extended(others), dfc.Box.around(points))
+
+
 def test_wrong_boxes_are_refused():
     with pytest.raises(ValueError, match="Both must be those of a state"):
         dfc.Box(jnp.zeros(2), jnp.ones(3))
