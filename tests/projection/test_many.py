@@ -2,6 +2,7 @@
 
 import diffrax as dfx
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -42,7 +43,7 @@ def test_the_rows_are_never_formed():
         for equation in jaxpr.eqns:
             for variable in equation.outvars:
                 yield variable.aval.size
-            for sub in jax.core.jaxprs_in_params(equation.params):
+            for sub in jax.extend.core.jaxprs_in_params(equation.params):
                 yield from shapes(sub)
 
     # One row is 3 (BONDS + 1) numbers; the probes of the norms are 16 states.
