@@ -111,16 +111,16 @@ class ConservativeLayer(eqx.Module):
             out = jtu.tree_map(lambda a, b: a - b.astype(a.dtype), out, values)
             return [x.astype(dtype) for x in jtu.tree_leaves(out)]
 
-        residual, split, join = written_out(Joined(parts), candidate)
+        function, split, join = written_out(Joined(parts), candidate)
         magnitude = joined([jnp.abs(x).astype(dtype) for x in jtu.tree_leaves(values)])
-        if isinstance(residual, Elements):
+        if isinstance(function, Elements):
             magnitude = tuple(magnitude)
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
         start = _stored(split(candidate), p)
         # Whatever the functions close over becomes part of `residual`'s PyTree.
-        residual = eqx.filter_closure_convert(residual, start)
+        residual = eqx.filter_closure_convert(lambda y: function(_stored(y, p)), start)
         fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
         y, _ = _conserve(residual, start, fixed, steps=self.steps)
         return join(y)
@@ -215,8 +215,9 @@ def _conserve_jvp(primals, tangents, *, steps):
 
 
 def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:
-    """`tree`, which XLA cannot know. So it stores it, and its cotangent, where it would otherwise
-    compute, element by element, what is stacked to an array."""
+    """`tree`, which XLA cannot know: so it stores it, and likewise its cotangent. Otherwise it
+    computes all that led to them again in each loop that uses them, and, where scalars are stacked
+    to an array, element by element."""
     return lax.cond(p >= 0, lambda x: x, lambda x: jtu.tree_map(jnp.zeros_like, x), tree)
 
 
