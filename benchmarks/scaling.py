@@ -23,11 +23,11 @@ import measuring
 
 import diffrax_conserve as dfc
 
-MIN_STEPS = 3
+MIN_STEPS = 30  # the start of a solve costs as much as some steps
 
 
 class Settings(NamedTuple):
-    """What is measured. A run takes as many steps as fit into `seconds`, but at least three."""
+    """What is measured. A run takes as many steps as fit into `seconds`, but at least 30."""
 
     batches: tuple[int, ...]
     constraints: tuple[int, ...]
