@@ -10,14 +10,14 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import check_manifold, conserved_values, evaluate
+from .._manifold import check_manifold, conserved_values
 from .._projection._jacobian import (
-    Elements,
     Joined,
     Residual,
     Vector,
     joined,
     linearise,
+    residual_parts,
     written_out,
 )
 from .._tree import (
@@ -107,14 +107,10 @@ class ConservativeLayer(eqx.Module):
         dtype = working_dtype(candidate)
 
         def parts(y: Y) -> list[Array]:
-            out = evaluate(self.manifold, t, y, self.args)
-            out = jtu.tree_map(lambda a, b: a - b.astype(a.dtype), out, values)
-            return [x.astype(dtype) for x in jtu.tree_leaves(out)]
+            return residual_parts(self.manifold, values, t, y, self.args, dtype)
 
-        function, split, join = written_out(Joined(parts), candidate)
         magnitude = joined([jnp.abs(x).astype(dtype) for x in jtu.tree_leaves(values)])
-        if isinstance(function, Elements):
-            magnitude = tuple(magnitude)
+        function, magnitude, split, join = written_out(Joined(parts), magnitude, candidate)
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule

@@ -20,8 +20,8 @@ import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, PyTree, Real
 
-from .._custom_types import Y
-from .._manifold import DENSE_MAX, estimated_norms
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import DENSE_MAX, estimated_norms, evaluate
 from .._scalars import elements_in_scalars
 from .._tree import tree_dot, tree_mul, working_dtype
 from ._elimination import GramSolver, Vector, dense_solver, unrolled_solver
@@ -88,7 +88,17 @@ def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
     return out, _Dense(rows)
 
 
+def residual_parts(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args, dtype: jnp.dtype
+) -> list[Array]:
+    """What the functions of the manifold return less their conserved values, in `dtype`."""
+    out = evaluate(manifold, t, y, args)
+    residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
+    return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
+
+
 def joined(parts: list[Array]) -> Real[Array, " m"]:
+    """Arrays of any shapes as one vector."""
     return jnp.concatenate([x.reshape(-1) for x in parts])
 
 
@@ -122,17 +132,17 @@ class Elements(eqx.Module):
 
 
 def written_out(
-    residual: Joined, y: Y
-) -> tuple[Joined | Elements, Callable[[Y], Y], Callable[[Y], Y]]:
-    """The same residual with scalars in the place of its values, if they are few, and of states,
-    if they are small, and the maps to its states and back."""
-    if eqx.filter_eval_shape(residual, y).size > UNROLLED_MAX:
-        return residual, _same, _same
+    residual: Joined, magnitude: Real[Array, " m"], y: Y
+) -> tuple[Joined | Elements, Vector, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same residual and magnitude with scalars in the place of vectors, if they are few, and
+    of states, if they are small, and the maps to its states and back."""
+    if magnitude.size > UNROLLED_MAX:
+        return residual, magnitude, _same, _same
     converted = elements_in_scalars(residual, y)
     if converted is None:
-        return Elements.of(residual, y), _same, _same
+        return Elements.of(residual, y), tuple(magnitude), _same, _same
     fns, split, join = converted
-    return Elements(fns), split, join
+    return Elements(fns), tuple(magnitude), split, join
 
 
 def _same(y: Y) -> Y:

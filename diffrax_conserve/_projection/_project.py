@@ -22,7 +22,7 @@ from .._manifold import (
 )
 from .._tree import tree_mul, tree_sub, working_dtype
 from ._base import AbstractProjection, Problem, ProjectionInfo
-from ._jacobian import Joined, joined, linearise
+from ._jacobian import Joined, joined, linearise, residual_parts
 from ._newton import Newton
 
 
@@ -154,9 +154,7 @@ def _problem(
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), candidate)
 
     def parts(y: Y) -> list[Array]:
-        out = evaluate(manifold, t, y, args)
-        residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
-        return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
+        return residual_parts(manifold, values, t, y, args, dtype)
 
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
     residual = Joined(eqx.filter_closure_convert(parts, candidate))

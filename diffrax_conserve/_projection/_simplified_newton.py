@@ -143,13 +143,15 @@ class _Iteration(eqx.Module):
         """The same with scalars in the place of vectors, if there are few, and of states, if they
         are small, and the maps to its states and back."""
         assert isinstance(self.residual, Joined)
-        residual, split, join = written_out(self.residual, self.candidate)
+        residual, magnitude, split, join = written_out(
+            self.residual, self.magnitude, self.candidate
+        )
         inline = dataclasses.replace(
             self,
             residual=residual,
             candidate=split(self.candidate),
             weights=split(self.weights),
-            magnitude=tuple(self.magnitude) if isinstance(residual, Elements) else self.magnitude,
+            magnitude=magnitude,
         )
         return inline, split, join
 
