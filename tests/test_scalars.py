@@ -35,6 +35,10 @@ FUNCTIONS = {
         jnp.exp(jnp.sin(y)) / jnp.hypot(y, 2.0) ** 3 + jnp.log1p(y**2)
     ),
     "comparisons": lambda y: jnp.where(y > 0, jnp.sqrt(jnp.abs(y)), jnp.clip(y, -0.5, 0.5)),
+    "matrices of constants": lambda y: (
+        y @ (jnp.tril(jnp.ones((3, 3), y.dtype)) - 2 * jnp.eye(3, dtype=y.dtype)),
+        y * (1 - (jnp.arange(6) + 1).reshape(2, 3) ** 3) / jnp.sqrt(jnp.full(3, 2.0, y.dtype)),
+    ),
     "a constant": lambda y: (y, jnp.ones(2, y.dtype)),
     "an inner jit": lambda y: jax.jit(jnp.linalg.norm)(y),
     "another dtype": lambda y: jnp.sum(y.astype(jnp.float16)),
