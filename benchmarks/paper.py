@@ -10,7 +10,6 @@ One JSON file for each system, kind of network and seed goes to `benchmarks/resu
 half the size, and an error far below theirs.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -21,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trained
 
 import diffrax_conserve as dfc
 from diffrax_conserve import _reproduce
@@ -72,18 +72,14 @@ def judge(system, network, t1=None):
         distance = np.where(np.asarray(ok)[:, None], distance, np.inf)
         relative = np.linalg.norm(distance, axis=1) / np.linalg.norm(size, axis=1)
         found[label] = {
-            "one_step_error": number(np.median(distance[:, 1])),
-            "state_error": number(np.median(distance[:, -1])),
-            "largest_state_error": number(np.median(np.max(distance, axis=1))),
-            "relative_l2_error": number(np.median(relative)),
-            "drift": number(drift),
+            "one_step_error": trained.number(np.median(distance[:, 1])),
+            "state_error": trained.number(np.median(distance[:, -1])),
+            "largest_state_error": trained.number(np.median(np.max(distance, axis=1))),
+            "relative_l2_error": trained.number(np.median(relative)),
+            "drift": trained.number(drift),
             "failed": int(np.sum(~np.asarray(ok))),
         }
     return found
-
-
-def number(x):
-    return float(x) if np.isfinite(x) else None
 
 
 def single_precision(network):
@@ -109,11 +105,11 @@ def record(system, kind, seed, epochs, network, log, ship, out=RESULTS):
         "kind": kind,
         "seed": seed,
         "epochs": epochs,
-        "best_loss": number(log.best),
+        "best_loss": trained.number(log.best),
         "best_epoch": log.best_epoch,
-        "last_loss": number(log.criteria[-1]),
+        "last_loss": trained.number(log.criteria[-1]),
         "skipped_updates": log.skipped,
-        "largest_training_loss": number(np.max(log.losses)),
+        "largest_training_loss": trained.number(np.max(log.losses)),
         "seconds": round(log.seconds, 1),
         "compile_seconds": round(log.compile_seconds, 1),
         "errors": judge(system, network),
@@ -156,8 +152,7 @@ def table(results):
 
 def cells(rows):
     def span(values):
-        values = sorted(np.inf if v is None else v for v in values)
-        texts = [f"{v:.1e}" if np.isfinite(v) else "failed" for v in values]
+        texts = [trained.error(v) for v in sorted(np.inf if v is None else v for v in values)]
         return texts[0] if texts[0] == texts[-1] else f"{texts[0]} to {texts[-1]}"
 
     return [
@@ -170,22 +165,15 @@ def cells(rows):
     ]
 
 
-def read_results(folder=RESULTS):
-    return [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-
-
 def main(argv=None):
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--system", choices=SYSTEMS, action="append")
+    parser = trained.parser(__doc__, SYSTEMS)
     parser.add_argument("--kind", choices=KINDS, action="append")
     parser.add_argument("--seed", type=int, action="append")
     parser.add_argument("--ship", action="store_true", help="write the networks into the package")
-    parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
-    parser.add_argument("--table", action="store_true", help="only print the table of the results")
     options = parser.parse_args(argv)
     if options.table:
-        print(table(read_results()))
+        print(table(trained.read_results(RESULTS)))
         return []
     epochs, points = (10, 20) if options.smoke else (5000, None)
     results = []

@@ -7,7 +7,6 @@
 The networks are those of the zoo, trained for fewer epochs and without its last updates.
 """
 
-import argparse
 import dataclasses
 import json
 import sys
@@ -17,6 +16,7 @@ from pathlib import Path
 import jax
 import jax.random as jr
 import numpy as np
+import trained
 import zoo
 
 import diffrax_conserve as dfc
@@ -95,21 +95,17 @@ def table(records):
 
 def cells(rows):
     def median(key):
-        return float(np.median([np.inf if row[key] is None else row[key] for row in rows]))
+        return trained.median(row[key] for row in rows)
 
-    error = median("largest_state_error")
-    end = f"{error:.1e}" if np.isfinite(error) else "failed"
+    end = trained.error(median("largest_state_error"))
     first = f"{median('cpu_seconds'):.0f} | {median('one_step_rms'):.1e}"
     return f"{first} | {end} | {median('outside'):.1%}"
 
 
 def main(argv=None):
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--system", choices=list(EPOCHS), action="append")
+    parser = trained.parser(__doc__, EPOCHS)
     parser.add_argument("--seed", type=int, action="append")
-    parser.add_argument("--table", action="store_true", help="only print the table of the results")
-    parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(argv)
     if options.table:

@@ -14,7 +14,6 @@ import os
 # waits for threads of its own, beside those of XLA.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import argparse
 import dataclasses
 import functools
 import json
@@ -29,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import trained
 
 import diffrax_conserve as dfc
 
@@ -264,8 +264,8 @@ def rollout(system, solver, y0s, ts, reference):
     error = np.linalg.norm(np.asarray(ys - reference).reshape(*ys.shape[:2], -1), axis=-1)
     error = np.where(np.asarray(ok)[:, None], error, np.inf)
     return {
-        "state_error": number(np.median(error[:, -1])),
-        "largest_state_error": number(np.median(np.max(error, axis=1))),
+        "state_error": trained.number(np.median(error[:, -1])),
+        "largest_state_error": trained.number(np.median(np.max(error, axis=1))),
         "failed": int(np.sum(~np.asarray(ok))),
     }
 
@@ -290,10 +290,6 @@ def cost(system, solver, states, steps=20, repeats=5):
     return round(min(times) / steps / len(states) * 1e9, 1)
 
 
-def number(x):
-    return float(x) if np.isfinite(x) else None
-
-
 # ---- Records ----
 
 
@@ -305,7 +301,7 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
         "seed": seed,
         "weights": sum(x.size for x in jax.tree.leaves(weights_of(network))),
         "epochs": len(log.losses) + (spec.epochs if spec.polish else 0),
-        "best_loss": number(log.best),
+        "best_loss": trained.number(log.best),
         "skipped_updates": log.skipped,
         "seconds": round(seconds, 1),
         "cpu_seconds": round(cpu_seconds, 1),
@@ -359,20 +355,14 @@ def tables(records):
 
 
 def cells(kind, rows):
-    def median(*path):
-        values = []
-        for row in rows:
-            value = row
-            for key in path:
-                value = value[key]
-            values.append(np.inf if value is None else value)
-        return float(np.median(values))
+    def median(label, key):
+        return trained.median(row["errors"][label][key] for row in rows)
 
-    def error(*path):
-        value = median("errors", *path)
-        return f"{value:.1e}" if np.isfinite(value) else "failed"
+    def error(label, key):
+        return trained.error(median(label, key))
 
-    first = [str(len(rows)), f"{rows[0]['weights']:,}", f"{median('seconds'):.0f}"]
+    seconds = trained.median(row["seconds"] for row in rows)
+    first = [str(len(rows)), f"{rows[0]['weights']:,}", f"{seconds:.0f}"]
     if kind == "pinn":
         return [
             *first,
@@ -385,25 +375,18 @@ def cells(kind, rows):
         *first,
         *[error(label, "one_step_rms") for label in ("plain", "RK4")],
         *[error(label, "largest_state_error") for label in labels],
-        *[f"{median('errors', label, 'ns_per_step'):,.0f}" for label in labels],
+        *[f"{median(label, 'ns_per_step'):,.0f}" for label in labels],
     ]
-
-
-def read_results(folder=RESULTS):
-    return [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
 
 
 def main(argv=None):
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--system", choices=list(SPECS), action="append")
+    parser = trained.parser(__doc__, SPECS)
     parser.add_argument("--seed", type=int, action="append")
     parser.add_argument("--ship", action="store_true", help="write the networks into the package")
-    parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
-    parser.add_argument("--table", action="store_true", help="only print the table of the results")
     options = parser.parse_args(argv)
     if options.table:
-        print(tables(read_results()))
+        print(tables(trained.read_results(RESULTS)))
         return []
     if options.smoke:
         smoke = options.system or ["rigid-body", "conservative-lorenz"]

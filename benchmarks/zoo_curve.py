@@ -9,13 +9,13 @@ The last point of each curve is the network of the zoo with the same seed. One J
 system goes to `benchmarks/results/zoo-curve/`.
 """
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
 
 import jax
 import numpy as np
+import trained
 import zoo
 
 import diffrax_conserve as dfc
@@ -64,8 +64,7 @@ def table(results):
     lines = ["| system | epochs | s | one step | 500 steps, projected |", "|---|---|---|---|---|"]
     for name, points in results.items():
         for p in points:
-            error = p["largest_state_error"]
-            end = "failed" if error is None else f"{error:.1e}"
+            end = trained.error(p["largest_state_error"])
             cells = [f"`{name}`", f"{p['epochs']:,}", f"{p['cpu_seconds']:.0f}"]
             lines.append("| " + " | ".join([*cells, f"{p['one_step_rms']:.1e}", end]) + " |")
     return "\n".join(lines)
@@ -87,11 +86,8 @@ def draw(results, path):
 
 def main(argv=None):
     jax.config.update("jax_enable_x64", True)
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--system", choices=list(EPOCHS), action="append")
-    parser.add_argument("--table", action="store_true", help="only print the table of the results")
+    parser = trained.parser(__doc__, EPOCHS)
     parser.add_argument("--figure", help="only draw the results, to this file")
-    parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     options = parser.parse_args(argv)
     if options.table:
         print(table(read_results()))

@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator
+from ..learned import EAST, LORENZ, RADIUS, SMALL, count_traces, flow_map, oscillator
 
 LAYER = dfc.ConservativeLayer(RADIUS, steps=2)
 KEY = jr.key(5)
@@ -210,19 +210,9 @@ def test_progress(capsys):
 
 
 def test_the_whole_schedule_compiles_once():
-    traces = 0
-
-    def counted(t, y, args):
-        nonlocal traces
-        traces += 1
-        return oscillator(t, y, args)
-
     def count(epochs):
-        nonlocal traces
-        traces = 0
-        model = circle(LAYER)
-        train(model, counted, epochs=epochs, iterations=dfc.staged_iterations)
-        return traces
+        options = dict(epochs=epochs, iterations=dfc.staged_iterations)
+        return count_traces(lambda field: train(circle(LAYER), field, **options))
 
     assert count(90) == count(3) > 0
 

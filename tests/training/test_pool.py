@@ -20,7 +20,7 @@ from diffrax_conserve._training._epochs import _anew
 from diffrax_conserve._training._pool import moved
 from diffrax_conserve._training._problem import start
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator, states
+from ..learned import EAST, LORENZ, RADIUS, SMALL, count_traces, oscillator, states
 
 KEY = jr.key(5)
 COUNT = 400
@@ -209,18 +209,8 @@ def test_the_same_key_gives_the_same_result():
 
 
 def test_it_compiles_once():
-    traces = 0
-
-    def counted(t, y, args):
-        nonlocal traces
-        traces += 1
-        return oscillator(t, y, args)
-
     def count(epochs):
-        nonlocal traces
-        traces = 0
-        train(vector_field=counted, epochs=epochs)
-        return traces
+        return count_traces(lambda field: train(vector_field=field, epochs=epochs))
 
     assert count(45) == count(3) > 0
 
