@@ -101,12 +101,9 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 # At toy sizes nearly all of it is compilation, which takes half as long with XLA's older emitters.
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
-	$(BIN)/python benchmarks/overhead.py --smoke
-	$(BIN)/python benchmarks/gradients.py --smoke
-	$(BIN)/python benchmarks/work_precision.py --smoke
-	$(BIN)/python benchmarks/scaling.py --smoke
+	printf '%s\n' overhead gradients work_precision scaling random_features \
+	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/report.py
-	$(BIN)/python benchmarks/random_features.py --smoke
 
 bench-learned: $(PLOTS) ## measure what learned solvers cost
 	$(BIN)/python benchmarks/learned.py

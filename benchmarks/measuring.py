@@ -29,8 +29,9 @@ if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # not
     # is set, and be it to nothing, stays.
     threshold = "xla_cpu_small_while_loop_byte_threshold=65536"
     os.environ.setdefault("XLA_FLAGS", f"--xla_backend_extra_options={threshold}")
-    # One core, as C and heyoka: XLA divides the larger loops between the cores that it sees.
-    if hasattr(os, "sched_setaffinity"):
+    # One core, as C and heyoka: XLA divides the larger loops between the cores that it sees. Smoke
+    # runs, whose times mean nothing, run side by side.
+    if hasattr(os, "sched_setaffinity") and "--smoke" not in sys.argv:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 import jax

@@ -83,7 +83,12 @@ def test_dense_output_agrees_with_the_vector_field():
         )
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+SLOWER = ("point-vortices", "double-pendulum")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOWER else n for n in SYSTEMS]
+)
 def test_drift_does_not_grow_over_a_million_steps(name):
     system = dfc.systems.get(name)
     saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 2e4, 20))

@@ -141,12 +141,15 @@ def test_statistics_are_those_of_the_projections():
     # Against a step made by hand.
     infos = []
     values = {name: f.fn(0.0, OMEGA0, None) for name, f in RIGID_BODY.items()}
+
+    @jax.jit
+    def step(y):
+        candidate = solve(rigid_body, dfc.RK4(), y, t1=0.1).ys[-1]
+        return dfc.project(RIGID_BODY, candidate, value=values, projection=dfc.SimplifiedNewton())
+
     y = OMEGA0
     for _ in range(steps):
-        candidate = solve(rigid_body, dfc.RK4(), y, t1=0.1).ys[-1]
-        y, info = dfc.project(
-            RIGID_BODY, candidate, value=values, projection=dfc.SimplifiedNewton()
-        )
+        y, info = step(y)
         infos.append(info)
     np.testing.assert_allclose(
         statistics.residual_before, max(i.residual_before for i in infos), rtol=1e-6
