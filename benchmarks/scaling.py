@@ -164,13 +164,15 @@ def check(row: dict[str, Any]) -> None:
 def bodies(count: int, settings: Settings) -> dict[str, Any]:
     """One projection of a state that is about as far off as a step, one evaluation of the forces.
 
-    The energy is a sum over all pairs, like the forces; so the projection is measured without it,
-    too. Sums go row by row: 10⁵ bodies need memory for 10⁷ pairs at a time, not for 10¹⁰.
+    The energy is a sum over all pairs, like the forces; so one evaluation of it is measured by
+    itself, and the projection without it, too. Sums go row by row: 10⁵ bodies need memory for 10⁷
+    pairs at a time, not for 10¹⁰.
     """
     y0 = many.bodies(count)
     candidate = jax.tree.map(lambda x: x + 1e-8 * jnp.roll(x, 1), y0)
     force, _ = measuring.compiled(partial(many.bodies_vector_field, 0.0), y0, None)
-    runs = {"force": partial(force, y0, None)}
+    energy, _ = measuring.compiled(partial(many.energy, 0.0), y0, None)
+    runs = {"force": partial(force, y0, None), "energy": partial(energy, y0, None)}
     compile_seconds = {}
     manifolds = {"projection": many.BODIES, "without energy": many.BODIES.copy()}
     del manifolds["without energy"]["energy"]
@@ -185,7 +187,8 @@ def bodies(count: int, settings: Settings) -> dict[str, Any]:
         if not info.residual_after <= MAX_DRIFT:
             raise AssertionError(f"{count} bodies: the residual is {info.residual_after:.1e}")
     seconds = {name: result.seconds for name, result in best.items()}
-    ratios = {f"{name} / force": seconds[name] / seconds["force"] for name in manifolds}
+    names = ["energy", *manifolds]
+    ratios = {f"{name} / force": seconds[name] / seconds["force"] for name in names}
     compilation = {f"{name}, compile seconds": x for name, x in compile_seconds.items()}
     return dict(bodies=count, **seconds, **ratios, **compilation)
 
