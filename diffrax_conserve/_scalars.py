@@ -186,12 +186,12 @@ _ON_NUMBERS: dict[str, Callable[..., np.ndarray]] = {
     "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
     "eq": lambda x, y, **_: x == y,
     "ge": lambda x, y, **_: x >= y,
-    "integer_pow": lambda x, y: x**y,
+    "integer_pow": lambda x, y, **_: x**y,
     "iota": lambda dtype, shape, dimension, **_: _broadcast(
         np.arange(shape[dimension], dtype=dtype), shape, (dimension,)
     ),
     "mul": lambda x, y, **_: x * y,
-    "neg": lambda x: -x,
+    "neg": lambda x, **_: -x,
     "sub": lambda x, y, **_: x - y,
 }
 
