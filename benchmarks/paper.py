@@ -152,7 +152,7 @@ def table(results):
 
 def cells(rows):
     def span(values):
-        texts = [trained.error(v) for v in sorted(np.inf if v is None else v for v in values)]
+        texts = [trained.error(v) for v in sorted(map(trained.or_infinity, values))]
         return texts[0] if texts[0] == texts[-1] else f"{texts[0]} to {texts[-1]}"
 
     return [

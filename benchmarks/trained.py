@@ -26,9 +26,15 @@ def number(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
+def or_infinity(x: float | None) -> float:
+    """What `number` was given, or infinity."""
+    return np.inf if x is None else x
+
+
 def median(values: Iterable[float | None]) -> float:
-    return float(np.median([np.inf if x is None else x for x in values]))
+    return float(np.median([or_infinity(x) for x in values]))
 
 
 def error(x: float | None) -> str:
-    return f"{x:.1e}" if x is not None and np.isfinite(x) else "failed"
+    x = or_infinity(x)
+    return f"{x:.1e}" if np.isfinite(x) else "failed"

@@ -32,19 +32,6 @@ def oscillator(t, y, args):
     return jnp.stack([y[1], -y[0]])
 
 
-def count_traces(run):
-    """How often `run(vector_field)` calls the vector field, which is when it is traced."""
-    calls = 0
-
-    def counted(t, y, args):
-        nonlocal calls
-        calls += 1
-        return oscillator(t, y, args)
-
-    run(counted)
-    return calls
-
-
 RADIUS = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
 EAST = jnp.array([1.0, 0.0])
 

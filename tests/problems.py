@@ -7,6 +7,18 @@ import numpy as np
 
 import diffrax_conserve as dfc
 
+
+class Counted:
+    """A function that counts its calls: inside of what is compiled, how often it is traced."""
+
+    def __init__(self, fn):
+        self.fn, self.calls = fn, 0
+
+    def __call__(self, t, y, args):
+        self.calls += 1
+        return self.fn(t, y, args)
+
+
 INERTIA = np.array([0.1, 0.2, 0.3])
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution, states
-from ..problems import OMEGA0, RIGID_BODY
+from ..problems import OMEGA0, RIGID_BODY, Counted
 
 ONE = jnp.ones(())
 
@@ -115,13 +115,7 @@ def test_a_schedule_blends_successive_iterates():
 
 
 def test_every_schedule_compiles_once():
-    traces = 0
-
-    def energy(t, y, args):
-        nonlocal traces
-        traces += 1
-        return jnp.sum(y**2)
-
+    energy = Counted(lambda t, y, args: jnp.sum(y**2))
     layer = dfc.ConservativeLayer(dfc.FirstIntegral(energy), steps=4)
 
     @jax.jit
@@ -129,10 +123,10 @@ def test_every_schedule_compiles_once():
         return layer(jnp.array([1.1, 0.2]), jnp.array(1.0), 0.0, ONE, (p, s))
 
     run(jnp.asarray(0), ONE)
-    first = traces
+    first = energy.calls
     for p in range(1, 5):
         run(jnp.asarray(p), ONE / 2)
-    assert traces == first
+    assert energy.calls == first
 
 
 # ---- Derivatives ----
