@@ -39,7 +39,8 @@ $(BIN)/python:
 
 $(VENV)/.installed-%: pyproject.toml | $(BIN)/python
 	@echo "Installing diffrax-conserve[$*] into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --editable '.[$*]'
+# Python compiles what it imports. pip would compile all that it installs, which takes longer.
+	@$(BIN)/python -m pip install --quiet --no-compile --editable '.[$*]'
 	@touch $@
 
 PLOTS := $(VENV)/.installed-plots
@@ -66,7 +67,7 @@ COUNT ?= 10000
 SEED ?= 0
 
 soak: $(TEST) ## try COUNT random combinations of everything, in search of a wrong one
-	$(BIN)/python tests/soak.py --count $(COUNT) --seed $(SEED)
+	$(BIN)/python -m tests.soak --count $(COUNT) --seed $(SEED)
 
 mutants: $(TEST) ## plant defects, and see that the tests notice each
 	$(BIN)/python tests/mutants.py
@@ -96,12 +97,14 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 	$(BIN)/python benchmarks/gradients.py
 	$(BIN)/python benchmarks/work_precision.py
 	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/unlike_lanes.py
+	$(BIN)/python benchmarks/devices.py
 	$(BIN)/python benchmarks/report.py --write
 
 # At toy sizes nearly all of it is compilation, which takes half as long with XLA's older emitters.
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
-	printf '%s\n' overhead gradients work_precision scaling random_features \
+	printf '%s\n' overhead gradients work_precision scaling random_features devices unlike_lanes \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/report.py
 
@@ -116,10 +119,10 @@ build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of 
 	$(BIN)/python -m build
 	@root=$$PWD; tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; set -e; \
 	"$(BIN)/python" -m venv --without-pip "$$tmp/venv"; \
-	"$(BIN)/python" -m pip --python "$$tmp/venv/bin/python" install --quiet "$$root"/dist/*.whl; \
+	"$(BIN)/python" -m pip --python "$$tmp/venv/bin/python" install --quiet --no-compile "$$root"/dist/*.whl; \
 	cd "$$tmp"; \
 	venv/bin/python -c 'import diffrax_conserve as d; print(d.__version__, d.__file__)'; \
-	venv/bin/python -m diffrax_conserve list
+	venv/bin/diffrax-conserve --version; venv/bin/python -m diffrax_conserve list
 
 clean: ## remove what the targets wrote, but not the virtual environment
 	rm -rf dist site out .pytest_cache .ruff_cache .hypothesis

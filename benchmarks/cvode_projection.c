@@ -23,18 +23,18 @@ enum { N = 3, M = 2 };
 static const double I[N] = {0.1, 0.2, 0.3};
 
 static void rates(const double *w, double *f) {
-    f[0] = (I[1] - I[2]) / I[0] * w[1] * w[2];
-    f[1] = (I[2] - I[0]) / I[1] * w[2] * w[0];
-    f[2] = (I[0] - I[1]) / I[2] * w[0] * w[1];
+    f[0] = (I[1] - I[2]) / (I[1] * I[2]) * w[1] * w[2];
+    f[1] = (I[2] - I[0]) / (I[2] * I[0]) * w[2] * w[0];
+    f[2] = (I[0] - I[1]) / (I[0] * I[1]) * w[0] * w[1];
 }
 
 static void integrals(const double *w, double *v) {
     v[0] = v[1] = 0;
-    for (int i = 0; i < N; ++i) v[0] += I[i] / 2 * w[i] * w[i], v[1] += I[i] * I[i] * w[i] * w[i];
+    for (int i = 0; i < N; ++i) v[0] += w[i] * w[i] / (2 * I[i]), v[1] += w[i] * w[i] / 2;
 }
 
 static void gradients(const double *w, double G[M][N]) {
-    for (int i = 0; i < N; ++i) G[0][i] = I[i] * w[i], G[1][i] = 2 * I[i] * I[i] * w[i];
+    for (int i = 0; i < N; ++i) G[0][i] = w[i] / I[i], G[1][i] = w[i];
 }
 
 #else /* Kepler: q_1, q_2, p_1, p_2 */

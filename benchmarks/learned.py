@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import jax.random as jr
 
 import diffrax_conserve as dfc
-from diffrax_conserve._reproduce._learned import KINDS, build, is_flow_map, is_learned
-from diffrax_conserve._training._defect import defects, draw, squared_norms, trainable
+from diffrax_conserve.learned._training.defect import defects, squared_norms, trainable
+from diffrax_conserve.reproduce._trained import KINDS, build, is_flow_map, is_learned
 
 OUT = Path(__file__).parent / "results" / "learned.json"
 SYSTEMS = [name for name in dfc.systems.names() if is_learned(dfc.systems.get(name))]
@@ -50,7 +50,7 @@ def epoch(system, kind, points):
     if isinstance(network, dfc.PINN):
         network = network.window(0)
     sample = system.sample if is_flow_map(system) else None
-    batch = draw(network, dfc.uniform_times, sample, points, jr.key(2))
+    batch = network.draw(dfc.learned.uniform_times, sample, points, jr.key(2))
     steps = 0 if network.layer is None else network.layer.steps
 
     def gradient(network, batch, p, s):
@@ -58,7 +58,7 @@ def epoch(system, kind, points):
 
         def loss(weights):
             model = eqx.combine(weights, static)
-            vectors = defects(model, system.vector_field, None, batch, p, s)
+            vectors = defects(model, system.vector_field, None, batch, (p, s))
             return jnp.mean(squared_norms(vectors))
 
         return jax.value_and_grad(loss)(weights)

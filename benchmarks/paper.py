@@ -23,8 +23,8 @@ import numpy as np
 import trained
 
 import diffrax_conserve as dfc
-from diffrax_conserve import _reproduce
-from diffrax_conserve._reproduce._learned import KINDS, is_flow_map, is_learned
+from diffrax_conserve import reproduce as _reproduce
+from diffrax_conserve.reproduce._trained import KINDS, is_flow_map, is_learned
 
 ROOT = Path(__file__).parent
 RESULTS = ROOT / "results" / "paper"
@@ -119,7 +119,8 @@ def record(system, kind, seed, epochs, network, log, ship, out=RESULTS):
     if ship:
         info = {
             **result,
-            "command": f"python benchmarks/paper.py --system {system.name} --seed {seed} --ship",
+            "command": f"python benchmarks/paper.py --system {system.name} --seed {seed} --ship"
+            + ("" if epochs == 5000 else f" --epochs {epochs}"),
             "recipe": "paper",
             "horizon": system.t1,
             "step": system.dt,
@@ -171,11 +172,14 @@ def main(argv=None):
     parser.add_argument("--kind", choices=KINDS, action="append")
     parser.add_argument("--seed", type=int, action="append")
     parser.add_argument("--ship", action="store_true", help="write the networks into the package")
+    parser.add_argument(
+        "--epochs", type=int, default=5000, help="another number is not the paper's"
+    )
     options = parser.parse_args(argv)
     if options.table:
         print(table(trained.read_results(RESULTS)))
         return []
-    epochs, points = (10, 20) if options.smoke else (5000, None)
+    epochs, points = (10, 20) if options.smoke else (options.epochs, None)
     results = []
     for name in options.system or SYSTEMS[: 1 if options.smoke else None]:
         for seed in options.seed or ([0] if options.smoke else [0, 1, 2]):

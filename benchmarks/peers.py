@@ -34,15 +34,15 @@ class Equations(NamedTuple):
 def _rigid_body() -> Equations:
     inertia = np.array([0.1, 0.2, 0.3])
     i, j, k = inertia.tolist()
-    a, b, c = (j - k) / i, (k - i) / j, (i - j) / k
+    a, b, c = (j - k) / (j * k), (k - i) / (k * i), (i - j) / (i * j)
     return Equations(
         3,
         lambda t, w: [a * w[1] * w[2], b * w[2] * w[0], c * w[0] * w[1]],
         (
-            lambda x, y, z: (i * x * x + j * y * y + k * z * z) / 2,
-            lambda x, y, z: i * i * x * x + j * j * y * y + k * k * z * z,
+            lambda x, y, z: (x * x / i + y * y / j + z * z / k) / 2,
+            lambda x, y, z: (x * x + y * y + z * z) / 2,
         ),
-        (lambda *w: inertia * w, lambda *w: 2 * inertia**2 * w),
+        (lambda *w: np.array(w) / inertia, lambda *w: np.array(w)),
         "-DRIGID_BODY",
     )
 

@@ -37,15 +37,15 @@ def train(system, spec, where, seed):
     states, sample = starts, system.sample
     if where == "reachable":
         states = zoo.reachable(system, spec, spec.pool, seed)
-        sample = dfc.from_states(states)
+        sample = dfc.learned.FromStates(states)
     elif where == "pool":
-        sample = dfc.Pool(system.sample, manifold=system.manifold)
+        sample = dfc.learned.Pool(system.sample, manifold=system.manifold)
     network = dfc.DeepONet(
         states, system.dt,
-        width=spec.width, depth=spec.depth, inputs=spec.inputs,
-        taylor=dfc.Taylor(system.vector_field, spec.order), key=jr.key(seed),
+        width=spec.width, depth=spec.depth, core=spec.core,
+        taylor=dfc.learned.Taylor(system.vector_field, spec.order), key=jr.key(seed),
     )  # fmt: skip
-    recipe = dfc.second_order(network, epochs=spec.epochs)
+    recipe = dfc.learned.second_order(network, epochs=spec.epochs)
     recipe = dataclasses.replace(recipe, points=spec.points)
     network, log = dfc.fit(
         network, system.vector_field, key=jr.key(seed), sample=sample, recipe=recipe

@@ -24,21 +24,22 @@ static inline real absolute(real x) { return (real)((bits)x & LONG_MAX); } /* dr
 enum { N = 3, M = 2 };
 static const double I[N] = {0.1, 0.2, 0.3};
 
+/* w is the angular momentum in the frame of the body. */
 static inline void vector_field(const real *w, real *f) {
-    f[0] = (I[1] - I[2]) / I[0] * w[1] * w[2];
-    f[1] = (I[2] - I[0]) / I[1] * w[2] * w[0];
-    f[2] = (I[0] - I[1]) / I[2] * w[0] * w[1];
+    f[0] = (I[1] - I[2]) / (I[1] * I[2]) * w[1] * w[2];
+    f[1] = (I[2] - I[0]) / (I[2] * I[0]) * w[2] * w[0];
+    f[2] = (I[0] - I[1]) / (I[0] * I[1]) * w[0] * w[1];
 }
 
 static inline void integrals(const real *w, real *v) {
-    v[0] = SUM(i, N, I[i] / 2 * w[i] * w[i]);
-    v[1] = SUM(i, N, I[i] * I[i] * w[i] * w[i]);
+    v[0] = SUM(i, N, 1 / (2 * I[i]) * w[i] * w[i]);
+    v[1] = SUM(i, N, 0.5 * w[i] * w[i]);
 }
 
 static inline void gradients(const real *w, real G[M][N]) {
     for (int i = 0; i < N; ++i) {
-        G[0][i] = I[i] * w[i];
-        G[1][i] = 2 * I[i] * I[i] * w[i];
+        G[0][i] = 1 / I[i] * w[i];
+        G[1][i] = w[i];
     }
 }
 

@@ -24,8 +24,8 @@ import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
-from diffrax_conserve._solver._feature_basis import feature_basis, tabulate
-from diffrax_conserve._solver._galerkin import StepEquations, flatten, solve
+from diffrax_conserve.learned._solvers.feature_basis import feature_basis, tabulate
+from diffrax_conserve.learned._solvers.galerkin import StepEquations, flatten, solve
 
 OUT = Path(__file__).parent / "results" / "random_features.json"
 

@@ -155,9 +155,10 @@ def sweeps(name, size):
     h, y0s = jnp.asarray(network.max_step), states_of(system, size.states)
     expected = exact(system, h, y0s)
     rows, classical = [], {}
+    kinds = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
     for sweep, numbers in (("picard", size.picard), ("newton", size.newton)):
         for k in numbers:
-            solver = dfc.DeepONetSolver(network, corrections=k, sweep=sweep)
+            solver = dfc.DeepONetSolver(network, corrections=k, sweep=kinds[sweep])
             y1s, estimates = one_step(solver, system, h, y0s)
             batch, alone = Solve.both(solver, system, y0s, size)
             row = {

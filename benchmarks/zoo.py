@@ -35,7 +35,7 @@ import diffrax_conserve as dfc
 ROOT = Path(__file__).parent
 RESULTS = ROOT / "results" / "zoo"
 SHIPPED = ROOT.parent / "diffrax_conserve" / "pretrained"
-INITIAL_STATES = 20
+INITIAL_STATES = 100
 
 
 def separation(y):
@@ -69,7 +69,7 @@ class Spec:
     depth: int
     epochs: int
     windows: int = 0  # of a PINN; none for a flow map
-    inputs: str = "concatenated"
+    core: type = dfc.learned.Concatenated
     order: int = 1
     points: int = 250
     duration: float = 20.0  # of the solutions along which its states are drawn
@@ -79,15 +79,23 @@ class Spec:
     frame: bool = False
     smaller: float | None = None  # how close the vortices of shrunk states may be
     repeats: int = 1  # learned steps in one
+    natural: bool = False  # of the double pendulum: trained in a gravity of 1, and scaled
     polish: int = 0  # updates by Levenberg-Marquardt in the end
 
 
 SPECS = {
     "harmonic-oscillator": Spec(width=30, depth=1, epochs=20, windows=10),
-    "rigid-body": Spec(width=30, depth=1, epochs=20, windows=6),
+    "rigid-body": Spec(width=30, depth=1, epochs=30, windows=16),
     "conservative-lorenz": Spec(width=32, depth=2, epochs=1700, order=3, polish=8),
     "double-pendulum": Spec(
-        width=40, depth=3, epochs=1200, inputs="gated", points=200, duration=10.0
+        width=40,
+        depth=3,
+        epochs=1200,
+        core=dfc.learned.Gated,
+        points=200,
+        duration=10.0,
+        repeats=4,
+        natural=True,
     ),
     "point-vortices": Spec(
         width=32,
@@ -132,7 +140,7 @@ def train(system, spec, seed):
             system.y0, 0.0, system.t1,
             windows=spec.windows, width=spec.width, depth=spec.depth, slope=2.0, key=key,
         )  # fmt: skip
-        recipe = dfc.second_order(network, epochs=spec.epochs)
+        recipe = dfc.learned.second_order(network, epochs=spec.epochs)
         network, log = dfc.fit(
             network, system.vector_field,
             key=key, manifold=system.manifold, recipe=recipe, progress=True,
@@ -145,35 +153,61 @@ def train(system, spec, seed):
 
 def train_flow_map(system, spec, seed, key):
     """SPRING on fresh points, then Levenberg-Marquardt on many that stay the same."""
+    own, system = system, dfc.systems.DoublePendulum(gravity=1.0) if spec.natural else system
+    longest = system.dt if spec.natural else system.dt / spec.repeats
     pool = reachable(system, spec, spec.pool, seed)
     if spec.smaller is not None:
         pool = with_smaller(pool, spec.smaller, jr.key(seed + 300))
     network = dfc.DeepONet(
-        pool, system.dt / spec.repeats,
-        width=spec.width, depth=spec.depth, inputs=spec.inputs,
-        taylor=dfc.Taylor(system.vector_field, spec.order) if spec.order else None,
+        pool, longest,
+        width=spec.width, depth=spec.depth, core=spec.core,
+        taylor=dfc.learned.Taylor(system.vector_field, spec.order) if spec.order else None,
         frame=system.frame if spec.frame else None, key=key,
     )  # fmt: skip
 
     def fit(network, **changes):
-        recipe = dataclasses.replace(dfc.second_order(network, epochs=spec.epochs), **changes)
+        recipe = dataclasses.replace(
+            dfc.learned.second_order(network, epochs=spec.epochs), **changes
+        )
         return dfc.fit(
             network, system.vector_field,
-            key=key, sample=dfc.from_states(pool), recipe=recipe, progress=True,
+            key=key, sample=dfc.learned.FromStates(pool), recipe=recipe, progress=True,
         )  # fmt: skip
 
-    network, log = fit(network, points=spec.points, optimiser=dfc.SPRING(damping=spec.damping))
+    network, log = fit(
+        network, points=spec.points, optimiser=dfc.learned.SPRING(damping=spec.damping)
+    )
     if spec.polish:
         network, log = fit(
             network, epochs=spec.polish, points=spec.pool // 8, refresh=None, check_every=1,
-            optimiser=dfc.LevenbergMarquardt(damping=5e-5),
+            optimiser=dfc.learned.LevenbergMarquardt(damping=5e-5),
         )  # fmt: skip
-    return network if spec.repeats == 1 else dfc.Repeated(network, spec.repeats), log
+    network = scaled(network, own) if spec.natural else network
+    return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
+
+
+def scaled(network, system):
+    r"""The flow map of a double pendulum in its own gravity, from one that is for a gravity of 1.
+
+    With times in units of $1/\sqrt g$ and momenta in units of $\sqrt g$ its equations have no $g$:
+    it is the same network, with other scales and a longest step that is $\sqrt g$ times shorter.
+    """
+    root = jnp.sqrt(system.gravity)
+    units = jnp.stack([jnp.ones(()), jnp.ones(()), root, root])
+    corners = jnp.stack([network.domain.lower, network.domain.upper]) * units
+    layers = network.core.hidden
+    found = dfc.DeepONet(
+        corners, network.max_step / root,
+        width=layers[0].weights[0].shape[1], depth=len(layers), core=dfc.learned.Gated,
+        taylor=dfc.learned.Taylor(system.vector_field, network.order), key=jr.key(0),
+    )  # fmt: skip
+    parts = network.core, network.shift * units, network.scale * units
+    return eqx.tree_at(lambda m: (m.core, m.shift, m.scale), found, parts)
 
 
 def reachable(system, spec, count, seed):
     y0s = initial_states(system, spec, count, seed + 100)
-    return dfc.reachable_states(
+    return dfc.learned.reachable_states(
         system.vector_field, y0s, spec.duration, key=jr.key(seed + 200), keep=spec.keep
     )
 
@@ -223,7 +257,7 @@ def judged_on(name, spec, steps, states):
 
 
 def judge_flow_map(system, spec, network, steps, states):
-    """One-step errors over fresh reachable states; rollouts from 20 initial states (medians)."""
+    """One-step errors over fresh reachable states; rollouts from `INITIAL_STATES`."""
     fresh, exact, y0s, ts, reference = judged_on(system.name, spec, steps, states)
     solvers = {"plain": dfc.DeepONetSolver(network), "RK4": dfc.RK4()}
     found = {}
@@ -258,14 +292,20 @@ def rollout(system, solver, y0s, ts, reference):
             dfx.ODETerm(system.vector_field), solver, 0.0, ts[-1], system.dt, y0,
             saveat=dfx.SaveAt(ts=ts), max_steps=len(ts) + 2, throw=False,
         )  # fmt: skip
-        return solution.ys, solution.result == dfx.RESULTS.successful
+        drift = jax.tree.leaves(dfc.drift(solution, system.manifold))
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(d)) for d in drift]))
+        return solution.ys, largest, solution.result == dfx.RESULTS.successful
 
-    ys, ok = solve(y0s)
+    ys, drift, ok = solve(y0s)
     error = np.linalg.norm(np.asarray(ys - reference).reshape(*ys.shape[:2], -1), axis=-1)
     error = np.where(np.asarray(ok)[:, None], error, np.inf)
+    largest = np.max(error, axis=1)
     return {
         "state_error": trained.number(np.median(error[:, -1])),
-        "largest_state_error": trained.number(np.median(np.max(error, axis=1))),
+        "largest_state_error": trained.number(np.median(largest)),
+        "rms_largest_state_error": trained.number(np.sqrt(np.mean(largest**2))),
+        "worst_state_error": trained.number(np.max(largest)),
+        "drift": trained.number(np.max(np.asarray(drift))),
         "failed": int(np.sum(~np.asarray(ok))),
     }
 
@@ -316,7 +356,7 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
 
 
 def weights_of(network):
-    network = network.flow_map if isinstance(network, dfc.Repeated) else network
+    network = network.flow_map if isinstance(network, dfc.learned.Repeated) else network
     core = network.nets if isinstance(network, dfc.PINN) else network.core
     return eqx.filter(core, eqx.is_array)
 
@@ -356,10 +396,16 @@ def tables(records):
 
 def cells(kind, rows):
     def median(label, key):
-        return trained.median(row["errors"][label][key] for row in rows)
+        found = [row["errors"].get(label, {}).get(key) for row in rows]
+        return None if None in found else trained.median(found)
 
     def error(label, key):
-        return trained.error(median(label, key))
+        number = median(label, key)
+        return "" if number is None else trained.error(number)
+
+    def nanoseconds(label):
+        number = median(label, "ns_per_step")
+        return "" if number is None else f"{number:,.0f}"
 
     seconds = trained.median(row["seconds"] for row in rows)
     first = [str(len(rows)), f"{rows[0]['weights']:,}", f"{seconds:.0f}"]
@@ -375,7 +421,7 @@ def cells(kind, rows):
         *first,
         *[error(label, "one_step_rms") for label in ("plain", "RK4")],
         *[error(label, "largest_state_error") for label in labels],
-        *[f"{median(label, 'ns_per_step'):,.0f}" for label in labels],
+        *[nanoseconds(label) for label in labels],
     ]
 
 

@@ -71,7 +71,7 @@ def table(results):
 
 
 def draw(results, path):
-    from diffrax_conserve import _plot
+    from diffrax_conserve.reproduce import _plot
 
     panels = {}
     for name, points in results.items():

@@ -1,14 +1,16 @@
-"""The command line: `python -m diffrax_conserve list` and `... reproduce NAME`."""
+"""The command line: `diffrax-conserve`, or `python -m diffrax_conserve`."""
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 
-from . import _reproduce, systems
+from . import __version__, systems
+from . import reproduce as _reproduce
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,7 +46,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     except _reproduce.SetupError as error:
         parser.error(str(error))
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _complain(error)
+        return 1
     return 0 if ok else 1
+
+
+def _run() -> int:
+    """`main`, and what standard output still holds."""
+    try:
+        status = main()
+        sys.stdout.flush()
+    except OSError as error:
+        # Python flushes once more at the end, which must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # a reader that has seen enough
+            _complain(error)
+        return 1
+    return status
+
+
+def _complain(error: OSError) -> None:
+    place = "" if error.filename is None else f" {error.filename}"
+    print(f"error: cannot write{place}: {error.strerror or error}", file=sys.stderr)
 
 
 def _list() -> None:
@@ -55,9 +81,10 @@ def _list() -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m diffrax_conserve",
+        prog="diffrax-conserve",
         description="Conservative solves of the systems in the catalogue.",
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     commands.add_parser("list", help="list the systems by name")
     reproduce = commands.add_parser(
@@ -100,4 +127,4 @@ def _positive(text: str) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(_run())

@@ -11,14 +11,14 @@ from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, PyTree
 
-from ._custom_types import DenseInfo, RealScalarLike
-from ._projection import Target
+from ._custom_types import DenseInfo, RealScalarLike, Y
+from ._projection import SimplifiedNewton, Target
 from ._tree import tree_sub
 
 
@@ -30,7 +30,8 @@ class PackedTarget(eqx.Module):
     static: Any = eqx.field(static=True)
 
     def __init__(self, target: Target):
-        arrays, static = eqx.partition(target, eqx.is_array_like)
+        # Python numbers stay what they are: a function may use them as a shape or an index.
+        arrays, static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
         leaves, treedef = jtu.tree_flatten(static)
         self.static = (tuple(leaves), treedef)
@@ -42,12 +43,17 @@ class PackedTarget(eqx.Module):
 
 @final
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
-    """A local interpolation whose values lie on a manifold, or are NaN where the projection
-    fails."""
+    """A local interpolation whose values lie on a manifold.
+
+    Where the projection of the interpolant fails, that by `SimplifiedNewton` starts again closer
+    and closer to the nearer end of the step, which lies on the manifold. If even that fails, the
+    value is NaN. Nothing is extrapolated: a time outside the step counts as the end of the step.
+    """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
+    ends: tuple[Y, Y]
     target: PackedTarget
 
     def evaluate(
@@ -55,9 +61,22 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        y, info = self.target.unpack().project(t0, self.inner.evaluate(t0, left=left))
-        success = info.result == optx.RESULTS.successful
-        return jtu.tree_map(lambda x: jnp.where(success, x, jnp.asarray(np.nan, x.dtype)), y)
+        # Strictly, so that the slope at the ends is that of the interpolant.
+        first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
+        t0 = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
+        early = jnp.abs(t0 - self.t0) < jnp.abs(self.t1 - t0)
+        anchor = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
+        candidate, target = self.inner.evaluate(t0, left=left), self.target.unpack()
+        y, info = target.project(t0, candidate, anchor)
+        okay = info.ok
+        if not isinstance(target.projection, SimplifiedNewton):
+            again = SimplifiedNewton(metric=target.projection.metric)
+            second, info = dataclasses.replace(target, projection=again).project(
+                t0, candidate, anchor
+            )
+            y = jtu.tree_map(lambda a, b: jnp.where(okay, a, b), y, second)
+            okay = okay | info.ok
+        return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.asarray(np.nan, x.dtype)), y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +87,13 @@ class MakeManifoldInterpolation:
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 
     def __call__(
-        self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, target: PackedTarget
+        self,
+        *,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        inner: DenseInfo,
+        ends: tuple[Y, Y],
+        target: PackedTarget,
     ) -> ManifoldInterpolation:
-        return ManifoldInterpolation(t0, t1, self.inner_cls(t0=t0, t1=t1, **inner), target)
+        interpolation = self.inner_cls(t0=t0, t1=t1, **inner)
+        return ManifoldInterpolation(t0, t1, interpolation, ends, target)

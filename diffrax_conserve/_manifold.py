@@ -1,24 +1,16 @@
 """What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
 
 import abc
-import functools as ft
 import math
-from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 from ._tree import tree_shapes
-
-# Above this many scalar constraints their gradients are never formed: what is needed of them is
-# computed from products with them.
-DENSE_MAX = 128
 
 
 class AbstractConserved(eqx.Module):
@@ -56,13 +48,20 @@ class FirstIntegral(AbstractConserved):
 
     def __init__(self, fn: ConstraintFn, *, value: Values | None = None):
         self.fn = fn
-        self.value = value
+        # Arrays, so that another value does not compile again.
+        self.value = jtu.tree_map(
+            lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
+        )
 
     def __check_init__(self):
         _check_callable(self)
 
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return self.fn(t, y, args) if self.value is None else self.value
+
+
+def _as_array(x: Any) -> Any:
+    return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
@@ -148,6 +147,41 @@ def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
     return [(f"manifold{jtu.keystr(path)}", entry) for path, entry in flat]
 
 
+def entry_name(manifold: Manifold, position: int) -> str:
+    """The name of an entry of a manifold, which the message of a failed solve gives as a number.
+
+    **Arguments:**
+
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `position`: the number of the entry, in the order in which JAX flattens the PyTree.
+
+    **Returns:**
+
+    The path to the entry, such as `manifold['energy']`.
+
+    **Raises:**
+
+    `ValueError` if the manifold has no entry of that number.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        print(dfc.entry_name({"sphere": sphere}, 0))  # manifold['sphere']
+        ```
+    """
+    names = [name for name, _ in named_entries(manifold)]
+    if not 0 <= position < len(names):
+        raise ValueError(
+            f"`position` is {position}, but the manifold has the entries 0 to {len(names) - 1}: "
+            f"{', '.join(names)}."
+        )
+    return names[position]
+
+
 def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by `fn(t, y, args)`."""
     return jtu.tree_map(
@@ -162,47 +196,6 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
         manifold,
         is_leaf=is_entry,
     )
-
-
-def scales(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """What roundoff in `evaluate` is relative to, `|value| + Σ_k |y_k ∂I/∂y_k|`.
-
-    With more than `DENSE_MAX` constraints an estimate of the Euclidean norm takes the place of the
-    sum.
-    """
-    if sum(jnp.size(value) for value in jtu.tree_leaves(values)) > DENSE_MAX:
-        _, forward = jax.linearize(lambda y: evaluate(manifold, t, y, args), y)
-        return jtu.tree_map(lambda v, e: jnp.abs(v) + e, values, estimated_norms(forward, y))
-    jacobian = jax.jacrev(lambda y: evaluate(manifold, t, y, args))(y)
-
-    def scale(value: Array, rows: Y) -> Array:
-        def contract(row: Array, leaf: Array) -> Array:
-            axes = tuple(range(value.ndim, row.ndim))
-            return jnp.sum(jnp.abs(row) * jnp.abs(leaf), axis=axes).astype(value.dtype)
-
-        return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(contract, rows, y)), jnp.abs(value))
-
-    return jtu.tree_map(scale, values, jacobian)
-
-
-def estimated_norms(linear: Callable[[Y], Values], weights: Y) -> Values:
-    """The norms of the rows of `G diag(weights)`, where `linear` is `y ↦ G y`.
-
-    Estimated without forming a row: for random signs `s` the mean of `(G (weights s))²` is the
-    squared norm, so over 16 draws, always the same, it is good to about a third.
-    """
-    leaves, treedef = jtu.tree_flatten(weights)
-    keys = jr.split(jr.key(0), len(leaves))
-
-    def probe(index: Array) -> Values:
-        signed = [
-            jr.rademacher(jr.fold_in(key, index), jnp.shape(leaf), jnp.result_type(leaf)) * leaf
-            for key, leaf in zip(keys, leaves, strict=True)
-        ]
-        return jtu.tree_map(jnp.square, linear(jtu.tree_unflatten(treedef, signed)))
-
-    squares = jax.vmap(probe)(jnp.arange(16))
-    return jtu.tree_map(lambda x: jnp.sqrt(jnp.mean(x, axis=0)), squares)
 
 
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:

@@ -43,6 +43,26 @@ def tree_dot(a: Y, b: Y, dtype: jnp.dtype) -> Real[Array, ""]:
     return ft.reduce(jnp.add, jtu.tree_leaves(products))
 
 
+def tree_norm(a: Y) -> Real[Array, ""]:
+    """The Euclidean norm. In single precision squares can overflow, and are scaled."""
+    dtype = working_dtype(a)
+    if dtype == jnp.float64:
+        return jnp.sqrt(tree_dot(a, a, dtype))
+    largest = tree_max(a)
+    scale = jnp.where(largest > 0, largest, 1)
+    unit = jtu.tree_map(lambda x: x / scale.astype(x.dtype), a)
+    return scale * jnp.sqrt(tree_dot(unit, unit, dtype))
+
+
+def tree_max(a: Y) -> Real[Array, ""]:
+    """The largest modulus in `a`."""
+    dtype = working_dtype(a)
+    return ft.reduce(
+        jnp.maximum,
+        [jnp.max(jnp.abs(x), initial=0).astype(dtype) for x in jtu.tree_leaves(a)],
+    )
+
+
 def tree_all_finite(a: PyTree[Array]) -> Array:
     """Whether there is no NaN and no infinity in `a`."""
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]

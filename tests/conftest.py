@@ -1,6 +1,7 @@
 """Double precision, run-time shape checks, and hypothesis profiles for the whole suite."""
 
 import os
+import shutil
 from pathlib import Path
 
 import jax
@@ -12,6 +13,12 @@ OLDER_EMITTERS = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitter
 os.environ.setdefault("XLA_FLAGS", OLDER_EMITTERS)
 jax.config.update("jax_enable_x64", True)
 
+# What one run compiled the next one reads, and one worker what the other compiled.
+CACHE = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
+CACHE_BYTES_MAX = 2**30
+jax.config.update("jax_compilation_cache_dir", str(CACHE))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
 # Before the first import of the package: its annotations are then checked at every call.
 install_import_hook("diffrax_conserve", "beartype.beartype")
 
@@ -20,6 +27,14 @@ settings.register_profile(
 )
 settings.register_profile("ci", settings.get_profile("dev"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+
+def pytest_configure():
+    """Empties the cache of compiled functions once it has grown large; not in a worker."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        size = sum(file.stat().st_size for file in CACHE.glob("*"))
+        if size > CACHE_BYTES_MAX:
+            shutil.rmtree(CACHE, ignore_errors=True)
 
 
 # Each compiled function holds some memory maps, of which Linux allows a process 65,530. A worker

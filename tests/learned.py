@@ -11,6 +11,12 @@ import diffrax_conserve as dfc
 
 LORENZ = dfc.systems.ConservativeLorenz()
 SMALL = dict(width=8, depth=2)
+CORES = {
+    "product": dfc.learned.Product,
+    "concatenated": dfc.learned.Concatenated,
+    "gated": dfc.learned.Gated,
+}
+SWEEPS = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
 
 
 def states(count=50, system=LORENZ, seed=7):

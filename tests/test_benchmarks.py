@@ -130,10 +130,10 @@ def test_every_timed_answer_is_judged(precision):
     system = precision.SYSTEMS["rigid-body"]
     solver = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)
     contestants = {
-        "projected Tsit5": precision.ours(system, solver, 1, (1e-5, 1e-8)),
+        "projected Tsit5": precision.ours(system, solver, 1, (1e-6, 1e-9)),
         "scipy DOP853": precision.Contestant(
             precision.peers.scipy_dop853(precision.peers.EQUATIONS["rigid-body"], precision.T1),
-            (1e-5, 1e-8),
+            (1e-6, 1e-9),
         ),
     }
     start = precision.measuring.initial_states(system, 1)

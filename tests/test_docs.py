@@ -6,6 +6,7 @@ new folder and in the state of a new interpreter: float32 unless the page enable
 
 import ast
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -158,3 +159,28 @@ def test_every_public_name_is_in_the_api_reference(module):
     missing = set(exported(module)) - set(documented)
     assert not missing, f"add `::: NAME` to a page in docs/api for {sorted(missing)}"
     assert len(documented) == len(set(documented)), "a name is documented twice"
+
+
+PROBLEMS = {
+    '<script src="https://elsewhere.org/x.js"></script>': "loads https://elsewhere.org/x.js",
+    '<link rel="stylesheet" href="//elsewhere.org/x.css">': "loads //elsewhere.org/x.css",
+    "<style>@import 'https://elsewhere.org/x.css'</style>": "loads https://elsewhere.org/x.css",
+    '<p style="background: url(https://elsewhere.org/x)">': "loads https://elsewhere.org/x",
+    "<p>the energy $E$</p>": "raw LaTeX: '$E$'",
+    r"<p>\(E\)</p>": "raw LaTeX",
+    '<a href="https://elsewhere.org">a link</a> <code>$HOME</code>': None,
+    '<img src="images/x.png"> <math><mi>E</mi></math>': None,
+}
+
+
+@pytest.mark.parametrize("html", PROBLEMS)
+def test_what_a_page_must_not_have_fails_the_build(html, tmp_path):
+    check = runpy.run_path(str(ROOT / "docs" / "self_contained.py"))["problems"]
+    (tmp_path / "page.html").write_text(f"<html><body>{html}</body></html>", encoding="utf-8")
+    found = check(tmp_path)
+    expected = PROBLEMS[html]
+    if expected is None:
+        assert not found
+    else:
+        assert len(found) == 1
+        assert expected in found[0]

@@ -20,44 +20,33 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _TREE = _TYPES | {"_tree"}
 _MANIFOLD = _TREE | {"_manifold"}
-_PROJECTION = _MANIFOLD | {"_scalars", "_projection"}
-_INTERPOLATION = _PROJECTION | {"_interpolation"}
-# The learned side: a network is wrapped by a solver, and trained by what lies above the solvers.
-_NETWORK = _PROJECTION | {"_network"}
-_SOLVER = _INTERPOLATION | {"_network", "_solver"}
-_CORE = _SOLVER | {"_diagnostics"}
-_LEARNED = _CORE | {"_files", "_training", "_serialisation"}
+_PROJECTION = _MANIFOLD | {"_projection"}
+_CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
+_GUESTS = {"_replace_file", "learned", "systems"}
 MAY_IMPORT = {
     "_custom_types": set(),
-    "_files": set(),
+    "_replace_file": set(),
     "_tree": _TYPES,
-    "_scalars": _TYPES,
     "_manifold": _TREE,
-    "_check": _MANIFOLD,
-    "_projection": _MANIFOLD | {"_scalars"},
+    "_projection": _MANIFOLD,
     "_interpolation": _PROJECTION,
-    "_network": _PROJECTION,
-    "_solver": _INTERPOLATION | {"_network"},
-    "_diagnostics": _SOLVER,
-    "_training": _CORE,
-    "_serialisation": _CORE | {"_files", "systems"},
-    "_plot": _TYPES,
+    "_solver": _PROJECTION | {"_interpolation"},
+    "_diagnostics": _PROJECTION,
+    "learned": _CORE | {"_replace_file", "systems"},
     "systems": _CORE,
-    "testing": _CORE | {"systems", "_check"},
-    PACKAGE: _LEARNED | {"systems", "_check"},
-    "_reproduce": _LEARNED | {"_plot", "systems", PACKAGE},
-    "__main__": _LEARNED | {"_plot", "_reproduce", "systems", PACKAGE},
+    "testing": _CORE | {"systems"},
+    PACKAGE: _CORE | _GUESTS,
+    "reproduce": _CORE | _GUESTS | {PACKAGE},
+    "__main__": _CORE | _GUESTS | {"reproduce", PACKAGE},
 }
 
 # Packages that only one part may import, because they are optional.
-CONFINED = {"hypothesis": "testing", "matplotlib": "_plot"}
+CONFINED = {"hypothesis": "testing", "matplotlib": "reproduce"}
 
 # Private names of other packages that have no public equivalent: `(file, name)`, and why.
 PRIVATE_ALLOWED = {
-    # Nothing public tells a solver that `t1 < t0`, where `diffeqsolve` negates its times.
-    ("_solver/_terms.py", "diffrax._term.WrapTerm"),
-    # Nor that it is called by `BacksolveAdjoint`, whose state is not on the manifold.
-    ("_solver/_terms.py", "diffrax._term.AdjointTerm"),
+    ("_solver/diffrax_private.py", "diffrax._term.WrapTerm"),
+    ("_solver/diffrax_private.py", "diffrax._term.AdjointTerm"),
 }
 
 

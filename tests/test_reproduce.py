@@ -1,5 +1,6 @@
 """The command line: what it prints and writes, and how it refuses what it cannot do."""
 
+import errno
 import json
 import os
 import subprocess
@@ -12,8 +13,9 @@ import pytest
 
 import diffrax_conserve as dfc
 from diffrax_conserve.__main__ import main
-from diffrax_conserve._files import replace_file
-from diffrax_conserve._reproduce import _compare, _job, _learned
+from diffrax_conserve._replace_file import replace_file
+from diffrax_conserve.reproduce import _compare, _job
+from diffrax_conserve.reproduce import _trained as _learned
 
 FIGURES = ("trajectory", "drift", "state_error")
 PAPER = dfc.systems.names()[:5]
@@ -158,7 +160,7 @@ def test_files_and_nothing_else(tmp_path, capsys):
     _, metrics = reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
     assert set(metrics["solvers"]) == {"rk4", "projected rk4", *LEARNED}
     assert max(metrics["solvers"]["conservative"]["drift"].values()) < 1e-14
-    assert metrics["solvers"]["conservative"]["state_error"] < 1e-3
+    assert metrics["solvers"]["conservative"]["state_error"] < 1e-2
     files = list((tmp_path / "out").iterdir())
     names = (*FIGURES, "loss")
     figures = {f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")}
@@ -181,6 +183,28 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
         replace_file(path, half)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk(tmp_path, monkeypatch, capsys):
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "metrics.json")
+
+    monkeypatch.setattr("diffrax_conserve.reproduce._job.replace_file", full)
+    argv = ["reproduce", "lotka-volterra", "--t1", "0.5", "--out", str(tmp_path / "out")]
+    assert main(argv) == 1
+    found = capsys.readouterr().err
+    assert found == "error: cannot write metrics.json: No space left on device\n"
+
+
+@pytest.mark.parametrize("redirection", ["| head -1", "> /dev/full"])
+def test_an_output_that_ends_early(redirection):
+    command = f"set -o pipefail; {sys.executable} -m diffrax_conserve list {redirection}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+    if "full" in redirection:
+        assert done.stderr == "error: cannot write: No space left on device\n"
+        assert done.returncode == 1
 
 
 def test_the_folder_of_the_system_is_the_default(tmp_path, monkeypatch):
@@ -262,7 +286,7 @@ def test_a_folder_that_cannot_be_written(capsys, tmp_path):
 
 
 def test_without_matplotlib(tmp_path):
-    """`list` works, and `reproduce` says what to install before it computes anything."""
+    """Everything works but the figures; `reproduce` says what to install for them."""
     (tmp_path / "matplotlib.py").write_text("raise ImportError('No module named matplotlib')")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
 
@@ -276,10 +300,11 @@ def test_without_matplotlib(tmp_path):
         )
 
     assert run("list").returncode == 0
-    done = run("reproduce", "kepler")
-    assert done.returncode == 2
-    assert "pip install diffrax-conserve[plots]" in done.stderr
-    assert "Traceback" not in done.stderr
+    done = run("reproduce", "kepler", "--t1", "1")
+    assert done.returncode == 0, done.stderr
+    assert "projected rk4" in done.stdout
+    assert "pip install 'diffrax-conserve[plots]'" in done.stdout
+    assert [file.name for file in (tmp_path / "out" / "kepler").iterdir()] == ["metrics.json"]
 
 
 # ---- What it says about a solver that fails ----
@@ -331,7 +356,7 @@ def test_training_anew(tmp_path, capsys):
     assert "Training the conservative network: 3 epochs, seed 1" in capsys.readouterr().out
     for kind in ("standard", "conservative"):
         file = tmp_path / "out" / f"{kind}.network"
-        assert dfc.read_info(file)["info"]["seed"] == 1
+        assert dfc.learned.read_info(file)["info"]["seed"] == 1
         assert (dfc.load(file).layer is None) == (kind == "standard")
     # Three epochs teach nothing, and the manifold holds all the same.
     assert metrics["solvers"]["conservative"]["state_error"] > 1e-3

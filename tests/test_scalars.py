@@ -1,6 +1,7 @@
 """A function written out in scalars is the same function, or it is not written out at all."""
 
 import jax
+import jax.extend.core as jex
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -8,12 +9,13 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve import _scalars
-from diffrax_conserve._scalars import elements_in_scalars, written_out
+from diffrax_conserve._projection import scalars as _scalars
+from diffrax_conserve._projection.scalars import elements_in_scalars, written_out
 
 from .problems import RIGID_BODY
 
 MATRIX = np.arange(6.0).reshape(2, 3) / 7
+Y = jnp.asarray(MATRIX)
 
 
 def primitives(fn, y):
@@ -161,3 +163,52 @@ def test_a_projection_is_the_same_without(monkeypatch):
     expected = projected()
     monkeypatch.setattr(_scalars, "MAX_SCALARS", 0)
     np.testing.assert_allclose(projected(), expected, rtol=4e-16)
+
+
+# ---- What jax may change ----
+
+
+def test_an_invented_primitive_is_not_written_out():
+    invented = jex.Primitive("invented")
+    invented.def_impl(lambda x: x)
+    invented.def_abstract_eval(lambda x: x)
+    assert elements_in_scalars(lambda y: invented.bind(y).reshape(-1), Y) is None
+
+
+@pytest.mark.parametrize("name", ["reduce_sum", "broadcast_in_dim", "dot_general", "transpose"])
+def test_an_invented_parameter_is_not_written_out(name, monkeypatch):
+    """A new jax may give a primitive a parameter that changes what it means."""
+    original = _scalars._WriteOut._equation
+
+    def with_parameter(self, eqn, inputs):
+        if eqn.primitive.name == name:
+            eqn = eqn.replace(params=eqn.params | {"invented": 1})
+        return original(self, eqn, inputs)
+
+    def fn(y):
+        return jnp.sum((y @ MATRIX.T).T + jnp.ones(2), axis=0)
+
+    assert elements_in_scalars(fn, Y) is not None
+    monkeypatch.setattr(_scalars._WriteOut, "_equation", with_parameter)
+    assert elements_in_scalars(fn, Y) is None
+
+
+EVERYDAY = {
+    "dot": lambda y: jnp.dot(y[0], y[1])[None],
+    "sum": lambda y: jnp.sum(y)[None],
+    "stack": lambda y: jnp.stack([y[0, 0], y[1, 2]]),
+    "norm": lambda y: jnp.linalg.norm(y)[None],
+    "where": lambda y: jnp.where(y[0] > 1, y[0], 0.0),
+    "einsum": lambda y: jnp.einsum("ij,kj->ik", y, y).reshape(-1),
+    "matrix product": lambda y: (y @ y.T).reshape(-1),
+    "indexing": lambda y: y[1, ::2],
+}
+
+
+@pytest.mark.parametrize("name", EVERYDAY)
+def test_everyday_functions_are_written_out(name):
+    assert elements_in_scalars(EVERYDAY[name], Y) is not None, (
+        f"`{name}` is no longer written out in scalars with this version of jax, so that small "
+        "projections that use it are several times slower: look which primitive or parameter in "
+        f"{jax.make_jaxpr(EVERYDAY[name])(Y)} is new to `_projection/scalars.py`."
+    )

@@ -1,6 +1,8 @@
 """Networks in files: what comes back is what went in, and a bad file says what is wrong with it."""
 
 import json
+import os
+import stat
 
 import equinox as eqx
 import jax
@@ -25,17 +27,17 @@ NETWORKS = {
     "pinn": solution(activation="sin"),
     "raw pinn": solution(normalise=False),
     "deeponet": flow_map(depth=3),
-    "conservative pinn": solution(layer=dfc.ConservativeLayer(LORENZ.manifold, steps=4)),
+    "conservative pinn": solution(layer=dfc.learned.ConservativeLayer(LORENZ.manifold, steps=4)),
     "windows": solution(windows=3, slope=2.0),
-    "gated": flow_map(inputs="gated", taylor=dfc.Taylor(LORENZ.vector_field, 2)),
+    "gated": flow_map(core=dfc.learned.Gated, taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)),
     "concatenated": flow_map(
-        inputs="concatenated",
-        taylor=dfc.Taylor(LORENZ.vector_field),
-        layer=dfc.ConservativeLayer(LORENZ.manifold),
+        core=dfc.learned.Concatenated,
+        taylor=dfc.learned.Taylor(LORENZ.vector_field),
+        layer=dfc.learned.ConservativeLayer(LORENZ.manifold),
     ),
-    "conservative deeponet": flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold)),
-    "framed": vortices(taylor=dfc.Taylor(VORTICES.vector_field)),
-    "repeated": dfc.Repeated(vortices(inputs="concatenated"), 3),
+    "conservative deeponet": flow_map(layer=dfc.learned.ConservativeLayer(LORENZ.manifold)),
+    "framed": vortices(taylor=dfc.learned.Taylor(VORTICES.vector_field)),
+    "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
 }
 
 
@@ -62,14 +64,14 @@ def test_a_state_of_any_standard_container(path):
 def test_the_parameters_of_the_system_are_kept(path):
     system = dfc.systems.PointVortices(strengths=(1.0, 2.0, 3.0, -1.0))
     y0s = jax.vmap(system.sample)(jr.split(jr.key(0), 4))
-    layer = dfc.ConservativeLayer(system.manifold, steps=2)
+    layer = dfc.learned.ConservativeLayer(system.manifold, steps=2)
     network = dfc.DeepONet(y0s, 0.5, key=jr.key(0), layer=layer, **SMALL)
     dfc.save(path, network)
     assert eqx.tree_equal(dfc.load(path), network)
 
 
 def test_a_layer_of_the_users_own_is_given_again(path):
-    layer = dfc.ConservativeLayer(RADIUS, steps=4)
+    layer = dfc.learned.ConservativeLayer(RADIUS, steps=4)
     pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
     dfc.save(path, pinn)
     with pytest.raises(ValueError, match=r"layer=ConservativeLayer\(manifold, steps=4\)"):
@@ -81,7 +83,7 @@ def test_a_layer_of_the_users_own_is_given_again(path):
 
 
 def test_a_vector_field_of_the_users_own_is_given_again(path):
-    taylor = dfc.Taylor(oscillator, 3)
+    taylor = dfc.learned.Taylor(oscillator, 3)
     network = dfc.DeepONet(EAST[None], 1.0, key=jr.key(0), taylor=taylor, **SMALL)
     dfc.save(path, network)
     with pytest.raises(ValueError, match=r"taylor=Taylor\(vector_field, 3\)"):
@@ -92,7 +94,7 @@ def test_a_vector_field_of_the_users_own_is_given_again(path):
 def test_a_frame_of_the_users_own_is_given_again(path):
     def polar(y):
         across = jnp.stack([-y[1], y[0]])
-        return dfc.Frame(jnp.sum(y**2)[None], jnp.stack([y, across], axis=1))
+        return dfc.learned.Frame(jnp.sum(y**2)[None], jnp.stack([y, across], axis=1))
 
     network = dfc.DeepONet(EAST[None], 1.0, key=jr.key(0), frame=polar, **SMALL)
     dfc.save(path, network)
@@ -103,7 +105,7 @@ def test_a_frame_of_the_users_own_is_given_again(path):
 
 def test_the_info(path):
     dfc.save(path, NETWORKS["deeponet"], info={"system": "lorenz", "errors": [1.0, 2.0]})
-    found = dfc.read_info(path)
+    found = dfc.learned.read_info(path)
     assert found["info"] == {"system": "lorenz", "errors": [1.0, 2.0]}
     assert found["kind"] == "DeepONet"
     assert found["config"]["max_step"] == 0.25
@@ -111,16 +113,21 @@ def test_the_info(path):
     assert set(found["versions"]) >= {"diffrax-conserve", "jax"}
 
 
-def test_float32_arrays_stay_float32(path):
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), NETWORKS["deeponet"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_arrays_keep_their_dtype(path, dtype):
+    single = jax.tree.map(lambda x: x.astype(dtype), NETWORKS["deeponet"])
     dfc.save(path, single)
     assert eqx.tree_equal(dfc.load(path), single)
+    # Some arrays, too.
+    mixed = eqx.tree_at(lambda m: m.core, NETWORKS["deeponet"], single.core)
+    dfc.save(path, mixed)
+    assert eqx.tree_equal(dfc.load(path), mixed)
 
 
 def test_the_file_is_no_pickle(path):
     dfc.save(path, NETWORKS["pinn"])
     first, header, _ = path.read_bytes().split(b"\n", 2)
-    assert first.startswith(b"diffrax-conserve network 2 ")
+    assert first.startswith(b"diffrax-conserve network 3 ")
     assert json.loads(header)["kind"] == "PINN"
 
 
@@ -158,6 +165,22 @@ def test_a_save_that_fails_leaves_the_old_file(path, monkeypatch):
     assert list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o666])
+def test_a_file_keeps_its_mode_and_a_link_stays_one(path, mode):
+    dfc.save(path, NETWORKS["pinn"])
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
+    path.chmod(mode)
+    link = path.with_name("link.network")
+    link.symlink_to(path.name)
+    dfc.save(link, NETWORKS["deeponet"])
+    assert link.is_symlink()
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert eqx.tree_equal(dfc.load(path), NETWORKS["deeponet"])
+    assert set(path.parent.iterdir()) == {path, link}
+
+
 # ---- Bad files ----
 
 
@@ -191,13 +214,14 @@ def test_a_foreign_file(path):
 
 
 def test_a_file_of_a_newer_version(path, content):
-    path.write_bytes(content.replace(b"network 2 ", b"network 3 ", 1))
+    path.write_bytes(content.replace(b"network 3 ", b"network 4 ", 1))
     with pytest.raises(ValueError, match=r"newer version .* Upgrade"):
         dfc.load(path)
 
 
-def test_a_file_from_before_the_first_release(path, content):
-    path.write_bytes(content.replace(b"network 2 ", b"network 1 ", 1))
+@pytest.mark.parametrize("version", [b"0", b"1", b"2"])
+def test_a_file_from_before_the_first_release(path, content, version):
+    path.write_bytes(content.replace(b"network 3 ", b"network %s " % version, 1))
     with pytest.raises(ValueError, match=r"before the first release"):
         dfc.load(path)
 
@@ -217,8 +241,8 @@ SYSTEMS = dfc.systems.names()[:5]
 def test_every_pretrained_network(name, kind):
     name = f"{name}-{kind}"
     network = dfc.load_pretrained(name)
-    file = dfc.pretrained_path(name)
-    info = dfc.read_info(file)["info"]
+    file = dfc.learned.pretrained_path(name)
+    info = dfc.learned.read_info(file)["info"]
     system = dfc.systems.get(info["system"])
     assert file.stat().st_size < 150_000
     assert (network.layer is not None) == (kind == "conservative")
@@ -240,8 +264,8 @@ def test_every_pretrained_network(name, kind):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_network_of_the_zoo(name):
     network = dfc.load_pretrained(name)
-    file = dfc.pretrained_path(name)
-    info = dfc.read_info(file)["info"]
+    file = dfc.learned.pretrained_path(name)
+    info = dfc.learned.read_info(file)["info"]
     system = dfc.systems.get(name)
     assert file.stat().st_size < 60_000
     assert info["command"].startswith("python benchmarks/zoo.py")
@@ -260,6 +284,7 @@ def test_every_network_of_the_zoo(name):
     assert network.domain.contains(system.y0)
 
 
-def test_a_pretrained_network_that_does_not_exist():
+@pytest.mark.parametrize("name", ["rigid-bodies", "../pretrained/rigid-body", "/etc/passwd", ""])
+def test_a_pretrained_network_that_does_not_exist(name):
     with pytest.raises(ValueError, match=r"rigid-body-conservative"):
-        dfc.load_pretrained("rigid-bodies")
+        dfc.load_pretrained(name)

@@ -32,22 +32,23 @@ class DoublePendulum(AbstractIntegratedSystem):
     - \partial V / \partial \theta_{1,2}, \qquad
     V = -(m_1 + m_2) g l_1 \cos\theta_1 - m_2 g l_2 \cos\theta_2.$$
 
-    **Manifold**: energy, the Hamiltonian $H = \tfrac12\, p \cdot M^{-1} p + V$. For unit
-    parameters,
+    **Manifold**: energy, the Hamiltonian $H = \tfrac12\, p \cdot M^{-1} p + V$. For unit masses
+    and lengths,
 
     $$H = \frac{p_1^2 + 2 p_2^2 - 2 p_1 p_2 \cos\Delta}{2 (1 + \sin^2\Delta)}
-    - 2 \cos\theta_1 - \cos\theta_2;$$
+    - 2 g \cos\theta_1 - g \cos\theta_2;$$
 
     the paper lacks a bracket here. **Reference**: numerical. **Samples**: uniform on
     $[-\pi/6, \pi/6]^4$.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
-    horizon (20 steps of 0.5) are the defaults; Landau and Lifshitz, "Mechanics", §5.
+    horizon (20 steps of 0.5) are the defaults; it names no single initial state, that one is ours.
+    Landau and Lifshitz, "Mechanics", §5.
     """
 
     masses: Pair = eqx.field(converter=real, default=(1.0, 1.0))
     lengths: Pair = eqx.field(converter=real, default=(1.0, 1.0))
-    gravity: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+    gravity: Float[Array, ""] = eqx.field(converter=real, default=9.81)
 
     name: ClassVar[str] = "double-pendulum"
     title: ClassVar[str] = "Double pendulum"
@@ -57,7 +58,7 @@ class DoublePendulum(AbstractIntegratedSystem):
     )
     t1: ClassVar[float] = 10.0
     dt: ClassVar[float] = 0.5
-    axes: ClassVar[tuple[str, ...]] = ("θ", "p")
+    axes: ClassVar[tuple[str, ...]] = ("θ₁", "θ₂")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -104,7 +105,7 @@ class DoublePendulum(AbstractIntegratedSystem):
         return jr.uniform(key, (4,), minval=-jnp.pi / 6, maxval=jnp.pi / 6)
 
     def trajectories(self, ys: Float[Array, "times 4"]) -> dict[str, Float[Array, "times 2"]]:
-        return {"upper mass": ys[:, 0::2], "lower mass": ys[:, 1::2]}
+        return {"angles": ys[:, :2]}
 
 
 DoublePendulum.__init__.__doc__ = r"""**Arguments:**

@@ -17,20 +17,23 @@ State = Float[Array, "3"]
 
 @final
 class RigidBody(AbstractSystem):
-    r"""Euler's equations of a free rigid body, `y = ω` of shape `(3,)`, in its principal frame.
+    r"""Euler's equations of a free rigid body, in its principal frame.
 
-    $$I_1 \omega_1' = (I_2 - I_3)\, \omega_2 \omega_3 \quad\text{and cyclically},$$
+    The state `y = w` of shape `(3,)` is the angular momentum; the angular velocity is $w_i / I_i$.
 
-    $$H = \tfrac12 \sum_i I_i \omega_i^2, \qquad L = \sum_i I_i^2 \omega_i^2.$$
+    $$w_1' = \frac{I_2 - I_3}{I_2 I_3}\, w_2 w_3 \quad\text{and cyclically},$$
 
-    **Manifold**: energy $H$ and squared angular momentum $L$ (the paper prints $\omega_3^3$ for
-    $\omega_3^2$ in $L$). At a steady rotation, about a principal axis, the two are dependent.
+    $$H = \tfrac12 \sum_i w_i^2 / I_i, \qquad L = \tfrac12 \sum_i w_i^2.$$
+
+    **Manifold**: energy $H$ and half the squared angular momentum $L$ (the paper prints $w_3^3$ for
+    $w_3^2$ in $L$). At a steady rotation, about a principal axis, the two are dependent.
     **Reference**: exact, by Jacobi's elliptic functions; needs at least two distinct moments, and
-    loses accuracy at the separatrix $L = 2 H I_2$, where the motion is itself unstable.
-    **Samples**: uniform direction, $\tfrac12 \le |\omega| \le 2$ uniform.
+    loses accuracy at the separatrix $L = H I_2$, where the motion is itself unstable.
+    **Samples**: uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and horizon are
-    the defaults; Landau and Lifshitz, "Mechanics", §37 for the solution.
+    the defaults (1.55 periods; the step is ours, the paper gives none); Landau and Lifshitz,
+    "Mechanics", §37 for the solution.
     """
 
     inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
@@ -43,7 +46,7 @@ class RigidBody(AbstractSystem):
     )
     t1: ClassVar[float] = 1.75
     dt: ClassVar[float] = 0.05
-    axes: ClassVar[tuple[str, ...]] = ("ω₁", "ω₂", "ω₃")
+    axes: ClassVar[tuple[str, ...]] = ("w₁", "w₂", "w₃")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -53,11 +56,11 @@ class RigidBody(AbstractSystem):
 
     def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
         del t, args
-        return jnp.sum(self.like(y).inertia * y**2) / 2
+        return jnp.sum(y**2 / self.like(y).inertia) / 2
 
     def squared_angular_momentum(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
         del t, args
-        return jnp.sum((self.like(y).inertia * y) ** 2)
+        return jnp.sum(y**2) / 2
 
     @property
     def manifold(self) -> dict[str, FirstIntegral | Constraint]:
@@ -88,7 +91,8 @@ class RigidBody(AbstractSystem):
         return None
 
     def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
-        return {"angular velocity": ys}
+        # Not the two that the paper shows: there a closed orbit is an arc, run to and fro.
+        return {"angular momentum": ys}
 
 
 RigidBody.__init__.__doc__ = r"""**Arguments:**
@@ -99,18 +103,18 @@ RigidBody.__init__.__doc__ = r"""**Arguments:**
 
 def _rates(inertia: Float[Array, "3"]) -> tuple[Array, Array, Array]:
     i1, i2, i3 = inertia
-    return (i2 - i3) / i1, (i3 - i1) / i2, (i1 - i2) / i3
+    return (i2 - i3) / (i2 * i3), (i3 - i1) / (i3 * i1), (i1 - i2) / (i1 * i2)
 
 
 def _elliptic_form(
     inertia: Float[Array, "3"], y0: State
 ) -> tuple[Array, Array, Array, Array, Array]:
-    r"""The solution as $(\omega_a, \omega_b, \omega_c) = (A\,dn, B\,sn, C\,cn)(\lambda t + u_0)$.
+    r"""The solution as $(w_a, w_b, w_c) = (A\,dn, B\,sn, C\,cn)(\lambda t + u_0)$.
 
-    Here $b$ is the axis of the middle moment of inertia. With $\omega_i' = k_i \omega_j \omega_k$,
+    Here $b$ is the axis of the middle moment of inertia. With $w_i' = k_i w_j w_k$,
     inserting this form gives $\lambda^2 = -k_b k_c A^2$, $B = k_b A C / \lambda$ and
     $m = k_a C^2 / k_c A^2$. Of the two outer axes, $a$ is the one for which $m \le 1$: the one that
-    $\omega$ circles.
+    $w$ circles.
     """
     order = jnp.argsort(inertia)
     k = jnp.stack(_rates(inertia))

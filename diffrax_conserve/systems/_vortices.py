@@ -1,6 +1,6 @@
 """Point vortices in the plane."""
 
-from typing import ClassVar, final
+from typing import ClassVar, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -12,12 +12,19 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from .._network import Frame
 from ._base import real
 from ._reference import AbstractIntegratedSystem
 from ._sampling import annulus
 
 State = Float[Array, "vortices 2"]
+
+
+class Reduced(NamedTuple):
+    """A state up to symmetries: a `diffrax_conserve.learned.Frame` is made of these three."""
+
+    inputs: Float[Array, " k"]  # what the symmetries do not change
+    basis: Float[Array, "n m"]  # directions that turn with the state
+    clock: Float[Array, ""]  # units of its own time in one unit of time
 
 
 @final
@@ -107,7 +114,7 @@ class PointVortices(AbstractIntegratedSystem):
 
         return jax.lax.while_loop(is_too_close, again, again((key, draw(key))))[1]
 
-    def frame(self, y: State) -> Frame:
+    def frame(self, y: State) -> Reduced:
         r"""The frame of three vortices of equal strengths, for a [`diffrax_conserve.DeepONet`][].
 
         Their flow commutes with translations, rotations, permutations, and changes of scale by $c$
@@ -138,7 +145,8 @@ class PointVortices(AbstractIntegratedSystem):
             *(jnp.outer(of_q, d * x).reshape(-1) for x in (e, _quarter_turn(e))),
             *(jnp.outer(of_r, x).reshape(-1) for x in (r, _quarter_turn(r))),
         ]
-        return Frame(jnp.stack(inputs), jnp.stack(columns, axis=1).astype(y.dtype), 1 / d**2)
+        basis = jnp.stack(columns, axis=1).astype(y.dtype)
+        return Reduced(jnp.stack(inputs), basis, 1 / d**2)
 
     def trajectories(
         self, ys: Float[Array, "times vortices 2"]

@@ -1,3 +1,10 @@
+import importlib.util as _util
+
+if _util.find_spec("hypothesis") is None:
+    raise ImportError(
+        "diffrax_conserve.testing needs hypothesis: pip install 'diffrax-conserve[testing]'"
+    )
+
 from ._conserved import assert_conserved as assert_conserved
 from ._conserved import assert_on_manifold as assert_on_manifold
 from ._gradients import assert_gradients as assert_gradients

@@ -21,8 +21,8 @@ from .._manifold import (
     evaluate,
     is_entry,
     named_entries,
-    scales,
 )
+from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
 
 # Twice what a projection accepts by default: the residual is evaluated here once more.
@@ -179,17 +179,16 @@ def measure(
     for the initial state."""
     ts, ys, t0, y0 = lane
     target = conserved_values(manifold, t0, y0, args) if values is None else values
-    initial_scale = scales(manifold, target, t0, y0, args)
+    _, initial_scale = residuals(manifold, target, t0, y0, args)
 
     def at(t: Array, y: Y) -> tuple[Values, Values, Values, Array]:
         padded = jnp.isinf(t)
         t = jnp.where(padded, t0.astype(t.dtype), t)
         y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
         found = evaluate(manifold, t, y, args)
-        residual = jtu.tree_map(
-            lambda a, b: jnp.where(padded, 0, a - jnp.asarray(b, a.dtype)), found, target
-        )
-        scale = jtu.tree_map(jnp.maximum, scales(manifold, target, t, y, args), initial_scale)
+        residual, scale = residuals(manifold, target, t, y, args)
+        residual = jtu.tree_map(lambda g: jnp.where(padded, 0, g), residual)
+        scale = jtu.tree_map(jnp.maximum, scale, initial_scale)
         finite = [jnp.all(jnp.isfinite(x)) for x in (t, *jtu.tree_leaves(y))]
         return residual, scale, found, jnp.all(jnp.stack(finite))
 

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
-from diffrax_conserve._manifold import scales
+from diffrax_conserve._projection import measure
 
 from .common import (
     SYSTEMS,
@@ -96,7 +96,7 @@ def linear_combinations_of_the_integrals_change_nothing(system, y, displacement)
     fn = joined(system.manifold)
     count = fn(0.0, y, None).size
     matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)) + 2 * np.eye(count))
-    (scale,) = scales((dfc.FirstIntegral(fn),), (fn(0.0, y, None),), 0.0, y, None)
+    _, (scale,) = measure((dfc.FirstIntegral(fn),), (fn(0.0, y, None),), 0.0, y, None)
     got, ok2 = project(dfc.FirstIntegral(lambda *a: matrix @ (fn(*a) / scale)), candidate, y)
     return ok1 & ok2, got, expected
 

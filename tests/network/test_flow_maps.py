@@ -10,9 +10,10 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, RADIUS, flow_map, oscillator, solution
+from ..learned import CORES, EAST, LORENZ, RADIUS, flow_map, oscillator, solution
+from ..thinned import some_of
 
-KINDS = ("product", "concatenated", "gated")
+KINDS = pytest.mark.parametrize("core", CORES.values(), ids=CORES)
 
 
 # ---- The Taylor polynomial ----
@@ -21,7 +22,7 @@ KINDS = ("product", "concatenated", "gated")
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_the_polynomial_of_a_linear_system(order):
     matrix = jr.normal(jr.key(0), (3, 3))
-    taylor = dfc.Taylor(lambda t, y, args: args * (matrix @ y), order, args=2.0)
+    taylor = dfc.learned.Taylor(lambda t, y, args: args * (matrix @ y), order, args=2.0)
     y0, h = jnp.array([1.0, -2.0, 0.5]), 0.3
     expected, term = np.asarray(y0), np.asarray(y0)
     for j in range(1, order + 1):
@@ -32,17 +33,17 @@ def test_the_polynomial_of_a_linear_system(order):
 
 def test_the_polynomial_of_any_state():
     y0 = {"a": jnp.array(1.0), "b": (jnp.ones(2, jnp.float32),)}
-    taylor = dfc.Taylor(lambda t, y, args: jax.tree.map(lambda x: -x, y), 3)
+    taylor = dfc.learned.Taylor(lambda t, y, args: jax.tree.map(lambda x: -x, y), 3)
     y = taylor(y0, 0.1)
     assert y["b"][0].dtype == jnp.float32
     np.testing.assert_allclose(y["a"], 1 - 0.1 + 0.1**2 / 2 - 0.1**3 / 6, rtol=1e-15)
 
 
-@pytest.mark.parametrize("order", [0, 1, 2, 3])
-@pytest.mark.parametrize("inputs", KINDS)
-def test_untrained_it_has_the_order_of_its_polynomial(inputs, order):
-    taylor = dfc.Taylor(LORENZ.vector_field, order) if order else None
-    network = flow_map(inputs=inputs, taylor=taylor)
+@some_of("order", [0, 1, 2, 3], ids="0123", period=2)
+@KINDS
+def test_untrained_it_has_the_order_of_its_polynomial(core, order):
+    taylor = dfc.learned.Taylor(LORENZ.vector_field, order) if order else None
+    network = flow_map(core=core, taylor=taylor)
     assert network.order == order
     steps = 0.02 / 2.0 ** np.arange(3)
     exact = LORENZ.reference(jnp.asarray(steps[::-1]))[::-1]
@@ -52,20 +53,20 @@ def test_untrained_it_has_the_order_of_its_polynomial(inputs, order):
 
 
 def test_its_solver_has_that_order_too():
-    solver = dfc.DeepONetSolver(flow_map(taylor=dfc.Taylor(LORENZ.vector_field, 2)))
+    solver = dfc.DeepONetSolver(flow_map(taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)))
     assert solver.order(dfx.ODETerm(LORENZ.vector_field)) == 2
 
 
 def test_a_wrong_polynomial():
     with pytest.raises(ValueError, match="`order` must be a positive integer"):
-        dfc.Taylor(oscillator, 0)
+        dfc.learned.Taylor(oscillator, 0)
 
 
 # ---- The networks ----
 
 
 def test_concatenated_inputs():
-    network = flow_map(inputs="concatenated")
+    network = flow_map(core=dfc.learned.Concatenated)
     h = 0.2
     x = jnp.append((LORENZ.y0 - network.shift) / network.scale, 2 * h / 0.25 - 1)
     first, second, last = network.core.net.weights
@@ -76,7 +77,7 @@ def test_concatenated_inputs():
 
 
 def test_gated_inputs():
-    network = flow_map(inputs="gated", depth=3)
+    network = flow_map(core=dfc.learned.Gated, depth=3)
     core = network.core
     assert len(core.hidden) == 3
     x = jnp.append(jnp.array([0.3, -0.2, 0.5]), 0.1)
@@ -89,17 +90,17 @@ def test_gated_inputs():
     np.testing.assert_allclose(core(x[:3], x[3]), expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize("inputs", KINDS)
-def test_every_kind_starts_at_its_state(inputs):
-    network = flow_map(inputs=inputs, taylor=dfc.Taylor(LORENZ.vector_field))
+@KINDS
+def test_every_kind_starts_at_its_state(core):
+    network = flow_map(core=core, taylor=dfc.learned.Taylor(LORENZ.vector_field))
     np.testing.assert_array_equal(network(LORENZ.y0, 0.0), LORENZ.y0)
     slope = jax.jacfwd(lambda h: network(LORENZ.y0, h))(0.0)
     np.testing.assert_allclose(slope, LORENZ.vector_field(0.0, LORENZ.y0, None), rtol=1e-14)
 
 
 def test_an_unknown_kind_is_refused():
-    with pytest.raises(ValueError, match="`inputs` is 'both'"):
-        flow_map(inputs="both")
+    with pytest.raises(TypeError):
+        flow_map(core="both")
 
 
 def test_its_domain_is_the_box_round_its_states():

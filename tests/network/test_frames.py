@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._training._defect import Points, defects
+from diffrax_conserve.learned._networks import Points
+from diffrax_conserve.learned._training.defect import defects
 
-from ..learned import LORENZ, SMALL, flow_map, states
+from ..learned import CORES, LORENZ, SMALL, flow_map, states
 
 VORTICES = dfc.systems.PointVortices()
 # One compilation each, not one for each operation.
@@ -20,7 +21,7 @@ STEP = 0.125
 
 
 def framed(order=0, seed=0, **options):
-    taylor = dfc.Taylor(VORTICES.vector_field, order) if order else None
+    taylor = dfc.learned.Taylor(VORTICES.vector_field, order) if order else None
     y0s = states(system=VORTICES)
     options = SMALL | dict(taylor=taylor, frame=VORTICES.frame, key=jr.key(seed)) | options
     return dfc.DeepONet(y0s, STEP, **options)
@@ -54,7 +55,7 @@ def test_its_basis_spans_what_the_vector_field_can_do():
     y0s = states(system=VORTICES)
     frames = FRAMES(y0s)
     rates = jax.vmap(lambda y: VORTICES.vector_field(0.0, y, None))(y0s).reshape(len(y0s), 6)
-    coefficients = jax.vmap(dfc.Frame.measure)(frames, rates)
+    coefficients = jax.vmap(dfc.learned.Frame.measure)(frames, rates)
     again = jnp.einsum("snm,sm->sn", frames.basis, coefficients) * frames.clock[:, None]
     np.testing.assert_allclose(again, rates, atol=1e-12)
 
@@ -76,9 +77,9 @@ def test_other_vortices_have_no_such_frame(strengths):
 # ---- Flow maps with a frame ----
 
 
-@pytest.mark.parametrize(("inputs", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
-def test_untrained_it_commutes_with_the_symmetries(inputs, order):
-    network = framed(order, inputs=inputs)
+@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+def test_untrained_it_commutes_with_the_symmetries(core, order):
+    network = framed(order, core=CORES[core])
     y0s, h = states(10, VORTICES, seed=3), 0.05
     step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
     found = step(jax.vmap(transformed)(y0s), 1.3**2 * h)
@@ -112,14 +113,14 @@ def test_its_domain_is_one_of_shapes():
 
 
 def test_training_measures_the_defect_in_the_frame():
-    network = framed(1, inputs="concatenated")
+    network = framed(1, core=dfc.learned.Concatenated)
     y0s, ts = states(20, VORTICES), jnp.linspace(0.0, STEP, 20)
 
     @jax.jit
     def both():
         points = Points(ts, y0s)
         measured = defects(
-            network, VORTICES.vector_field, None, points, jnp.asarray(0), jnp.asarray(1.0)
+            network, VORTICES.vector_field, None, points, (jnp.asarray(0), jnp.asarray(1.0))
         )
         path = jax.vmap(network)
         ys, slopes = jax.jvp(lambda ts: path(y0s, ts), (ts,), (jnp.ones_like(ts),))
@@ -135,12 +136,12 @@ def test_training_measures_the_defect_in_the_frame():
 
 @pytest.mark.slow
 def test_training_lessens_the_error():
-    network = framed(inputs="concatenated", width=12, depth=1)
+    network = framed(core=dfc.learned.Concatenated, width=12, depth=1)
     y0s = states(200, VORTICES)
-    recipe = dfc.Recipe(epochs=30, points=40, optimiser=dfc.SPRING(), refresh=1)
+    recipe = dfc.learned.Recipe(epochs=30, points=40, optimiser=dfc.learned.SPRING(), refresh=1)
     trained, _ = dfc.fit(
         network, VORTICES.vector_field,
-        key=jr.key(0), sample=dfc.from_states(y0s), recipe=recipe,
+        key=jr.key(0), sample=dfc.learned.FromStates(y0s), recipe=recipe,
     )  # fmt: skip
     fresh = states(20, VORTICES, seed=9)
 
@@ -158,7 +159,7 @@ def test_training_lessens_the_error():
 def test_a_frame_of_a_dictionary():
     def polar(y):
         x = jnp.stack([y["q"], y["p"]])
-        return dfc.Frame(
+        return dfc.learned.Frame(
             jnp.sum(x**2)[None], jnp.stack([x, jnp.stack([-y["p"], y["q"]])], axis=1)[::-1]
         )
 
@@ -175,12 +176,12 @@ def test_wrong_frames_are_named():
     options = dict(key=jr.key(0), **SMALL)
     with pytest.raises(TypeError):
         dfc.DeepONet(y0s, 1.0, frame=1.0, **options)
-    with pytest.raises(TypeError, match=r"must return a `diffrax_conserve\.Frame`"):
+    with pytest.raises(TypeError, match=r"must return a `diffrax_conserve\.learned\.Frame`"):
         dfc.DeepONet(y0s, 1.0, frame=lambda y: y, **options)
     with pytest.raises(ValueError, match=r"`\(6, m\)`"):
-        dfc.DeepONet(y0s, 1.0, frame=lambda y: dfc.Frame(y[0], jnp.ones((3, 2))), **options)
+        dfc.DeepONet(y0s, 1.0, frame=lambda y: dfc.learned.Frame(y[0], jnp.ones((3, 2))), **options)
     with pytest.raises(ValueError, match="cannot have a `layer`"):
-        framed(layer=dfc.ConservativeLayer(VORTICES.manifold))
+        framed(layer=dfc.learned.ConservativeLayer(VORTICES.manifold))
     with pytest.raises(ValueError, match="for states of 6 numbers"):
         framed()(jnp.ones(4), 0.1)
 
@@ -189,8 +190,8 @@ def test_wrong_frames_are_named():
 
 
 def test_a_repeated_flow_map_is_its_steps_one_after_the_other():
-    inner = flow_map(taylor=dfc.Taylor(LORENZ.vector_field))
-    repeated = dfc.Repeated(inner, 3)
+    inner = flow_map(taylor=dfc.learned.Taylor(LORENZ.vector_field))
+    repeated = dfc.learned.Repeated(inner, 3)
     inner = eqx.filter_jit(inner)
     assert (repeated.max_step, repeated.order) == (0.75, 1)
     assert repeated.domain is repeated.flow_map.domain
@@ -210,15 +211,15 @@ def test_a_flow_map_without_a_domain_repeated():
         def __call__(self, y0, h):
             return y0
 
-    repeated = dfc.Repeated(Still(), 2)
+    repeated = dfc.learned.Repeated(Still(), 2)
     assert repeated.order == 0
     assert repeated.domain is None
 
 
 def test_wrong_repetitions_are_named():
     with pytest.raises(ValueError, match="`count` must be a positive integer"):
-        dfc.Repeated(flow_map(), 0)
+        dfc.learned.Repeated(flow_map(), 0)
     with pytest.raises(TypeError, match="which is no flow map"):
-        dfc.Repeated(lambda y0, h: y0, 2)
+        dfc.learned.Repeated(lambda y0, h: y0, 2)
     with pytest.raises(ValueError, match="Train its inner"):
-        dfc.fit(dfc.Repeated(flow_map(), 2), LORENZ.vector_field, key=jr.key(0))
+        dfc.fit(dfc.learned.Repeated(flow_map(), 2), LORENZ.vector_field, key=jr.key(0))

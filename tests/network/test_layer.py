@@ -34,7 +34,7 @@ def moved(layer, y, values, radius, schedule=None):
 @given(st.integers(0, 10**6), st.integers(2, 12))
 def test_enough_iterations_reach_the_manifold_from_far_away(seed, halves):
     distance = 10 ** (-halves / 2)  # from 0.1 to 1e-6
-    layer = dfc.ConservativeLayer(RIGID_BODY, steps=12)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)
     values = layer.values(0.0, OMEGA0)
     candidate = OMEGA0 + distance * jr.normal(jr.key(seed), (3,))
     y = moved(layer, candidate, values, ONE)
@@ -45,7 +45,7 @@ def test_each_iteration_comes_nearer():
     candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
     left = []
     for steps in range(1, 6):
-        layer = dfc.ConservativeLayer(RIGID_BODY, steps=steps)
+        layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)
         values = layer.values(0.0, OMEGA0)
         left.append(residual(layer, moved(layer, candidate, values, ONE), values))
     assert all(b < a / 3 or b < 1e-15 for a, b in itertools.pairwise(left))
@@ -53,7 +53,7 @@ def test_each_iteration_comes_nearer():
 
 
 def test_the_move_is_along_the_gradients_at_the_candidate():
-    layer = dfc.ConservativeLayer(RIGID_BODY, steps=8)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=8)
     values = layer.values(0.0, OMEGA0)
     candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
     rows = jnp.stack(jax.tree.leaves(jax.jacrev(lambda y: layer.values(0.0, y))(candidate)))
@@ -63,20 +63,20 @@ def test_the_move_is_along_the_gradients_at_the_candidate():
 
 
 def test_a_state_on_the_manifold_stays():
-    layer = dfc.ConservativeLayer(RIGID_BODY)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY)
     y = moved(layer, OMEGA0, layer.values(0.0, OMEGA0), ONE)
     np.testing.assert_allclose(y, OMEGA0, rtol=0, atol=1e-15)
 
 
 def test_where_the_gradient_vanishes_nothing_blows_up():
-    layer = dfc.ConservativeLayer(RADIUS, steps=5)
+    layer = dfc.learned.ConservativeLayer(RADIUS, steps=5)
     for scale in (0.0, 1e-300, 1e-12, 1e-3):
         y = moved(layer, scale * EAST, layer.values(0.0, EAST), ONE)
         assert float(jnp.max(jnp.abs(y))) <= 1 + 5
 
 
 def test_dependent_integrals_change_nothing():
-    once, twice = (dfc.ConservativeLayer(m, steps=8) for m in (RADIUS, (RADIUS, RADIUS)))
+    once, twice = (dfc.learned.ConservativeLayer(m, steps=8) for m in (RADIUS, (RADIUS, RADIUS)))
     candidate = jnp.array([1.1, 0.3])
     a, b = (moved(x, candidate, x.values(0.0, EAST), ONE) for x in (once, twice))
     np.testing.assert_allclose(a, b, atol=1e-9)
@@ -84,7 +84,7 @@ def test_dependent_integrals_change_nothing():
 
 def test_many_constraints_use_the_dense_solve():
     sphere = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2, axis=1))
-    layer = dfc.ConservativeLayer(sphere, steps=8)
+    layer = dfc.learned.ConservativeLayer(sphere, steps=8)
     y0 = jr.normal(jr.key(0), (12, 3))
     candidate = 1.1 * y0
     y = moved(layer, candidate, layer.values(0.0, y0), ONE)
@@ -97,7 +97,7 @@ CANDIDATE = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
 
 
 def scheduled(p, s, steps=3):
-    layer = dfc.ConservativeLayer(RIGID_BODY, steps=steps)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)
     schedule = (jnp.asarray(p), jnp.asarray(s))
     return moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE, schedule)
 
@@ -107,7 +107,7 @@ def test_a_schedule_blends_successive_iterates():
     np.testing.assert_allclose(scheduled(1, 0.0), CANDIDATE, rtol=1e-15)
     for p in (1, 2, 3):
         # With `p` iterations in all, the layer makes them without a schedule.
-        layer = dfc.ConservativeLayer(RIGID_BODY, steps=p)
+        layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=p)
         expected = moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE)
         np.testing.assert_allclose(scheduled(p, 1.0), expected, rtol=1e-15)
         blend = 0.75 * scheduled(p - 1, 1.0) + 0.25 * scheduled(p, 1.0)
@@ -116,7 +116,7 @@ def test_a_schedule_blends_successive_iterates():
 
 def test_every_schedule_compiles_once():
     energy = Counted(lambda t, y, args: jnp.sum(y**2))
-    layer = dfc.ConservativeLayer(dfc.FirstIntegral(energy), steps=4)
+    layer = dfc.learned.ConservativeLayer(dfc.FirstIntegral(energy), steps=4)
 
     @jax.jit
     def run(p, s):
@@ -139,7 +139,7 @@ def finite_difference(f, x, direction, h=1e-5):
 @pytest.mark.parametrize("distance", [pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
 def test_first_and_second_derivatives(distance):
     """To second order, since every loss with a time derivative needs the gradient of one."""
-    layer = dfc.ConservativeLayer(RIGID_BODY, steps=12)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)
     values = layer.values(0.0, OMEGA0)
     start = OMEGA0 + distance * jnp.array([0.3, -1.0, 0.5])
     velocity, direction = jnp.array([0.2, 0.5, -0.4]), jnp.array([-0.7, 0.1, 0.4])
@@ -167,7 +167,7 @@ def test_derivatives_with_respect_to_the_manifold_and_the_values():
     @jax.jit
     def moved_to(omega, value):
         energy = dfc.FirstIntegral(lambda t, y, args: (y[1] ** 2 + (omega * y[0]) ** 2) / 2)
-        layer = dfc.ConservativeLayer(energy, steps=12)
+        layer = dfc.learned.ConservativeLayer(energy, steps=12)
         return layer(jnp.array([1.1, 0.4]), value, 0.0, ONE)[0]
 
     point, h = jnp.array([1.3, 0.9]), 1e-6
@@ -178,7 +178,7 @@ def test_derivatives_with_respect_to_the_manifold_and_the_values():
 
 
 def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifold():
-    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=12)
+    layer = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=12)
     net = flow_map(layer=layer)
 
     @jax.jit
@@ -195,7 +195,7 @@ def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifol
 
 
 def test_a_conservative_network_is_its_candidate_moved():
-    layer = dfc.ConservativeLayer(LORENZ.manifold, steps=12)
+    layer = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=12)
     plain, y0 = flow_map(), LORENZ.y0
     conservative = eqx.filter_jit(flow_map(layer=layer))
     values = layer.values(0.0, y0)
@@ -209,7 +209,7 @@ def test_a_conservative_network_is_its_candidate_moved():
 
 
 def test_a_batch_is_its_lanes():
-    net = flow_map(layer=dfc.ConservativeLayer(LORENZ.manifold))
+    net = flow_map(layer=dfc.learned.ConservativeLayer(LORENZ.manifold))
     y0s, hs = states(6), jnp.linspace(0, 0.25, 6)
     batch, lane = jax.jit(jax.vmap(net))(y0s, hs), eqx.filter_jit(net)
     for i in range(6):
@@ -218,13 +218,13 @@ def test_a_batch_is_its_lanes():
 
 def test_args_are_passed_to_the_manifold():
     weighted = dfc.FirstIntegral(lambda t, y, args: jnp.sum(args * y**2))
-    layer = dfc.ConservativeLayer(weighted, steps=12, args=jnp.array([1.0, 3.0]))
+    layer = dfc.learned.ConservativeLayer(weighted, steps=12, args=jnp.array([1.0, 3.0]))
     pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
     assert abs(float(weighted.fn(0, pinn(0.7), layer.args)) - 1) < 1e-14
 
 
 def test_what_is_refused():
     with pytest.raises(ValueError, match="`steps` must be a positive integer"):
-        dfc.ConservativeLayer(RADIUS, steps=0)
+        dfc.learned.ConservativeLayer(RADIUS, steps=0)
     with pytest.raises(TypeError, match="neither a `FirstIntegral`"):
-        dfc.ConservativeLayer(lambda t, y, args: y)
+        dfc.learned.ConservativeLayer(lambda t, y, args: y)

@@ -9,8 +9,9 @@ import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._manifold import DENSE_MAX, estimated_norms
-from diffrax_conserve._projection import _jacobian
+from diffrax_conserve._projection import linearise as _jacobian
+from diffrax_conserve._projection.jacobian import estimated_norms
+from diffrax_conserve._projection.linearise import DENSE_MAX
 
 from ..problems import solve
 
@@ -60,6 +61,7 @@ def test_it_agrees_with_the_dense_solver(monkeypatch):
     np.testing.assert_allclose(y, dense, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_finite_differences():
     q, rng = chain(), np.random.default_rng(1)
     d, h = jnp.asarray(rng.normal(size=q.shape)), 1e-6
@@ -97,11 +99,12 @@ def test_contradicting_constraints_fail():
     assert info.result != optx.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_solve_keeps_every_constraint_at_every_saved_time():
     def free_rotation(t, q, args):  # rigid, so that it keeps the bonds
         return jnp.cross(jnp.array([0.0, 0.3, 1.0]), q)
 
-    y0, _ = dfc.project(CHAIN, chain(), args=1.0, projection=dfc.SimplifiedNewton())
+    y0, _ = projected(chain())
     sol = solve(
         free_rotation,
         dfc.ManifoldProjection(dfx.Heun(), CHAIN),

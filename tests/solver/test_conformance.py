@@ -12,6 +12,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body
+from ..thinned import some_of
 from .conformance_table import (
     ADDITIVE,
     EXPLICIT,
@@ -102,7 +103,19 @@ def problem(kind):
     raise AssertionError(kind)
 
 
-@pytest.mark.parametrize("name", TABLE)
+# By default one solver of each kind.
+FIRST_OF_ITS_KIND = set({kind: name for name, kind in reversed(TABLE.items())}.values())
+every_solver = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in FIRST_OF_ITS_KIND else pytest.mark.slow)
+        for name in TABLE
+    ],
+)
+EXPLICIT_ONES = [name for name, kind in TABLE.items() if kind in (EXPLICIT, MULTISTEP)]
+
+
+@every_solver
 def test_every_solver_stays_on_the_manifold(name):
     kind = TABLE[name]
     terms, y0, manifold = problem(kind)
@@ -127,7 +140,7 @@ def test_every_solver_stays_on_the_manifold(name):
     assert largest(moved) > 1e-2
 
 
-@pytest.mark.parametrize("name", [n for n, kind in TABLE.items() if kind in (EXPLICIT, MULTISTEP)])
+@some_of("name", EXPLICIT_ONES, ids=EXPLICIT_ONES, period=3)
 def test_projection_makes_the_error_no_worse_than_thrice(name):
     """It is the wrapped method that is projected, not another."""
     inner = public_solvers()[name]()

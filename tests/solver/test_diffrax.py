@@ -1,5 +1,7 @@
 """What diffrax offers around a solve works around a projected one."""
 
+import functools
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -65,7 +67,13 @@ def test_half_solver_on_either_side():
         np.testing.assert_allclose(sol.ys[-1], reference, atol=1e-4)
 
 
-@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfc.RK4()], ids=["tsit5", "rk4"])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(dfx.Tsit5(), id="tsit5"),
+        pytest.param(dfc.RK4(), id="rk4", marks=pytest.mark.slow),
+    ],
+)
 def test_adjoints_agree(solver):
     """Reverse and forward mode, through the loops of each adjoint."""
     projected = dfc.ManifoldProjection(solver, RIGID_BODY)
@@ -191,15 +199,15 @@ def test_failure_with_fixed_steps_is_reported():
         solve(rotation, solver, jnp.array([1.0, 0.0]))
     sol = solve(rotation, solver, jnp.array([1.0, 0.0]), throw=False)
     assert sol.result != dfx.RESULTS.successful
-    assert "`manifold` is still off" in dfx.RESULTS[sol.result]
+    assert "`manifold` is still not satisfied" in dfx.RESULTS[sol.result]
 
 
 def test_failure_with_adaptive_steps_is_retried_with_smaller_ones():
-    """Three iterations are too few for a long step with the first-order method."""
+    """Two iterations are too few for a long step with the first-order method."""
     sol = solve(
         rigid_body,
         dfc.ManifoldProjection(
-            dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=dfc.SimplifiedNewton(max_steps=4)
+            dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=dfc.SimplifiedNewton(max_steps=2)
         ),
         OMEGA0,
         t1=0.2,
@@ -221,23 +229,37 @@ def test_nan_from_the_vector_field_is_no_success():
 @pytest.mark.parametrize(
     "transform",
     [
-        lambda f: f,
         jax.jit,
         jax.checkpoint,
         lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[0],
         lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=1)[0],
     ],
-    ids=["plain", "jit", "checkpoint", "vmap", "scan"],
+    ids=["jit", "checkpoint", "vmap", "scan"],
 )
 def test_transformations(transform):
-    def final(y0):
-        return solve(rigid_body, dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY), y0, t1=0.3).ys[-1]
-
-    expected = final(OMEGA0)
-    np.testing.assert_allclose(transform(final)(OMEGA0), expected, rtol=0, atol=1e-14)
-    gradient = jax.grad(lambda y0: jnp.sum(transform(final)(y0) ** 3))(OMEGA0)
-    plain = jax.grad(lambda y0: jnp.sum(final(y0) ** 3))(OMEGA0)
+    expected, plain = plain_end_and_gradient()
+    gradient, end = end_and_gradient(transform(end_of_a_solve))
+    np.testing.assert_allclose(end, expected, rtol=0, atol=1e-14)
     np.testing.assert_allclose(gradient, plain, rtol=0, atol=1e-12)
+
+
+def end_of_a_solve(y0):
+    return solve(rigid_body, dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY), y0, t1=0.3).ys[-1]
+
+
+def end_and_gradient(end):
+    """The gradient of a function of the end, and the end itself."""
+
+    def loss(y0):
+        y1 = end(y0)
+        return jnp.sum(y1**3), y1
+
+    return jax.grad(loss, has_aux=True)(OMEGA0)
+
+
+@functools.cache
+def plain_end_and_gradient():
+    return end_of_a_solve(OMEGA0), end_and_gradient(end_of_a_solve)[0]
 
 
 def test_strict_promotion_rank_promotion_and_nan_debugging():

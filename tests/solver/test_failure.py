@@ -1,9 +1,13 @@
 """A failed projection says so: which constraint, how far off, and what to do."""
 
+import subprocess
+import sys
+
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
@@ -36,18 +40,17 @@ OUT_OF_REACH = {"square": dfc.FirstIntegral(square), "jump": dfc.FirstIntegral(o
 
 
 @pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()])
-def test_the_error_of_fixed_steps_names_the_constraint_its_residual_and_a_remedy(solver):
-    with pytest.raises(
-        eqx.EquinoxRuntimeError, match=r"manifold\['jump'\].*off by about 1e-1"
-    ) as e:
+def test_the_error_of_fixed_steps_names_the_constraint_and_a_remedy(solver):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="entry 0 of the manifold") as e:
         run(OUT_OF_REACH, solver)
+    assert dfc.entry_name(OUT_OF_REACH, 0) == "manifold['jump']"
     assert "smaller steps" in str(e.value)
 
 
 def test_the_result_holds_the_message_if_nothing_is_raised():
     sol = run(OUT_OF_REACH, throw=False)
     assert sol.result != dfx.RESULTS.successful
-    assert "manifold['jump']" in dfx.RESULTS[sol.result]
+    assert "entry 0 of the manifold" in dfx.RESULTS[sol.result]
 
 
 def test_each_lane_of_a_batch_has_its_own_result():
@@ -62,7 +65,7 @@ def test_each_lane_of_a_batch_has_its_own_result():
         eqx.tree_at(lambda r: r._value, results, results._value[i]) for i in range(3)
     )
     assert first == dfx.RESULTS.successful
-    assert "off by about 1e-1" in dfx.RESULTS[second]
+    assert "still not satisfied" in dfx.RESULTS[second]
     assert "not finite" in dfx.RESULTS[third]
 
 
@@ -93,7 +96,7 @@ def test_contradicting_constraints_name_one_of_them():
         dfc.FirstIntegral(square, value=1.0),
         dfc.FirstIntegral(square, value=1.1),
     )
-    with pytest.raises(eqx.EquinoxRuntimeError, match=r"`manifold\[[01]\]` .* contradict"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="value` of entry 0 of the manifold"):
         run(manifold)
 
 
@@ -102,15 +105,65 @@ def test_many_entries_are_not_named_one_by_one():
         dfc.FirstIntegral(lambda t, y, args, k=k: out_of_reach(t, y[k], args)) for k in range(60)
     ]
     y0 = jnp.ones((60, 2))
-    with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is still off"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="the manifold"):
         run(manifold, y0=y0, vector_field=lambda t, y, args: y[:, ::-1] * jnp.array([1.0, -1.0]))
 
 
-def test_without_the_list_of_messages_diffrax_has_its_say(monkeypatch):
-    monkeypatch.setattr(dfx.RESULTS, "_index_to_message", tuple(dfx.RESULTS._index_to_message))
-    sol = run(dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y, args)), throw=False)
-    assert sol.result != dfx.RESULTS.successful
-    assert "diffrax_conserve" not in dfx.RESULTS[sol.result]
+def test_the_list_of_messages_is_the_same_whatever_was_solved():
+    code = "import diffrax, diffrax_conserve as dfc; print(len(diffrax.RESULTS._index_to_message))"
+    fresh = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    run(OUT_OF_REACH, throw=False)
+    assert int(fresh.stdout) == len(dfx.RESULTS._index_to_message)
+
+
+def test_diffrax_has_the_list_that_messages_are_added_to():
+    assert isinstance(getattr(dfx.RESULTS, "_index_to_message", None), list), (
+        "diffrax has no list `RESULTS._index_to_message` any more: find out how this version "
+        "keeps its messages, and change `_solver/diffrax_private.py`."
+    )
+
+
+# ---- The start ----
+
+
+@pytest.mark.parametrize(
+    ("manifold", "message"),
+    [
+        (dfc.FirstIntegral(square, value=-1.0), "value` of `manifold` cannot be reached"),
+        (
+            dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan),
+            "not finite at the in",
+        ),
+        (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), "initial state violates"),
+    ],
+)
+def test_what_cannot_start_ends_at_once(manifold, message):
+    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    sol = run(manifold, dfx.Tsit5(), stepsize_controller=adaptive, max_steps=None, throw=False)
+    assert message in dfx.RESULTS[sol.result]
+    assert sol.stats["num_steps"] == 1
+
+
+def test_one_lane_that_cannot_start_leaves_the_others_alone():
+    unit = dfc.Constraint(lambda t, y, args: square(t, y, args) - 1)
+    y0 = jnp.array([[1.0, 0.0], [1.001, 0.0], [0.0, 1.0]])
+    batch = jax.jit(jax.vmap(lambda y0: run(unit, y0=y0, throw=False)))(y0)
+    np.testing.assert_array_equal(dfx.is_okay(batch.result), [True, False, True])
+    for i in (0, 2):
+        np.testing.assert_allclose(batch.ys[i], run(unit, y0=y0[i]).ys, rtol=1e-14)
+
+
+@pytest.mark.parametrize("after", [jnp.nan, 5.0])
+def test_an_adaptive_solve_without_hope_ends(after):
+    def fn(t, y, args):
+        return square(t, y, args) * jnp.where(t > 0.5, after, 1.0) + jnp.where(t > 0.5, 9.0, 0.0)
+
+    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    options = dict(stepsize_controller=adaptive, max_steps=None, throw=False)
+    sol = run(dfc.FirstIntegral(fn), dfx.Tsit5(), **options)
+    assert "`manifold`" in dfx.RESULTS[sol.result]
+    plain = run(dfc.FirstIntegral(square), dfx.Tsit5(), **options)
+    assert sol.stats["num_steps"] <= plain.stats["num_steps"] + 40
 
 
 # ---- max_correction ----
@@ -176,6 +229,27 @@ def test_max_correction_lets_roundoff_pass():
         t1=10.0,
     )
     assert sol.result == dfx.RESULTS.successful
+
+
+def test_max_correction_ends_what_is_not_conserved():
+    """The position of a pendulum, kept at its first value."""
+    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    sol = run(
+        dfc.FirstIntegral(lambda t, y, args: y[0] ** 2),
+        dfx.Tsit5(),
+        vector_field=lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])]),
+        t1=10.0,
+        max_correction=0.5,
+        stepsize_controller=adaptive,
+        throw=False,
+    )
+    assert "max_correction" in dfx.RESULTS[sol.result]
+
+
+def test_no_limit_is_no_limit_at_an_equilibrium():
+    for limit in (None, float("inf")):
+        sol = run(WELL, y0=jnp.array([1.0, 0.0]), vector_field=double_well, max_correction=limit)
+        assert sol.result == dfx.RESULTS.successful
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])

@@ -159,7 +159,9 @@ def loss(network, y0, args, adjoint, projection=None):
     [
         (None, dfc.SimplifiedNewton()),
         pytest.param(
-            dfc.ConservativeLayer(LORENZ.manifold, steps=8), dfc.Newton(), marks=pytest.mark.slow
+            dfc.learned.ConservativeLayer(LORENZ.manifold, steps=8),
+            dfc.Newton(),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -227,7 +229,7 @@ def test_backsolve_adjoint_explains(solver):
 
 @pytest.mark.parametrize(
     "layer",
-    [pytest.param(None, marks=pytest.mark.slow), dfc.ConservativeLayer(LORENZ.manifold)],
+    [pytest.param(None, marks=pytest.mark.slow), dfc.learned.ConservativeLayer(LORENZ.manifold)],
 )
 def test_random_networks_are_on_the_manifold_or_fail(layer):
     """Whatever the quality of the network: at steps and between them."""
@@ -278,20 +280,19 @@ TRANSFORMS = {
 
 @pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
 def test_a_step_that_is_too_long(transform):
-    """Whether the length is known to the compiler or not, with both numbers in the message."""
+    """Whether the length is known to the compiler or not."""
 
     def run(dt0):
         term = dfx.ODETerm(LORENZ.vector_field)
         return dfx.diffeqsolve(term, FLOW, 0.0, 2.0, dt0, LORENZ.y0).ys
 
     message = refusal(lambda: transform(run)(jnp.array(0.375)))
-    assert "A step of 0.375 " in message
-    assert "from 0 to 0.25" in message
+    assert "a step is longer than the flow map was trained for" in message
 
 
 def test_a_solve_backwards_in_time():
     message = refusal(lambda: solve(FLOW, t1=-1.0, dt0=-0.125).ys)
-    assert "A step of -0.125 " in message
+    assert "backwards in time" in message
     assert "from 0 to 0.25" in message
 
 
@@ -303,20 +304,18 @@ def test_a_largest_step_that_is_an_array():
             return y0 + 0 * h
 
     still = dfc.DeepONetSolver(Still(jnp.array(0.25)))
-    assert "A step of 0.5 " in refusal(lambda: solve(still, dt0=0.5).ys)
+    assert "a step is longer" in refusal(lambda: solve(still, dt0=0.5).ys)
     np.testing.assert_array_equal(solve(still).ys[0], LORENZ.y0)
 
 
 def test_a_pinn_from_another_initial_state():
     message = refusal(lambda: solve(FOLLOW, LORENZ.y0 + jnp.array([0, 0.125, 0])).ys)
-    assert "differs by 0.125 " in message
-    assert "differs by 0.0625 " in refusal(lambda: solve(FOLLOW, LORENZ.y0 - 0.0625).ys)
+    assert "`y0` is not the state that the PINN has" in message
 
 
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 3.0), (0.0, -1.0)])
 def test_a_pinn_outside_its_interval(t0, t1):
     message = refusal(lambda: solve(FOLLOW, t0=t0, t1=t1, dt0=float(np.sign(t1))).ys)
-    assert f"The time {t1:g} " in message
     assert "from 0 to 2 " in message
 
 

@@ -43,7 +43,7 @@ def test_target_of_the_rigid_body():
         system.y0,
         1.75,
         solver=dfc.RandomFeatureSolver(),
-        dt0=0.5,
+        dt0=0.25,
         saveat=dfx.SaveAt(ts=ts),
     )
     assert relative_error(sol.ys, system.solution(ts, system.y0)) <= 1e-12

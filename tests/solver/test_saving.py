@@ -135,6 +135,7 @@ def test_a_steady_state_by_the_implicit_adjoint():
     np.testing.assert_allclose(end(args), args / 3, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_vmap_of_grad():
     @jax.jit
     @jax.grad

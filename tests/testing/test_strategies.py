@@ -1,5 +1,8 @@
 """What the strategies draw is what they say, and it shrinks to what they say."""
 
+import importlib.util
+import runpy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -140,3 +143,9 @@ def test_quadratic_systems_conserve_their_integrals(dimension, integrals):
 
     run()
     assert any(moving)
+
+
+def test_without_hypothesis_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pip install 'diffrax-conserve\[testing\]'"):
+        runpy.run_path(dct.__file__)

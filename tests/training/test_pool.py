@@ -16,9 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
-from diffrax_conserve._training._epochs import _anew
-from diffrax_conserve._training._pool import moved
-from diffrax_conserve._training._problem import start
+from diffrax_conserve.learned._networks import as_flow_map
+from diffrax_conserve.learned._training.epochs import _anew
+from diffrax_conserve.learned._training.objective import start
+from diffrax_conserve.learned._training.pool import moved
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator, states
 from ..problems import Counted
@@ -74,7 +75,7 @@ def move(pool, model, y0s, key, square=0.0, fresh=FRESH):
     def squares(steps):
         return jnp.broadcast_to(square, steps.ts.shape)
 
-    return moved(pool, model, None, squares, jnp.asarray(1.0), y0s, fresh, key)
+    return moved(pool, as_flow_map(model), None, squares, jnp.asarray(1.0), y0s, fresh, key)
 
 
 def begun_again(ys, fresh=FRESH):
@@ -87,7 +88,7 @@ def begun_again(ys, fresh=FRESH):
 @given(st.integers(0, 2**31 - 1), st.floats(-0.1, 0.1))
 def test_states_stay_on_the_manifold_of_their_own_start(seed, growth):
     """Though the network leaves it in every step."""
-    pool = dfc.Pool(near_east, manifold=RADIUS, mean_steps=1e9)
+    pool = dfc.learned.Pool(near_east, manifold=RADIUS, mean_steps=1e9)
     ys, model = Y0S, Turning(jnp.asarray(0.9), jnp.asarray(growth))
     for key in jr.split(jr.key(seed), 20):
         ys = move(pool, model, ys, key)
@@ -98,7 +99,7 @@ def test_states_stay_on_the_manifold_of_their_own_start(seed, growth):
 
 @given(st.integers(0, 2**31 - 1))
 def test_a_step_has_a_random_length_up_to_the_longest(seed):
-    ys = move(dfc.Pool(near_east, mean_steps=1e9), Turning(), Y0S, jr.key(seed))
+    ys = move(dfc.learned.Pool(near_east, mean_steps=1e9), Turning(), Y0S, jr.key(seed))
     angles = jnp.arctan2(-ys[:, 1], ys[:, 0]) - jnp.arctan2(-Y0S[:, 1], Y0S[:, 0])
     assert float(jnp.min(angles)) >= -1e-12
     assert float(jnp.max(angles)) <= 1 + 1e-12
@@ -108,7 +109,7 @@ def test_a_step_has_a_random_length_up_to_the_longest(seed):
 
 @pytest.mark.parametrize("mean_steps", [1, 4, 20])
 def test_one_state_in_mean_steps_starts_again(mean_steps):
-    pool = dfc.Pool(near_east, mean_steps=mean_steps)
+    pool = dfc.learned.Pool(near_east, mean_steps=mean_steps)
     keys = jr.split(KEY, 25)
     share = np.mean([begun_again(move(pool, Turning(), Y0S, key)) for key in keys])
     deviation = np.sqrt((1 - 1 / mean_steps) / mean_steps / (25 * COUNT))
@@ -117,14 +118,14 @@ def test_one_state_in_mean_steps_starts_again(mean_steps):
 
 @pytest.mark.parametrize("square", [0.011, 1e30, jnp.inf, jnp.nan])
 def test_a_step_with_a_large_defect_is_not_taken(square):
-    pool = dfc.Pool(near_east, mean_steps=1e9, max_defect=0.1)
+    pool = dfc.learned.Pool(near_east, mean_steps=1e9, max_defect=0.1)
     assert begun_again(move(pool, Turning(), Y0S, KEY, square)).all()
     assert not begun_again(move(pool, Turning(), Y0S, KEY, 0.009)).any()
 
 
 @pytest.mark.parametrize("growth", [jnp.nan, jnp.inf, 1e308])
 def test_a_state_that_is_not_finite_starts_again(growth):
-    pool = dfc.Pool(near_east, mean_steps=1e9, max_defect=jnp.inf)
+    pool = dfc.learned.Pool(near_east, mean_steps=1e9, max_defect=jnp.inf)
     ys = move(pool, Turning(growth=growth, max_step=1e3), Y0S, KEY)
     assert bool(jnp.all(jnp.isfinite(ys)))
     assert begun_again(ys).mean() > 0.99
@@ -133,15 +134,15 @@ def test_a_state_that_is_not_finite_starts_again(growth):
 def test_a_state_whose_projection_fails_starts_again():
     """At the origin the radius has no gradient."""
     model = Own(lambda y0, h: y0 * jnp.where(y0[0] > 1.5, 0.0, 1.0))
-    pool = dfc.Pool(near_east, manifold=RADIUS, mean_steps=1e9)
+    pool = dfc.learned.Pool(near_east, manifold=RADIUS, mean_steps=1e9)
     ys = move(pool, model, Y0S, KEY)
     np.testing.assert_array_equal(begun_again(ys), Y0S[:, 0] > 1.5)
 
 
 def test_only_states_that_are_to_be_kept_go_on():
-    pool = dfc.Pool(near_east, mean_steps=1e9, keep=lambda y: y[1] > -0.5)
+    pool = dfc.learned.Pool(near_east, mean_steps=1e9, keep=lambda y: y[1] > -0.5)
     ys = move(pool, Turning(), Y0S, KEY)
-    free = move(dfc.Pool(near_east, mean_steps=1e9), Turning(), Y0S, KEY)
+    free = move(dfc.learned.Pool(near_east, mean_steps=1e9), Turning(), Y0S, KEY)
     low = free[:, 1] <= -0.5
     assert 0 < float(jnp.mean(low)) < 1
     np.testing.assert_array_equal(ys, jnp.where(low[:, None], FRESH, free))
@@ -149,16 +150,16 @@ def test_only_states_that_are_to_be_kept_go_on():
 
 # ---- Trainings ----
 
-BOX = dfc.Box.around(Y0S)
+BOX = dfc.learned.Box.around(Y0S)
 QUARTER = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
 def train(model=None, pool=None, key=KEY, vector_field=oscillator, epochs=40, **changes):
     """Of the clock of `Turning`, which is 10 % slow."""
     model = Turning(jnp.asarray(0.9), 0.0, BOX) if model is None else model
-    pool = dfc.Pool(near_east) if pool is None else pool
+    pool = dfc.learned.Pool(near_east) if pool is None else pool
     parts = dict(points=60, optimiser=optax.sgd(0.02), refresh=1, check_every=10) | changes
-    recipe = dfc.Recipe(epochs=epochs, **parts)
+    recipe = dfc.learned.Recipe(epochs=epochs, **parts)
     return dfc.fit(model, vector_field, key=key, sample=pool, recipe=recipe)
 
 
@@ -221,12 +222,14 @@ def test_it_compiles_once():
 def small_network(**options):
     # Normalised by states from all round the circle, as far as it will go.
     ring = jnp.concatenate([Y0S, -Y0S, Y0S @ QUARTER, -Y0S @ QUARTER])
-    network = dfc.DeepONet(ring, 1.0, inputs="concatenated", key=jr.key(3), **(SMALL | options))
+    network = dfc.DeepONet(
+        ring, 1.0, core=dfc.learned.Concatenated, key=jr.key(3), **(SMALL | options)
+    )
     return eqx.tree_at(lambda m: m.domain, network, BOX)
 
 
 def fitted(network, sample, epochs=300, field=oscillator):
-    recipe = dataclasses.replace(dfc.second_order(network, epochs=epochs), points=40)
+    recipe = dataclasses.replace(dfc.learned.second_order(network, epochs=epochs), points=40)
     return dfc.fit(network, field, key=KEY, sample=sample, recipe=recipe)
 
 
@@ -240,7 +243,7 @@ def error_opposite(network):
 @pytest.mark.parametrize("manifold", [None, pytest.param(RADIUS, marks=pytest.mark.slow)])
 def test_it_learns_where_it_was_never_told_to_look(manifold, tmp_path):
     """On the other side of the circle, from samples on this one: no solution is given."""
-    pool = dfc.Pool(near_east, manifold=manifold)
+    pool = dfc.learned.Pool(near_east, manifold=manifold)
     network, log = fitted(small_network(), pool, epochs=200)
     assert error_opposite(network) < 0.02
     assert log.skipped == 0
@@ -257,12 +260,12 @@ def test_without_a_pool_it_does_not():
 
 def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
     """Its states would be where y' = y³ explodes: none of its steps is taken."""
-    pool = dfc.Pool(near_east)
+    pool = dfc.learned.Pool(near_east)
     wild = jax.tree.map(lambda x: 30 * x if eqx.is_inexact_array(x) else x, small_network().core)
     wild = eqx.tree_at(lambda m: m.core, small_network(), wild)
     ends = jax.jit(jax.vmap(wild, (0, None)))(Y0S, 1.0)
     assert float(jnp.median(radii(ends))) > 10
-    recipe = dfc.Recipe(points=COUNT, refresh=1)
+    recipe = dfc.learned.Recipe(points=COUNT, refresh=1)
 
     @eqx.filter_jit
     def next_states(model):
@@ -277,8 +280,8 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
 @pytest.mark.slow
 def test_a_pool_goes_where_the_whole_network_leads():
     """Its conservative layer included: without a projection the states stay on the circle."""
-    layer = dfc.ConservativeLayer(RADIUS, steps=4)
-    trained, log = fitted(small_network(layer=layer), dfc.Pool(near_east), epochs=60)
+    layer = dfc.learned.ConservativeLayer(RADIUS, steps=4)
+    trained, log = fitted(small_network(layer=layer), dfc.learned.Pool(near_east), epochs=60)
     assert log.best < 0.01 * log.criteria[0]
     corners = jnp.stack([trained.domain.lower, trained.domain.upper])
     assert float(jnp.max(jnp.abs(corners))) < 2.001
@@ -292,8 +295,8 @@ APART = states(100, VORTICES)
 
 @functools.cache
 def framed():
-    options = dict(inputs="concatenated", frame=VORTICES.frame, key=KEY) | SMALL
-    return dfc.DeepONet(APART, 0.125, taylor=dfc.Taylor(VORTICES.vector_field), **options)
+    options = dict(core=dfc.learned.Concatenated, frame=VORTICES.frame, key=KEY) | SMALL
+    return dfc.DeepONet(APART, 0.125, taylor=dfc.learned.Taylor(VORTICES.vector_field), **options)
 
 
 def test_a_domain_of_shapes_is_extended_by_shapes():
@@ -316,7 +319,7 @@ def test_a_domain_of_shapes_is_extended_by_shapes():
 def test_vortices_that_turn_too_fast_start_again():
     """For the network time would be longer than what it calls one."""
     network = framed()
-    pool = dfc.Pool(VORTICES.sample, mean_steps=1e9)
+    pool = dfc.learned.Pool(VORTICES.sample, mean_steps=1e9)
     ys = move(pool, network, 0.3 * APART, KEY, fresh=APART)
     again = np.all(np.asarray(ys == APART), axis=(1, 2))
     assert 0 < again.mean() < 1
@@ -328,7 +331,9 @@ def test_vortices_that_turn_too_fast_start_again():
 def test_a_pool_of_vortices():
     """Their network computes the same as with the domain that it had."""
     network = framed()
-    pool = dfc.Pool(VORTICES.sample, manifold=VORTICES.manifold, keep=lambda y: jnp.all(y < 10))
+    pool = dfc.learned.Pool(
+        VORTICES.sample, manifold=VORTICES.manifold, keep=lambda y: jnp.all(y < 10)
+    )
     trained, log = fitted(network, pool, epochs=60, field=VORTICES.vector_field)
     assert log.best < 0.5 * log.criteria[0]
     assert trained.domain.fastest == network.domain.fastest
@@ -352,15 +357,15 @@ def test_a_pool_of_vortices():
 )
 def test_a_pool_that_cannot_be(options, error, match):
     with pytest.raises(error, match=match):
-        dfc.Pool(**(dict(sample=near_east) | options))
+        dfc.learned.Pool(**(dict(sample=near_east) | options))
 
 
 def test_given_states_are_no_sampler():
     """As users see it: the run-time type checker of the suite would answer first."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
-        with pytest.raises(TypeError, match=r"Pool\(from_states\(states\)\)"):
-            dfc.Pool(Y0S)  # pyright: ignore
+        with pytest.raises(TypeError, match=r"Pool\(FromStates\(states\)\)"):
+            dfc.learned.Pool(Y0S)  # pyright: ignore
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
 
@@ -374,13 +379,13 @@ def test_a_pool_that_would_never_grow(refresh):
 def test_a_pool_for_something_else():
     pinn = dfc.PINN(EAST, 0.0, 1.0, key=KEY, **SMALL)
     with pytest.raises(ValueError, match="leave `sample` out"):
-        dfc.fit(pinn, oscillator, key=KEY, sample=dfc.Pool(near_east))
+        dfc.fit(pinn, oscillator, key=KEY, sample=dfc.learned.Pool(near_east))
     with pytest.raises(ValueError, match="for states of 2 numbers, but was given one of 3"):
-        train(small_network(), dfc.Pool(LORENZ.sample))
+        train(small_network(), dfc.learned.Pool(LORENZ.sample))
     with pytest.raises(ValueError, match="`model` returns the structure"):
         train(Own(lambda y0, h: (y0, h)))
     many = dfc.FirstIntegral(lambda t, y, args: jnp.ones(3) * jnp.sum(y))
     with pytest.raises(ValueError, match="3 scalar constraints, but the state has only 2"):
-        train(pool=dfc.Pool(near_east, manifold=many))
+        train(pool=dfc.learned.Pool(near_east, manifold=many))
     with pytest.raises(TypeError, match="a `Pool` needs real floating-point states"):
-        train(pool=dfc.Pool(lambda key: jr.randint(key, (2,), 1, 5)))
+        train(pool=dfc.learned.Pool(lambda key: jr.randint(key, (2,), 1, 5)))

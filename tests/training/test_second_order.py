@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._training._second_order import LeastSquares
+from diffrax_conserve.learned._training.second_order import LeastSquares
 
 from ..learned import EAST, LORENZ, RADIUS, oscillator
 
@@ -33,7 +33,7 @@ def error(pinn):
 # ---- One update, against what it is defined to be ----
 
 
-def linear_problem(seed=0, points=7, n=2, weights=5, loss=dfc.mean_square):
+def linear_problem(seed=0, points=7, n=2, weights=5, loss=dfc.learned.mean_square):
     matrix, b = (
         jr.normal(key, shape)
         for key, shape in zip(
@@ -52,7 +52,7 @@ def linear_problem(seed=0, points=7, n=2, weights=5, loss=dfc.mean_square):
 def test_levenberg_marquardt_solves_the_damped_problem():
     problem, matrix, b = linear_problem()
     linear = jnp.array([False, True, False, True, False])
-    method, weights = dfc.LevenbergMarquardt(), jnp.arange(5.0)
+    method, weights = dfc.learned.LevenbergMarquardt(), jnp.arange(5.0)
     damping = jnp.asarray(0.3)
     after, _, loss = method.update(problem, weights, damping, jnp.asarray(0.0), linear)
     r = matrix @ weights - b
@@ -66,7 +66,7 @@ def test_levenberg_marquardt_refuses_an_update_that_is_worse():
     problem, _, _ = linear_problem()
     # The Jacobian has the wrong sign: every step goes uphill.
     wrong = problem._replace(jacobian=lambda w: -problem.jacobian(w))
-    weights, method = jnp.arange(5.0), dfc.LevenbergMarquardt()
+    weights, method = jnp.arange(5.0), dfc.learned.LevenbergMarquardt()
     damping = method.init(weights)
     after, raised, _ = method.update(wrong, weights, damping, jnp.asarray(0.0), NOTHING)
     np.testing.assert_array_equal(after, weights)
@@ -75,7 +75,11 @@ def test_levenberg_marquardt_refuses_an_update_that_is_worse():
 
 def test_spring_solves_the_damped_problem_around_its_last_update():
     problem, matrix, b = linear_problem(points=2)
-    method, weights, last = dfc.SPRING(momentum=0.5, damping=0.1), jnp.arange(5.0), jnp.ones(5)
+    method, weights, last = (
+        dfc.learned.SPRING(momentum=0.5, damping=0.1),
+        jnp.arange(5.0),
+        jnp.ones(5),
+    )
     state = method.init(weights)._replace(update=last)
     after, state, loss = method.update(problem, weights, state, jnp.asarray(0.0), NOTHING)
     r, damping = matrix @ weights - b, 0.1 * loss
@@ -88,13 +92,13 @@ def test_spring_solves_the_damped_problem_around_its_last_update():
 
 def test_spring_ends_with_steps_of_length_zero():
     problem, _, _ = linear_problem()
-    method, weights = dfc.SPRING(), jnp.arange(5.0)
+    method, weights = dfc.learned.SPRING(), jnp.arange(5.0)
     after, _, _ = method.update(problem, weights, method.init(weights), jnp.asarray(1.0), NOTHING)
     np.testing.assert_array_equal(after, weights)
 
 
 def test_the_gradient_is_that_of_any_loss():
-    problem, _, _ = linear_problem(loss=dfc.bounded(0.5))
+    problem, _, _ = linear_problem(loss=dfc.learned.Bounded(0.5))
     weights = jnp.arange(5.0)
     r, jacobian, loss = problem.rows(weights)
     gradient = jax.grad(lambda w: problem.value(problem.defects(w)))(weights)
@@ -114,7 +118,7 @@ def test_a_window_is_learned_to_ten_digits():
 
 def test_windows_follow_each_other():
     pinn = turns(9.0, windows=3)
-    recipe = dfc.second_order(pinn, epochs=15)
+    recipe = dfc.learned.second_order(pinn, epochs=15)
     seen = []
     trained, log = dfc.fit(
         pinn, oscillator, key=KEY, recipe=recipe, manifold=RADIUS,
@@ -139,25 +143,23 @@ def test_a_window_knows_what_time_it_is():
 
 
 def test_a_conservative_window_is_trained_through_its_layer():
-    pinn = turns(3.0, layer=dfc.ConservativeLayer(RADIUS, steps=3))
-    pinn, _ = dfc.fit(pinn, oscillator, key=KEY, recipe=dfc.second_order(pinn, epochs=40))
+    pinn = turns(3.0, layer=dfc.learned.ConservativeLayer(RADIUS, steps=3))
+    pinn, _ = dfc.fit(pinn, oscillator, key=KEY, recipe=dfc.learned.second_order(pinn, epochs=40))
     before = error(turns(3.0, layer=pinn.layer))
     assert error(pinn) < 1e-4 * before
 
 
-def flow_map(inputs="concatenated", order=1):
+def flow_map(core=dfc.learned.Concatenated, order=1):
     states = jax.vmap(LORENZ.sample)(jr.split(jr.key(7), 200))
-    taylor = dfc.Taylor(LORENZ.vector_field, order)
-    return states, dfc.DeepONet(
-        states, 0.25, width=12, depth=1, inputs=inputs, taylor=taylor, key=KEY
-    )
+    taylor = dfc.learned.Taylor(LORENZ.vector_field, order)
+    return states, dfc.DeepONet(states, 0.25, width=12, depth=1, core=core, taylor=taylor, key=KEY)
 
 
 def test_spring_trains_a_flow_map():
     states, network = flow_map()
-    recipe = dfc.second_order(network, epochs=60)
+    recipe = dfc.learned.second_order(network, epochs=60)
     recipe = dataclasses.replace(recipe, points=60)
-    options = dict(key=KEY, sample=dfc.from_states(states), recipe=recipe)
+    options = dict(key=KEY, sample=dfc.learned.FromStates(states), recipe=recipe)
     trained, log = dfc.fit(network, LORENZ.vector_field, **options)
     assert log.best < 1e-4 * log.criteria[0]
     again, _ = dfc.fit(network, LORENZ.vector_field, **options)
@@ -166,13 +168,15 @@ def test_spring_trains_a_flow_map():
 
 def test_an_update_that_is_not_finite_is_not_made():
     states, network = flow_map()
-    recipe = dataclasses.replace(dfc.second_order(network, epochs=4), points=10)
+    recipe = dataclasses.replace(dfc.learned.second_order(network, epochs=4), points=10)
 
     def field(t, y, args):
         return jnp.where(jnp.abs(y[0]) < 100, LORENZ.vector_field(t, y, args), jnp.nan)
 
     poisoned = states.at[::4].set(200.0)
-    trained, log = dfc.fit(network, field, key=KEY, sample=dfc.from_states(poisoned), recipe=recipe)
+    trained, log = dfc.fit(
+        network, field, key=KEY, sample=dfc.learned.FromStates(poisoned), recipe=recipe
+    )
     assert log.skipped == 4
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(trained.core))
 
@@ -181,20 +185,20 @@ def test_an_update_that_is_not_finite_is_not_made():
 
 
 def test_the_recipe_goes_by_size():
-    small = dfc.second_order(turns(3.0, windows=5))
-    assert isinstance(small.optimiser, dfc.LevenbergMarquardt)
-    large = dfc.second_order(turns(3.0, width=40, depth=4))
-    assert isinstance(large.optimiser, dfc.SPRING)
+    small = dfc.learned.second_order(turns(3.0, windows=5))
+    assert isinstance(small.optimiser, dfc.learned.LevenbergMarquardt)
+    large = dfc.learned.second_order(turns(3.0, width=40, depth=4))
+    assert isinstance(large.optimiser, dfc.learned.SPRING)
     assert large.refresh == 1
-    assert isinstance(dfc.second_order(flow_map()[1]).optimiser, dfc.SPRING)
+    assert isinstance(dfc.learned.second_order(flow_map()[1]).optimiser, dfc.learned.SPRING)
 
 
 @pytest.mark.parametrize(
     ("make", "name"),
     [
-        (lambda: dfc.SPRING(momentum=1.0), "momentum"),
-        (lambda: dfc.SPRING(damping=0.0), "damping"),
-        (lambda: dfc.LevenbergMarquardt(damping=-1.0), "damping"),
+        (lambda: dfc.learned.SPRING(momentum=1.0), "momentum"),
+        (lambda: dfc.learned.SPRING(damping=0.0), "damping"),
+        (lambda: dfc.learned.LevenbergMarquardt(damping=-1.0), "damping"),
     ],
 )
 def test_a_wrong_setting_is_named(make, name):
@@ -213,11 +217,11 @@ def test_a_manifold_without_windows_is_refused():
 def test_reachable_states_are_on_the_solutions():
     angles = jr.uniform(jr.key(1), (30,)) * 6
     y0s = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1) * 2
-    states = dfc.reachable_states(oscillator, y0s, 10.0, key=KEY)
+    states = dfc.learned.reachable_states(oscillator, y0s, 10.0, key=KEY)
     assert states.shape == (30, 2)
     np.testing.assert_allclose(jnp.sum(states**2, axis=1), 4, rtol=1e-4)
     assert float(jnp.max(jnp.abs(states - y0s))) > 1
-    kept = dfc.reachable_states(oscillator, y0s, 10.0, key=KEY, keep=lambda y: y[0] > 0)
+    kept = dfc.learned.reachable_states(oscillator, y0s, 10.0, key=KEY, keep=lambda y: y[0] > 0)
     np.testing.assert_array_equal(kept, states[states[:, 0] > 0])
 
 
@@ -226,10 +230,10 @@ def test_reachable_states_by_a_flow_map_of_ones_own():
     solver = dfc.ManifoldProjection(
         dfc.DeepONetSolver(network), LORENZ.manifold, projection=dfc.Newton()
     )
-    found = dfc.reachable_states(
+    found = dfc.learned.reachable_states(
         LORENZ.vector_field, states[:20], 2.0, key=KEY, solver=solver, dt0=0.025
     )
-    exact = dfc.reachable_states(LORENZ.vector_field, states[:20], 2.0, key=KEY)
+    exact = dfc.learned.reachable_states(LORENZ.vector_field, states[:20], 2.0, key=KEY)
     # Untrained, it is a method of order 3.
     np.testing.assert_allclose(found, exact, atol=0.05)
 
@@ -237,15 +241,17 @@ def test_reachable_states_by_a_flow_map_of_ones_own():
 def test_states_that_explode_are_left_out():
     """y' = y² from 1 has no solution beyond t = 1, from -1 it has."""
     y0s = jnp.where(jnp.arange(10) < 5, 1.0, -1.0)
-    states = dfc.reachable_states(lambda t, y, args: y**2, y0s, 1e3, key=KEY)
+    states = dfc.learned.reachable_states(lambda t, y, args: y**2, y0s, 1e3, key=KEY)
     assert 5 <= states.size < 10
     assert bool(jnp.all(states[-5:] < 0))
     with pytest.raises(ValueError, match="No state is left"):
-        dfc.reachable_states(lambda t, y, args: y, y0s, 1.0, key=KEY, keep=lambda y: y > 1e9)
+        dfc.learned.reachable_states(
+            lambda t, y, args: y, y0s, 1.0, key=KEY, keep=lambda y: y > 1e9
+        )
 
 
 def test_a_sampler_draws_every_state():
     states = {"a": jnp.arange(5.0), "b": jnp.arange(10.0).reshape(5, 2)}
-    drawn = jax.vmap(dfc.from_states(states))(jr.split(KEY, 200))
+    drawn = jax.vmap(dfc.learned.FromStates(states))(jr.split(KEY, 200))
     assert set(drawn["a"].tolist()) == {0.0, 1.0, 2.0, 3.0, 4.0}
     np.testing.assert_array_equal(drawn["b"][:, 0], 2 * drawn["a"])

@@ -1,0 +1,69 @@
+"""Which `max_correction` lets every solve of the catalogue through, and catches what is wrong.
+
+For each system the solves of the README's table, and others with coarse steps, are run with several
+limits. A limit is right if it changes none of them. Run `python benchmarks/max_correction.py`.
+"""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+
+import diffrax_conserve as dfc
+
+LIMITS = (0.1, 0.2, 0.5, 1.0, None)
+CASES = {
+    "Euler / 20": (dfx.Euler(), 1 / 20, None),
+    "Heun / 2": (dfx.Heun(), 1 / 2, None),
+    "RK4": (dfc.RK4(), 1.0, None),
+    "Tsit5": (dfx.Tsit5(), 1.0, None),
+    "Bosh3 1e-3": (dfx.Bosh3(), 1.0, 1e-3),
+    "Tsit5 1e-6": (dfx.Tsit5(), 1.0, 1e-6),
+}
+
+
+def steps_taken(system, solver, factor, rtol, limit, num_steps=50):
+    """The number of steps to the end, or `None` if the solve failed."""
+    dt = factor * system.dt
+    controller = dfx.ConstantStepSize() if rtol is None else dfx.PIDController(rtol=rtol, atol=rtol)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field),
+        dfc.ManifoldProjection(solver, system.manifold, max_correction=limit),
+        0.0,
+        num_steps * dt,
+        dt,
+        system.y0,
+        args=system.args,
+        stepsize_controller=controller,
+        max_steps=4096,
+        throw=False,
+    )
+    okay = bool(dfx.is_okay(solution.result))
+    return int(solution.stats["num_steps"]) if okay else None
+
+
+def main():
+    jax.config.update("jax_enable_x64", True)
+    print(f"{'system, solver':38}", *(f"{limit!s:>6}" for limit in LIMITS))
+    for name in dfc.systems.names():
+        system = dfc.systems.get(name)
+        for case, (solver, factor, rtol) in CASES.items():
+            counts = [steps_taken(system, solver, factor, rtol, limit) for limit in LIMITS]
+            print(f"{name + ', ' + case:38}", *(f"{count!s:>6}" for count in counts), flush=True)
+    wrong = dfc.FirstIntegral(lambda t, y, args: y[0] ** 2)
+    pendulum = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])]))
+    for limit in LIMITS:
+        solution = dfx.diffeqsolve(
+            pendulum,
+            dfc.ManifoldProjection(dfx.Tsit5(), wrong, max_correction=limit),
+            0.0,
+            10.0,
+            0.1,
+            jnp.array([1.0, 0.0]),
+            stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+            throw=False,
+        )
+        print("a pendulum that keeps q², limit", limit, solution.ts, dfx.is_okay(solution.result))
+
+
+if __name__ == "__main__":
+    main()

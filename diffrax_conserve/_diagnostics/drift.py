@@ -1,0 +1,105 @@
+"""How well a solution was conserved."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from .._custom_types import Args, Manifold, Values, Y
+from .._manifold import (
+    FirstIntegral,
+    check_manifold,
+    conserved_values,
+    evaluate,
+    named_entries,
+)
+from .._projection import measure, relative
+
+
+def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
+    r"""The residual of every constraint at every saved time, relative to its scale.
+
+    For a first integral $I$ this is
+
+    $$\frac{I(t_k, y_k) - I_0}{|I_0| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
+
+    where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
+    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
+
+    The scale is what roundoff is relative to: a momentum that vanishes as the sum of large terms is
+    not divided by zero.
+
+    **Arguments:**
+
+    - `sol`: what `diffrax.diffeqsolve` returned. It needs saved times; save `t0` too (as in
+        `SaveAt(t0=True, steps=True)`) if the drift from the initial state is wanted. For a batch
+        of solutions use `jax.vmap`.
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `args`: as given to `diffeqsolve`.
+
+    **Returns:**
+
+    A PyTree like the values of the functions in `manifold`, with a leading axis of saved times.
+    Rows that diffrax padded (times `inf`) are zero.
+
+    **Raises:**
+
+    `ValueError` if the solution holds no saved states, only one with nothing to compare it with, or
+    is a batch.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+        sol = diffrax.diffeqsolve(
+            term,
+            dfc.ManifoldProjection(diffrax.Tsit5(), square),
+            t0=0,
+            t1=9,
+            dt0=0.1,
+            y0=jnp.array([1.0, 0.0]),
+            saveat=diffrax.SaveAt(t0=True, steps=True),
+        )
+        print(jnp.max(jnp.abs(dfc.drift(sol, square))))
+        ```
+    """
+    check_manifold(manifold)
+    if sol.ts is None or sol.ys is None:
+        raise ValueError(
+            "`drift` needs saved states, but `sol` holds none. Save some, for example with "
+            "`saveat=SaveAt(t0=True, steps=True)`."
+        )
+    if sol.ts.ndim != 1:
+        raise ValueError(
+            f"`drift` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch write "
+            "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
+        )
+    unknown = [
+        name
+        for name, entry in named_entries(manifold)
+        if isinstance(entry, FirstIntegral) and entry.value is None
+    ]
+    if sol.ts.size == 1 and unknown:
+        raise ValueError(
+            f"`sol` holds one saved state, so the drift of `{unknown[0]}` from an earlier one is "
+            "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
+            "`FirstIntegral(fn, value=...)`."
+        )
+    t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
+    values = conserved_values(manifold, t0, y0, args)
+    _, scale = measure(manifold, values, t0, y0, args)
+
+    def at(t: Array, y: Y) -> Values:
+        padded = ~jnp.isfinite(t)
+        y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
+        now = evaluate(manifold, jnp.where(padded, t0, t), y, args)
+        residual = jtu.tree_map(lambda x, v: jnp.where(padded, 0, x - v), now, values)
+        return relative(residual, scale)
+
+    return jax.vmap(at)(sol.ts, sol.ys)

@@ -1,0 +1,195 @@
+"""What every projection takes and returns."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+
+from .._custom_types import Args, RealScalarLike, Values, Y
+from .._tree import tree_all_finite, tree_norm, tree_sub
+from .elimination import Vector
+from .linearise import Joined
+from .residual import Tolerance, largest, relative, within
+
+
+class ProjectionInfo(eqx.Module):
+    """How a projection went.
+
+    **Attributes:**
+
+    - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
+        residual is within its tolerance at the state that is returned.
+    - `num_steps`: how many iterations were made.
+    - `residual_before`, `residual_after`: the largest residual of the candidate and of the
+        projected state, each relative to the scale of its own constraint at the projected state,
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
+    - `correction`: the Euclidean norm of the projected state minus the candidate.
+    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate, of a
+        `Newton` at the result. With more than 128 constraints it is not formed: their number.
+    - `worst`: if the projection failed, the position of the scalar constraint that is farthest
+        off, before and after it, in the order in which the manifold is flattened; otherwise 0.
+    """
+
+    result: optx.RESULTS
+    num_steps: Int[Array, ""]
+    residual_before: Float[Array, ""]
+    residual_after: Float[Array, ""]
+    correction: Float[Array, ""]
+    rank: Int[Array, ""]
+    worst: Int[Array, ""]
+
+    @property
+    def ok(self) -> Bool[Array, ""]:
+        """Whether the projection succeeded."""
+        return self.result == optx.RESULTS.successful
+
+
+class Problem(eqx.Module):
+    """What a projection solves.
+
+    **Attributes:**
+
+    - `residual`: `y ↦ g(y)`, of shape `(m,)`, whose closed-over arrays are part of its PyTree.
+    - `magnitude`: the absolute conserved values, as `residual` returns them.
+    - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
+    - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
+        manifold, from which `residual` was made.
+    - `anchor`: a state near the manifold, in dense output the nearer end of the step, to start
+        from where the candidate leads nowhere; in a step `None`.
+    """
+
+    residual: Joined
+    magnitude: Vector
+    weights: Y
+    t: RealScalarLike
+    args: Args
+    values: Values
+    anchor: Y | None = None
+
+
+def option(default: Any, **kwargs: Any) -> Any:
+    """A field that is given by keyword, if at all."""
+    return eqx.field(default=default, kw_only=True, **kwargs)
+
+
+class AbstractProjection(eqx.Module):
+    """A way to return from a candidate to the manifold."""
+
+    metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
+
+    @abc.abstractmethod
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        """The state on the manifold that belongs to `candidate`, shaped like it.
+
+        Never raises at run time; `info.result` is successful only if every residual is small.
+        """
+
+
+# The options that the Newton iterations share.
+NEWTON_OPTIONS = r"""**Arguments:**
+
+- `rtol`: how large a residual may remain, relative to the scale of its constraint at the projected
+    state, which is what roundoff is relative to. Default: 16 units of roundoff of the dtype.
+    Nearly every projection ends well below it.
+- `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
+    less accurate than roundoff.
+- `max_steps`: the largest number of iterations; after that the projection has failed.
+- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
+    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
+    freezes its component. Default: Euclidean.
+
+**Raises:**
+
+`ValueError` if a weight is not positive.
+"""
+
+
+def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
+    """`metric`, checked at once where its values are known, and otherwise when they are."""
+    message = "`metric` has a weight that is not positive. Every weight must be greater than 0."
+
+    def check(weight: ArrayLike) -> ArrayLike:
+        if isinstance(weight, jax.core.Tracer):
+            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+        if not np.all(np.asarray(weight) > 0):
+            raise ValueError(message)
+        return weight
+
+    return jtu.tree_map(check, metric)
+
+
+class Outcome(eqx.Module):
+    """The verdict on a state that a projection returns: its result, and the worst constraint.
+
+    Two integers, so that a solve carries no more than that.
+    """
+
+    result: optx.RESULTS
+    worst: Int[Array, ""]
+
+    @classmethod
+    def success(cls) -> "Outcome":
+        return cls(_member(optx.RESULTS.successful), jnp.asarray(0, jnp.int32))
+
+    @classmethod
+    def of(cls, before: Vector, after: Vector, scale: Vector, tolerance: Tolerance) -> "Outcome":
+        """Of a state with residuals `after` of the scales `scale`, from a candidate with residuals
+        `before`: not finite if that was not, divergence if only the state is not."""
+        kinds = optx.RESULTS
+        success = within(after, tolerance(scale))
+        result = kinds.where(
+            tree_all_finite((after, scale)),
+            kinds.nonlinear_max_steps_reached,
+            kinds.nonlinear_divergence,
+        )
+        result = kinds.where(tree_all_finite(before), result, kinds.nonfinite)
+        result = kinds.where(success, kinds.successful, result)
+        ratios = jnp.concatenate(
+            [jnp.atleast_1d(x) for x in jtu.tree_leaves(relative(_smaller(before, after), scale))]
+        )
+        worst = jnp.argmax(jnp.where(jnp.isnan(ratios), jnp.inf, ratios)).astype(jnp.int32)
+        return cls(result, jnp.where(success, 0, worst))
+
+
+def _smaller(before: Vector, after: Vector) -> Vector:
+    """What an iteration that diverged left larger was not the fault of that constraint."""
+
+    def smaller(a: Array, b: Array) -> Array:
+        a, b = (jnp.where(jnp.isnan(x), jnp.inf, jnp.abs(x)) for x in (a, b))
+        return jnp.minimum(a, b)
+
+    return jtu.tree_map(smaller, before, after)
+
+
+def _member(result: optx.RESULTS) -> optx.RESULTS:
+    """The same with an array in it, as it comes out of a `where`."""
+    return optx.RESULTS.where(jnp.asarray(True), result, result)
+
+
+def report(
+    outcome: Outcome,
+    num_steps: Int[Array, ""],
+    candidate: Y,
+    y: Y,
+    before: Vector,
+    after: Vector,
+    scale: Vector,
+    rank: Int[Array, ""],
+) -> ProjectionInfo:
+    """The `ProjectionInfo` of a projection from `candidate` to `y`."""
+    correction = tree_sub(y, candidate)
+    return ProjectionInfo(
+        result=outcome.result,
+        num_steps=num_steps,
+        residual_before=largest(relative(before, scale)),
+        residual_after=largest(relative(after, scale)),
+        correction=tree_norm(correction),
+        rank=rank,
+        worst=outcome.worst,
+    )

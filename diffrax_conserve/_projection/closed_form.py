@@ -1,0 +1,93 @@
+"""A projection that the user knows how to write down."""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from .._custom_types import RealScalarLike, Values, Y
+from .base import AbstractProjection, Outcome, Problem, ProjectionInfo, option, report
+from .linearise import linearise
+from .residual import Tolerance
+
+
+@final
+class ClosedForm(AbstractProjection):
+    r"""Projects by a formula: $y = \mathrm{fn}(t, \hat y, args, values)$.
+
+    For manifolds with a known projection, such as spheres, unit quaternions and rotation matrices.
+    The residual of what the formula returns is checked like that of every other projection: where
+    it does not lie on the manifold, the projection has failed.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        def unit(t, y, args):
+            return jnp.sum(y**2) - 1
+
+        def normalise(t, y, args, values):
+            return y / jnp.linalg.norm(y)
+
+        solver = dfc.ManifoldProjection(
+            diffrax.Tsit5(), dfc.Constraint(unit), projection=dfc.ClosedForm(normalise)
+        )
+        ```
+    """
+
+    fn: Callable[[RealScalarLike, Any, Any, Values], Any]
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    metric: None = eqx.field(default=None, init=False)
+
+    def __check_init__(self):
+        if not callable(self.fn):
+            raise TypeError(
+                f"`fn` of a `ClosedForm` is {self.fn!r}, which is not callable. Pass a function "
+                "`fn(t, y, args, values)` that returns the projected state."
+            )
+
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        y = self.fn(problem.t, candidate, problem.args, problem.values)
+        _check_like(y, candidate)
+        before, jacobian = linearise(problem.residual, candidate)
+        after, at_y = linearise(problem.residual, y)
+        scale = problem.magnitude + at_y.scale(y)
+        outcome = Outcome.of(before, after, scale, Tolerance(self.rtol, self.atol))
+        rank = jacobian.gram_solver(problem.weights).rank
+        count = jnp.asarray(1)
+        return y, report(outcome, count, candidate, y, before, after, scale, rank)
+
+
+ClosedForm.__init__.__doc__ = r"""**Arguments:**
+
+- `fn`: a function `fn(t, y, args, values)` of the time, the candidate, the parameters and the
+    conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
+    which returns the state on the manifold, shaped like `y`. It is differentiated as it is written.
+- `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
+
+**Raises:**
+
+`TypeError` if `fn` is not callable; `ValueError`, when it is used, if what it returns is not shaped
+like the state.
+"""
+
+
+def _check_like(y: Any, candidate: Any) -> None:
+    def shape(x: Any) -> tuple[Any, Any]:
+        return jnp.shape(x), jnp.result_type(x)
+
+    got, expected = (jtu.tree_structure(x) for x in (y, candidate))
+    if got == expected:
+        got, expected = ([shape(x) for x in jtu.tree_leaves(tree)] for tree in (y, candidate))
+    if got != expected:
+        raise ValueError(
+            f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a state "
+            "of the same structure, shapes and dtypes."
+        )

@@ -1,0 +1,116 @@
+"""Newton's iteration for the multipliers, the one loop of every iterative projection."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Int
+
+from .._custom_types import Y
+from .._tree import tree_mul, tree_scale, tree_sub
+from .elimination import Vector
+from .jacobian import AbstractJacobian
+from .linearise import Elements, Joined, linearise
+from .residual import Tolerance, relative, within
+
+# An iteration ends at this part of the tolerance, or where it no longer halves the residual.
+SAFELY = 0.25
+# Where a step with this much damping does not reduce the residual, none will.
+_MOST_DAMPING = 1e8
+
+
+class Equations(eqx.Module):
+    """`g(y) = 0` for `y = ŷ + M⁻¹ Gᵀ λ`, from the candidate `ŷ`."""
+
+    residual: Joined | Elements
+    candidate: Y
+    weights: Y
+    magnitude: Vector
+    tolerance: Tolerance
+
+    def correction(self, jacobian: AbstractJacobian, multiplier: Vector) -> Y:
+        """`M⁻¹ Gᵀ λ`."""
+        return tree_mul(jacobian.pullback(multiplier), self.weights)
+
+    def scale(self, jacobian: AbstractJacobian, y: Y) -> Vector:
+        """What roundoff in the residual is relative to, at `y`, whose Jacobian is given."""
+        return jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
+
+    def safely_satisfied(self, g: Vector, scale: Vector) -> Bool[Array, ""]:
+        return within(g, tree_scale(SAFELY, self.tolerance(scale)))
+
+
+class Iterate(NamedTuple):
+    """A state with its multipliers, residual and scale, and how many steps led to it."""
+
+    y: Y
+    multiplier: Vector
+    g: Vector
+    scale: Vector
+    num_steps: Int[Array, ""]
+
+
+class _Carry(NamedTuple):
+    unfinished: Bool[Array, ""]
+    damping: Array
+    last: Array
+    iterate: Iterate
+
+
+def iterate(
+    equations: Equations, *, frozen: bool, max_steps: int, enabled: Bool[Array, ""] | bool = True
+) -> Iterate:
+    r"""Newton's method from the candidate.
+
+    Each step solves $(G(y) M^{-1} B^\top + D)\, \Delta = g(y)$ and moves $y$ by
+    $-M^{-1} B^\top \Delta$. With `frozen`, $B$ is the Jacobian at the candidate, so that the
+    result is $\hat y + M^{-1} B^\top \lambda$; otherwise it is that at $y$, which is a Gauss-Newton
+    iteration. The damping $D = \mu \min(10^{-2}, |g|^2)$, relative to the diagonal, vanishes with
+    the relative residual: it passes near points where gradients are parallel, and convergence is
+    quadratic elsewhere. A step that does not reduce the residual is not made, but tried again with
+    ten times the $\mu$, as in the method of Levenberg and Marquardt.
+    """
+    before, at_candidate = linearise(equations.residual, equations.candidate)
+    first = equations.scale(at_candidate, equations.candidate)
+
+    # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
+    # and then never ends: so the condition is evaluated once, and carried.
+    def body(carry: _Carry) -> _Carry:
+        _, damping, last, (y, multiplier, _, _, count) = carry
+        g, jacobian = linearise(equations.residual, y)
+        scale = equations.scale(jacobian, y)
+        merit = _squares(g, scale)
+        base = at_candidate if frozen else jacobian
+        # Near a state of which all terms vanish the residual is never small beside them.
+        vanishing = jnp.minimum(1e-2, _squares(g, jtu.tree_map(jnp.maximum, scale, first)))
+        change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
+        trial = tree_sub(y, equations.correction(base, change))
+        better = _squares(equations.residual(trial), scale) < merit
+
+        success = within(g, equations.tolerance(scale))
+        ended = success & (equations.safely_satisfied(g, scale) | (merit > 0.25 * last) | ~better)
+        moves = better & ~ended & (count < max_steps)
+        stuck = jnp.where(better, count >= max_steps, damping > _MOST_DAMPING)
+        unfinished = ~ended & ~stuck & (merit < jnp.inf)
+        y, multiplier = jtu.tree_map(
+            lambda a, b: jnp.where(moves, a, b),
+            (trial, tree_sub(multiplier, change)),
+            (y, multiplier),
+        )
+        damping = jnp.where(better, jnp.maximum(0.1 * damping, 1.0), 10.0 * damping)
+        last = jnp.where(better, merit, last)
+        new = Iterate(y, multiplier, g, scale, count + moves.astype(count.dtype))
+        return _Carry(unfinished, damping, last, new)
+
+    zeros = jtu.tree_map(jnp.zeros_like, before)
+    one = jnp.ones_like(jtu.tree_leaves(before)[0], shape=())
+    start = Iterate(equations.candidate, zeros, before, zeros, jnp.asarray(0))
+    carry = _Carry(jnp.asarray(enabled), one, one * jnp.inf, start)
+    return lax.while_loop(lambda carry: carry.unfinished, body, carry).iterate
+
+
+def _squares(g: Vector, scale: Vector) -> Array:
+    squares = jtu.tree_map(lambda x: jnp.sum(jnp.square(x)), relative(g, scale))
+    return sum(jtu.tree_leaves(squares))  # pyright: ignore

@@ -1,0 +1,292 @@
+"""The constraint Jacobian `G` at a state, and linear solves with Gram matrices, in three forms."""
+
+import abc
+import functools as ft
+from collections.abc import Callable
+from typing import Any, ClassVar, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import lineax as lx
+from jaxtyping import Array, PyTree, Real
+
+from .._custom_types import Y
+from .._tree import tree_dot, tree_mul, tree_scale, tree_sub, working_dtype
+from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
+
+# Up to this many constraints are unrolled: the ten integrals of gravitating bodies. Compile time
+# grows as m³, against a loop that costs some microseconds however small the matrix.
+UNROLLED_MAX = 10
+
+
+class AbstractJacobian(eqx.Module):
+    """The rows `∂g_i/∂y` at one state, each shaped like the state."""
+
+    # How many iterations to make before asking whether they are needed. Enough for nearly every
+    # step of an integrator where they are cheap.
+    inline_steps: ClassVar[int] = 2
+
+    @abc.abstractmethod
+    def pullback(self, multiplier: Vector) -> Y:
+        """`Gᵀ λ`, shaped like the state."""
+
+    @abc.abstractmethod
+    def pushforward(self, y: Y) -> Vector:
+        """`G y`."""
+
+    @abc.abstractmethod
+    def scale(self, y: Y) -> Vector:
+        """`Σ_k |y_k ∂g_i/∂y_k|`, the size of the terms that cancel in `g_i`."""
+
+    @abc.abstractmethod
+    def gram_solver(
+        self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
+    ) -> GramSolver:
+        """Solves with `G W Hᵀ`, where `H` is `other`, a Jacobian of the same kind, or `G`.
+
+        Rows are divided by their largest element before they are multiplied, so that no product
+        overflows or vanishes whatever the units. `damping` is relative to the diagonal, to which it
+        is added.
+        """
+
+    @abc.abstractmethod
+    def sines(self, weights: Y) -> Real[Array, " m"] | None:
+        """The sine of the angle between each row and the span of those before it, in the norm of
+        `W`; `None` where rows are never formed."""
+
+
+@final
+class Unrolled(AbstractJacobian):
+    rows: tuple[Y, ...]
+
+    def pullback(self, multiplier: Vector) -> Y:
+        def combine(*leaves: Array) -> Array:
+            terms = [c.astype(x.dtype) * x for c, x in zip(multiplier, leaves, strict=True)]
+            return ft.reduce(jnp.add, terms)
+
+        return jtu.tree_map(combine, *self.rows)
+
+    def pushforward(self, y: Y) -> Vector:
+        dtype = working_dtype(y)
+        return tuple(tree_dot(row, y, dtype) for row in self.rows)
+
+    def scale(self, y: Y) -> Vector:
+        magnitude = jtu.tree_map(jnp.abs, y)
+        dtype = working_dtype(y)
+        return tuple(tree_dot(jtu.tree_map(jnp.abs, r), magnitude, dtype) for r in self.rows)
+
+    def gram_solver(
+        self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
+    ) -> GramSolver:
+        rows, row_sizes = self._normalised()
+        columns, column_sizes = (rows, row_sizes) if other is None else other._normalised()
+        dtype = working_dtype(columns[0])
+        weighted = [tree_mul(column, weights) for column in columns]
+        gram: list[list[Array]] = []
+        for i, row in enumerate(rows):
+            known = gram if other is None else []
+            gram.append(
+                [
+                    known[j][i] if j < len(known) else tree_dot(row, weighted[j], dtype)
+                    for j in range(len(columns))
+                ]
+            )
+        return unrolled_solver(gram, damping).scaled(row_sizes, column_sizes)
+
+    def sines(self, weights: Y) -> Real[Array, " m"]:
+        # Gram and Schmidt: squares of sines, as pivots are, would have half the digits.
+        dtype = working_dtype(weights)
+        roots = jtu.tree_map(jnp.sqrt, weights)
+        basis: list[Y] = []
+        sines = []
+        for row in self._normalised()[0]:
+            rest = row = tree_mul(row, roots)
+            for unit in basis:
+                rest = tree_sub(rest, tree_scale(tree_dot(unit, rest, dtype), unit))
+            norms = [jnp.sqrt(tree_dot(x, x, dtype)) for x in (rest, row)]
+            length, whole = (jnp.where(x > 0, x, 1) for x in norms)
+            basis.append(tree_scale(1 / length, rest))
+            # A gradient that vanishes is parallel to none.
+            sines.append(jnp.where(norms[1] > 0, norms[0] / whole, 1))
+        return jnp.stack(sines)
+
+    def _normalised(self) -> tuple[tuple[Y, ...], Vector]:
+        sizes = tuple(
+            _size([jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(r)]) for r in self.rows
+        )
+        inverses = [1 / size for size in sizes]
+        rows = tuple(
+            jtu.tree_map(lambda x, s=inverse: x * s.astype(x.dtype), row)
+            for row, inverse in zip(self.rows, inverses, strict=True)
+        )
+        return rows, sizes
+
+
+@final
+class Dense(AbstractJacobian):
+    rows: PyTree[Array]  # each leaf with a leading axis of length m
+
+    def pullback(self, multiplier: Vector) -> Y:
+        return jtu.tree_map(lambda x: _contract(multiplier.astype(x.dtype), x), self.rows)
+
+    def pushforward(self, y: Y) -> Vector:
+        dtype = working_dtype(y)
+        return jax.vmap(lambda row: tree_dot(row, y, dtype))(self.rows)
+
+    def scale(self, y: Y) -> Vector:
+        magnitude = jtu.tree_map(jnp.abs, y)
+        dtype = working_dtype(y)
+        return jax.vmap(lambda row: tree_dot(jtu.tree_map(jnp.abs, row), magnitude, dtype))(
+            self.rows
+        )
+
+    def gram_solver(
+        self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
+    ) -> GramSolver:
+        rows, row_sizes = self._normalised()
+        columns, column_sizes = (rows, row_sizes) if other is None else other._normalised()
+        dtype = working_dtype(columns)
+
+        def product(row: Array, column: Array, weight: Array) -> Array:
+            m = row.shape[0]
+            weighted = column * weight.astype(column.dtype)[None]
+            return _contract(row.reshape(m, -1), weighted.reshape(m, -1).T).astype(dtype)
+
+        gram = ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(product, rows, columns, weights)))
+        if len(gram) > UNROLLED_MAX:
+            solver = dense_solver(gram, damping)
+        else:
+            unrolled = unrolled_solver([[*row] for row in gram], damping)
+            solver = unrolled._replace(solve=lambda b: jnp.stack(unrolled.solve(tuple(b))))
+        return solver.scaled(row_sizes, column_sizes)
+
+    def sines(self, weights: Y) -> Real[Array, " m"]:
+        rows, _ = self._normalised()
+        weighted = jtu.tree_map(lambda x, w: x * jnp.sqrt(w).astype(x.dtype)[None], rows, weights)
+        dtype = working_dtype(weights)
+        single = dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32  # as QR needs
+        columns = jnp.concatenate(
+            [x.reshape(len(x), -1).astype(single) for x in jtu.tree_leaves(weighted)], axis=1
+        ).T
+        norms = jnp.linalg.norm(columns, axis=0)
+        triangle = jnp.linalg.qr(columns, mode="r")
+        lengths = jnp.abs(jnp.diagonal(triangle))
+        return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(dtype)
+
+    def _normalised(self) -> tuple[PyTree[Array], Vector]:
+        size = _size(
+            [
+                jnp.max(jnp.abs(x.reshape(len(x), -1)), axis=1, initial=0)
+                for x in jtu.tree_leaves(self.rows)
+            ]
+        )
+        rows = jtu.tree_map(
+            lambda x: x / size.astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1)), self.rows
+        )
+        return rows, size
+
+
+def _size(maxima: list[Array]) -> Array:
+    """The largest element of a row, or one if all are zero. In float64 products of elements
+    neither overflow nor vanish in any units, so there it is one."""
+    dtype = working_dtype(maxima)
+    if dtype == jnp.float64:
+        return jnp.ones_like(maxima[0])
+    size = ft.reduce(jnp.maximum, [x.astype(dtype) for x in maxima])
+    return jnp.where(size > 0, size, jnp.ones_like(size))
+
+
+def _contract(a: Array, b: Array) -> Array:
+    """`a @ b`, over the last axis of `a` and the first of `b`, for small arrays in a way that XLA
+    fuses and compiles into a loop around it."""
+    if a.size * b.size > _SMALL:
+        return jnp.tensordot(a, b, axes=1, precision=lax.Precision.HIGHEST)
+    axis = a.ndim - 1
+    a = jnp.expand_dims(a, range(a.ndim, axis + b.ndim))
+    return jnp.sum(a * jnp.expand_dims(b, range(axis)), axis=axis)
+
+
+_SMALL = 4096
+
+
+# The accuracy of one iterative solve. The iteration around it corrects what is left, so the total
+# number of inner iterations hardly depends on it.
+_SOLVE_RTOL = 1e-4
+# With two different Jacobians, how often the solve with one is corrected: to roundoff.
+_CORRECTIONS = 4
+
+
+@final
+class MatrixFree(AbstractJacobian):
+    """Only products: `G y` by forward mode, `Gᵀ λ` by reverse mode, solves by conjugate gradients.
+
+    Memory is that of a few states. Norms of rows are estimates, good to about a third: see
+    `estimated_norms`.
+    """
+
+    forward: Callable[[Y], Vector]
+    backward: Callable[[Vector], Y]
+    inline_steps: ClassVar[int] = 0
+
+    def pullback(self, multiplier: Vector) -> Y:
+        return self.backward(multiplier)
+
+    def pushforward(self, y: Y) -> Vector:
+        return self.forward(y)
+
+    def scale(self, y: Y) -> Vector:
+        return estimated_norms(self.forward, y)
+
+    def sines(self, weights: Y) -> None:
+        del weights
+
+    def gram_solver(
+        self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
+    ) -> GramSolver:
+        squares = jnp.square(estimated_norms(self.forward, jtu.tree_map(jnp.sqrt, weights)))
+        diagonal = jnp.where(squares > 0, squares, 1)
+        struct = jax.eval_shape(lambda: diagonal)
+
+        def symmetric(x: Vector) -> Vector:
+            return self.forward(tree_mul(self.backward(x), weights)) + damping * diagonal * x
+
+        tag = lx.positive_semidefinite_tag
+        operator = lx.FunctionLinearOperator(symmetric, struct, tag)
+        preconditioner = lx.TaggedLinearOperator(lx.DiagonalLinearOperator(1 / diagonal), tag)
+        solver = lx.CG(rtol=_SOLVE_RTOL, atol=float(jnp.finfo(diagonal.dtype).tiny))
+
+        def solve(b: Vector) -> Vector:
+            options = dict(preconditioner=preconditioner)
+            return lx.linear_solve(operator, b, solver, options=options, throw=False).value
+
+        def corrected(b: Vector) -> Vector:
+            x = solve(b)
+            for _ in range(_CORRECTIONS):
+                product = self.forward(tree_mul(other.backward(x), weights))
+                x = x + solve(b - product)
+            return x
+
+        return GramSolver(solve if other is None else corrected, jnp.asarray(diagonal.size))
+
+
+def estimated_norms(linear: Callable[[Y], Vector], weights: Y) -> Vector:
+    """The norms of the rows of `G diag(weights)`, where `linear` is `y ↦ G y`.
+
+    Estimated without forming a row: for random signs `s` the mean of `(G (weights s))²` is the
+    squared norm, so over 16 draws, always the same, it is good to about a third.
+    """
+    leaves, treedef = jtu.tree_flatten(weights)
+    keys = jr.split(jr.key(0), len(leaves))
+
+    def probe(index: Array) -> Vector:
+        signed = [
+            jr.rademacher(jr.fold_in(key, index), jnp.shape(leaf), jnp.result_type(leaf)) * leaf
+            for key, leaf in zip(keys, leaves, strict=True)
+        ]
+        return jnp.square(linear(jtu.tree_unflatten(treedef, signed)))
+
+    return jnp.sqrt(jnp.mean(jax.vmap(probe)(jnp.arange(16)), axis=0))

@@ -1,0 +1,123 @@
+"""A branch that few lanes of a batch take, at the cost of those few."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.custom_batching
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool
+
+_State = TypeVar("_State")
+
+# Lanes are gathered in up to so many blocks, each by itself, so that no block meets another: with a
+# batch that is sharded over that many devices nothing is sent between them.
+_BLOCKS = 32
+# One over the part of a block that is finished at a time.
+_SHARES = 8
+
+
+def continue_if_any(
+    fn: Callable[[Bool[Array, ""], _State, Any], _State],
+    flag: Bool[Array, ""],
+    state: _State,
+    operands: Any,
+) -> _State:
+    """`fn(flag, state, operands)` if `flag` is set, and `state` if not.
+
+    In a batch, the lanes whose flag is set are gathered, some at a time, finished by one copy of
+    `fn`, and put back. (A `lax.cond` in a batch runs both branches for every lane.) `fn` must leave
+    a lane alone whose flag is not set, and may close over no arrays.
+    """
+    arrays, static = eqx.partition(operands, eqx.is_array)
+
+    def lane(flag: Array, state: _State, arrays: Any) -> _State:
+        return fn(flag, state, eqx.combine(arrays, static))
+
+    @jax.custom_batching.custom_vmap
+    def alone(flag, state, arrays):
+        def taken(state, arrays):
+            return lane(flag, state, arrays)
+
+        return lax.cond(flag, taken, lambda state, _: state, state, arrays)
+
+    @alone.def_vmap
+    def batched(size, axes, flag, state, arrays):
+        flags, states = _broadcast(size, tuple(axes[:2]), (flag, state))
+        batch, shared = _split(arrays, axes[2])
+        out = _lanes(flags, states, batch, shared)
+        return out, jtu.tree_map(lambda _: True, out)
+
+    # A batch of batches is one batch.
+    @jax.custom_batching.custom_vmap
+    def _lanes(flags, states, batch, shared):
+        def taken(flags, states, batch, shared):
+            return _finish(lane, flags, states, batch, shared)
+
+        def not_taken(flags, states, batch, shared):
+            return states
+
+        return lax.cond(jnp.any(flags), taken, not_taken, flags, states, batch, shared)
+
+    @_lanes.def_vmap
+    def batch_of_batches(size, axes, flags, states, batch, shared):
+        lanes = flags.shape[1 if axes[0] else 0]
+        more, same = _split(shared, axes[3])
+        # What is shared by the lanes of each batch, but not by the batches, is repeated.
+        more = jtu.tree_map(lambda x: jnp.repeat(x, lanes, axis=0), more)
+        flat = jtu.tree_map(
+            lambda x: x.reshape(size * lanes, *x.shape[2:]),
+            _broadcast(size, tuple(axes[:3]), (flags, states, batch)),
+        )
+        out = _lanes(*flat[:2], eqx.combine(flat[2], more), same)
+        out = jtu.tree_map(lambda x: x.reshape(size, lanes, *x.shape[1:]), out)
+        return out, jtu.tree_map(lambda _: True, out)
+
+    return alone(flag, state, arrays)
+
+
+def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: Any, shared: Any):
+    lanes = flags.shape[0]
+    blocks = math.gcd(lanes, _BLOCKS)
+    length = lanes // blocks
+    width = -(-length // _SHARES)
+    flags, states, batch = jtu.tree_map(
+        lambda x: x.reshape(blocks, length, *x.shape[1:]), (flags, states, batch)
+    )
+    # The lanes to be finished, first in each block; beyond them an index that is out of range.
+    order = jax.vmap(lambda f: jnp.nonzero(f, size=width * _SHARES, fill_value=length)[0])(flags)
+    most = jnp.max(jnp.sum(flags, axis=1))
+
+    def body(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        start, states = carry
+        index = lax.dynamic_slice_in_dim(order, start, width, axis=1)
+
+        def of_block(states: Any, batch: Any, index: Array) -> Any:
+            def taken(x: Array) -> Array:
+                return x.at[index].get(mode="clip")
+
+            def finished(flag: Array, state: Any, batch: Any) -> Any:
+                return lane(flag, state, eqx.combine(batch, shared))
+
+            out = jax.vmap(finished)(index < length, *jtu.tree_map(taken, (states, batch)))
+            return jtu.tree_map(lambda x, y: x.at[index].set(y, mode="drop"), states, out)
+
+        return start + width, jax.vmap(of_block)(states, batch, index)
+
+    _, states = lax.while_loop(lambda carry: carry[0] < most, body, (jnp.zeros_like(most), states))
+    return jtu.tree_map(lambda x: x.reshape(lanes, *x.shape[2:]), states)
+
+
+def _broadcast(size: int, axes: Any, tree: Any) -> Any:
+    return jtu.tree_map(
+        lambda x, batched: x if batched else jnp.broadcast_to(x, (size, *jnp.shape(x))), tree, axes
+    )
+
+
+def _split(arrays: Any, axes: Any) -> tuple[Any, Any]:
+    """Those with an axis of lanes, and those without."""
+    return eqx.partition(arrays, axes)

@@ -1,0 +1,98 @@
+"""A residual to first order: its value and its constraint Jacobian at a state.
+
+`linearise` chooses the form of the Jacobian. Up to ten constraints of a small state come as
+scalars: each product, sum and 2×2 solve is plain elementwise arithmetic that XLA fuses into the
+step around it (a `linalg` call on a 2×2 matrix costs more than the step itself). More of them make
+a matrix. Of very many the rows are never formed.
+
+A vector of `m` numbers (residuals, multipliers) is accordingly one array of shape `(m,)` or a tuple
+of `m` scalars. Code that uses one treats it as a PyTree.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Real
+
+from .._custom_types import Y
+from .elimination import Vector
+from .jacobian import UNROLLED_MAX, AbstractJacobian, Dense, MatrixFree, Unrolled
+from .scalars import elements_in_scalars
+
+Residual = Callable[[Y], Vector]
+
+# Above this many the gradients are never formed: what is needed of them is computed from products
+# with them.
+DENSE_MAX = 128
+
+
+def linearise(residual: Residual, y: Y) -> tuple[Vector, AbstractJacobian]:
+    """`g(y)` and `G(y)`."""
+    struct = eqx.filter_eval_shape(residual, y)
+    if isinstance(struct, tuple):
+        # One reverse pass per constraint, each of which touches only what that constraint depends
+        # on; XLA merges the forward passes.
+        fns = [lambda y, i=i: residual(y)[i] for i in range(len(struct))]
+        fns = residual.fns if isinstance(residual, Elements) else fns
+        outs, rows = zip(*(jax.value_and_grad(fn)(y) for fn in fns), strict=True)
+        return outs, Unrolled(rows)
+    out, vjp = jax.vjp(residual, y)
+    if out.size > DENSE_MAX:
+        _, jvp = jax.linearize(residual, y)
+        return out, MatrixFree(jvp, lambda multiplier: vjp(multiplier)[0])
+    (rows,) = jax.vmap(vjp)(jnp.eye(out.size, dtype=out.dtype))
+    return out, Dense(rows)
+
+
+class Joined(eqx.Module):
+    """A residual of shape `(m,)`, joined from the arrays that `parts` returns."""
+
+    parts: Callable[[Y], list[Array]]
+
+    def __call__(self, y: Y) -> Real[Array, " m"]:
+        return jnp.concatenate([x.reshape(-1) for x in self.parts(y)])
+
+
+class Elements(eqx.Module):
+    """A residual given as a list of functions, whose values are a tuple of scalars."""
+
+    fns: list[Residual]
+
+    @classmethod
+    def of(cls, residual: Joined, y: Y) -> "Elements":
+        # Of the parts, not of the whole: the gradient of an element of that would be made of the
+        # gradients of all parts, most of them times zero.
+        sizes = [x.size for x in eqx.filter_eval_shape(residual.parts, y)]
+
+        def element(part: int, i: int) -> Residual:
+            return lambda y: residual.parts(y)[part].reshape(-1)[i]
+
+        return cls([element(part, i) for part, size in enumerate(sizes) for i in range(size)])
+
+    def __call__(self, y: Y) -> tuple[Array, ...]:
+        return tuple(fn(y) for fn in self.fns)
+
+
+def written_out(
+    residual: Joined, magnitude: Real[Array, " m"], y: Y
+) -> tuple[Joined | Elements, Vector, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same residual and magnitude with scalars in the place of vectors, if they are few, and
+    of states, if they are small, and the maps to its states and back."""
+    if magnitude.size > UNROLLED_MAX:
+        return residual, magnitude, _same, _same
+    converted = elements_in_scalars(residual, y)
+    if converted is None:
+        return Elements.of(residual, y), tuple(magnitude), _same, _same
+    fns, split, join = converted
+    return Elements(fns), tuple(magnitude), split, join
+
+
+def _same(y: Y) -> Y:
+    return y
+
+
+def as_array(vector: Vector) -> Real[Array, " m"]:
+    """A vector in either form, of shape `(m,)`."""
+    return jnp.stack(vector) if isinstance(vector, tuple) else vector

@@ -1,0 +1,233 @@
+"""Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, PyTree
+
+from .._custom_types import Y
+from .._tree import (
+    tree_add,
+    tree_mul,
+    tree_scale,
+    tree_size,
+    tree_sub,
+    tree_tangents,
+    working_dtype,
+)
+from .base import (
+    NEWTON_OPTIONS,
+    AbstractProjection,
+    Outcome,
+    Problem,
+    ProjectionInfo,
+    option,
+    positive_weights,
+    report,
+)
+from .certainty import certain
+from .elimination import Vector
+from .iteration import Equations, iterate
+from .linearise import Residual, linearise
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
+
+# Above this many unknowns the optimality system is solved iteratively, matrix-free.
+_DENSE_MAX = 256
+
+
+@final
+class Newton(AbstractProjection):
+    r"""Projects to the nearest point of the manifold, with a fresh Jacobian in each iteration.
+
+    Finds the stationary point of the distance, $(y, \lambda)$ with
+
+    $$y = \hat y + M^{-1} G(y)^\top \lambda, \qquad g(y) = 0,$$
+
+    in two phases. First a Gauss-Newton iteration reaches the manifold, with a
+    damping $\min(10^{-2}, |g|^2)$ of the row-scaled Gram matrix, which vanishes with the
+    (relative) residual: it passes near points where gradients become parallel, and converges
+    quadratically elsewhere. Then Newton's method on both equations moves along the manifold to
+    the point nearest to the candidate. Where that fails, the result is the point that was reached
+    first: on the manifold, but not the nearest, and its derivative is NaN. The second phase costs
+    second derivatives of the constraint functions
+    and linear solves with all unknowns, so for the candidates of an integrator, which are close,
+    use [`diffrax_conserve.SimplifiedNewton`][].
+
+    Success is decided at the state that is returned, by the scale of the constraints there. The
+    result is differentiated by the implicit function theorem on both equations. Where the gradients
+    of the constraints are nearly parallel at the projected state, though not everywhere, the
+    derivative is NaN.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        circle = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        y, info = dfc.project(circle, jnp.array([3.0, 4.0]), projection=dfc.Newton())
+        ```
+
+    ??? cite "Reference"
+
+        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
+        2006, Section IV.4, equations (4.3).
+    """
+
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    max_steps: int = option(50, static=True)
+    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        if jnp.finfo(working_dtype(candidate)).bits < 32:
+            raise TypeError(
+                f"`Newton` was given a state of dtype {working_dtype(candidate)}, in which its "
+                "linear solves cannot be done. Convert the state to float32, or pass "
+                "`projection=SimplifiedNewton()`."
+            )
+        if len({x.dtype for x in jtu.tree_leaves(candidate)}) > 1:
+            raise TypeError(
+                "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
+                "pass `projection=SimplifiedNewton()`."
+            )
+        equations = Equations(
+            problem.residual,
+            candidate,
+            problem.weights,
+            problem.magnitude,
+            Tolerance(self.rtol, self.atol),
+        )
+        y, _, info = _project(equations, max_steps=self.max_steps)
+        return y, info
+
+
+Newton.__init__.__doc__ = NEWTON_OPTIONS
+
+
+@eqx.filter_custom_jvp
+def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, ProjectionInfo]:
+    reached = iterate(equations, frozen=False, max_steps=max_steps)
+    before = equations.residual(equations.candidate)
+    nearest, multiplier, along = _nearest(equations, reached.y, max_steps)
+
+    def residuals(y: Y) -> tuple[Vector, Vector]:
+        g, jacobian = linearise(equations.residual, y)
+        return g, equations.scale(jacobian, y)
+
+    g, scale = residuals(nearest)
+    found = within(g, equations.tolerance(scale)) & (along.result == optx.RESULTS.successful)
+    y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
+    after, scale = residuals(y)
+    outcome = Outcome.of(before, after, scale, equations.tolerance)
+    # Only that of the nearest point has a derivative.
+    reached_only = (outcome.result == optx.RESULTS.successful) & ~found
+    multiplier = jnp.where(reached_only, jnp.nan, multiplier)
+    rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
+    count = reached.num_steps + along.stats["num_steps"]
+    return y, multiplier, report(outcome, count, equations.candidate, y, before, after, scale, rank)
+
+
+def _state_norm(unknowns: tuple[Y, Vector]) -> Array:
+    # Where gradients are nearly parallel the state is well determined, the multipliers are not.
+    y, _ = unknowns
+    return optx.max_norm(y)
+
+
+def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -> tuple[Y, Vector]:
+    """`y - ŷ - M⁻¹ G(y)ᵀ λ` and `g(y)`."""
+    y, multiplier = unknowns
+    residual, candidate, weights = parameters
+    g, vjp = eqx.filter_vjp(residual, y)
+    (direction,) = vjp(multiplier)
+    return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
+
+
+def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector, optx.Solution]:
+    """Newton's method on the optimality system, from a point of the manifold and the multipliers
+    that suit the candidate best there."""
+    residual, candidate, weights = equations.residual, equations.candidate, equations.weights
+    _, jacobian = linearise(residual, start)
+    offset = jacobian.pushforward(tree_sub(start, candidate))
+    # Rows of norm one, so that a linear solver sees the rank of the system.
+    norms = jnp.where(jacobian.scale(start) > 0, jacobian.scale(start), 1)
+    multiplier = jacobian.gram_solver(weights).solve(offset) * norms
+    eps = float(jnp.finfo(working_dtype(candidate)).eps)
+    tolerance = eps ** (2 / 3)
+    # The multipliers of nearly parallel gradients are large and cancel, up to their roundoff.
+    atol = tolerance + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
+    size = tree_size((candidate, multiplier))
+    if size <= _DENSE_MAX:
+        # Dependent constraints make the system singular but consistent.
+        linear_solver = lx.AutoLinearSolver(well_posed=False)
+    else:
+        linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
+    solution = optx.root_find(
+        lambda x, p: _optimality(x, (lambda y: p[0](y) / p[3], p[1], p[2])),
+        optx.Newton(rtol=tolerance, atol=atol, norm=_state_norm, linear_solver=linear_solver),
+        (start, multiplier),
+        (residual, candidate, weights, norms),
+        max_steps=max_steps,
+        throw=False,
+    )
+    y, multiplier = solution.value
+    return y, multiplier / norms, solution
+
+
+@_project.def_jvp
+def _project_jvp(primals, tangents, *, max_steps):
+    """The implicit function theorem for the optimality system, in the unknowns `y` and `λ`."""
+    (equations,), (t_equations,) = primals, tangents
+    y, multiplier, info = _project(equations, max_steps=max_steps)
+
+    def parameters(x: Any) -> tuple[Any, Any, Any]:
+        return x.residual, x.candidate, x.weights
+
+    unknowns = y, multiplier
+    _, right = eqx.filter_jvp(
+        lambda p: _optimality(unknowns, p), (parameters(equations),), (parameters(t_equations),)
+    )
+    right = tree_tangents(unknowns, right)
+    given = parameters(equations)
+    t_y, t_multiplier = _solve(lambda x: _optimality(x, given), unknowns, right)
+    _, jacobian = linearise(given[0], y)
+    factor = jnp.where(info.ok, certain(equations, y, jacobian), 1)
+    t_y = tree_scale(lax.stop_gradient(factor), t_y)
+    minus = lambda x: jtu.tree_map(jnp.negative, x)  # noqa: E731
+    t_info = jtu.tree_map(lambda _: None, info)
+    return (y, multiplier, info), (minus(t_y), minus(t_multiplier), t_info)
+
+
+def _solve(fn, unknowns: PyTree[Array], right: PyTree[Array]) -> PyTree[Array]:
+    """The shortest solution of `F' x = right` for the Jacobian `F'` of `fn` at `unknowns`."""
+    x, unravel = jfu.ravel_pytree(unknowns)
+    b, _ = jfu.ravel_pytree(right)
+    if x.size > _DENSE_MAX:
+        eps = float(jnp.finfo(x.dtype).eps)
+        tolerance = eps ** (2 / 3)
+        operator = lx.JacobianLinearOperator(lambda y, _: fn(y), unknowns)
+        solver = lx.GMRES(rtol=tolerance, atol=tolerance)
+        return lx.linear_solve(operator, right, solver, throw=False).value
+    matrix = jax.jacfwd(lambda x: jfu.ravel_pytree(fn(unravel(x)))[0])(x)
+    # Rows and columns of comparable size, so that the condition is that of the problem.
+    columns = lax.stop_gradient(_sizes(matrix, 0))
+    rows = lax.stop_gradient(_sizes(matrix / columns, 1))
+    scaled = matrix / columns / rows[:, None]
+    finite = jnp.all(jnp.isfinite(scaled))
+    operator = lx.MatrixLinearOperator(jnp.where(finite, scaled, jnp.eye(x.size, dtype=x.dtype)))
+    # Dependent constraints make the system singular but consistent.
+    solver = lx.SVD(rcond=64 * float(jnp.finfo(x.dtype).eps))
+    solution = lx.linear_solve(operator, jnp.where(finite, b / rows, 0), solver).value
+    return unravel(jnp.where(finite, 1, jnp.nan) * solution / columns)
+
+
+def _sizes(matrix: Array, axis: int) -> Array:
+    size = jnp.max(jnp.abs(matrix), axis=axis)
+    return jnp.where(size > 0, size, 1)

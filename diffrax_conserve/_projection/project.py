@@ -1,0 +1,186 @@
+"""`project`: one state to the manifold. Also what the solver and the interpolation call."""
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, PyTree, Real
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import (
+    Constraint,
+    FirstIntegral,
+    check_manifold,
+    check_outputs,
+    check_values,
+    conserved_values,
+    is_entry,
+)
+from .._tree import tree_mul, tree_sub
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .linearise import linearise
+from .newton import Newton
+from .residual import largest, measure, relative, residual_of
+
+
+def project(
+    manifold: Manifold,
+    y: Y,
+    *,
+    t: RealScalarLike = 0.0,
+    args: Args = None,
+    value: Values | None = None,
+    projection: AbstractProjection | None = None,
+) -> tuple[Y, ProjectionInfo]:
+    r"""Projects one state to the manifold $\{y : g(t, y, args) = 0\}$.
+
+    Use it to make an initial state consistent, or to move a state to another value of its
+    integrals.
+
+    **Arguments:**
+
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `y`: the candidate, any PyTree of real floating-point arrays.
+    - `t`, `args`: passed to the functions of the manifold.
+    - `value`: the conserved values: a PyTree like `manifold`, with what `fn` is to be kept at in
+        the place of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed
+        where each `FirstIntegral` has a `value` of its own.
+    - `projection`: how to get there. Default: `Newton()`, the nearest point.
+
+    **Returns:**
+
+    The state on the manifold, shaped like `y`, and a
+    [`diffrax_conserve.ProjectionInfo`][]. `info.result` says whether it succeeded: nothing is
+    raised at run time.
+
+    **Raises:**
+
+    `TypeError` or `ValueError` if the manifold, the metric or the conserved values do not fit.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        y, info = dfc.project(sphere, jnp.array([1.0, 2.0, 2.0]))  # y = (1/3, 2/3, 2/3)
+        ```
+    """
+    check_manifold(manifold)
+    projection = Newton() if projection is None else projection
+    y = jtu.tree_map(jnp.asarray, y)
+    check_state(y)
+    check_metric(projection.metric, y)
+    check_outputs(manifold, t, y, args)
+    if value is None:
+        for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
+            if isinstance(entry, FirstIntegral) and entry.value is None:
+                raise ValueError(
+                    "`project` was given a `FirstIntegral` without a conserved value, so every "
+                    "state would do. Pass `value=...`, for example "
+                    "`value=integral.fn(t, y_start, args)`, or write "
+                    "`FirstIntegral(fn, value=...)`."
+                )
+    values = conserved_values(manifold, t, y, args)
+    if value is not None:
+        check_values(manifold, value, t, y, args)
+        values = jtu.tree_map(
+            lambda entry, given, own: own if isinstance(entry, Constraint) else given,
+            manifold,
+            value,
+            values,
+            is_leaf=is_entry,
+        )
+    check_values(manifold, values, t, y, args)
+    return apply(projection, manifold, values, t, y, args)
+
+
+def apply(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+    anchor: Y | None = None,
+) -> tuple[Y, ProjectionInfo]:
+    """`project` without its checks."""
+    problem = _problem(projection, manifold, values, t, candidate, args, anchor)
+    return projection.solve(problem, candidate)
+
+
+def tangential(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    vector: Y,
+) -> Y:
+    """The part of `vector` that is tangent to the manifold at `y`, `v - M⁻¹Gᵀ(GM⁻¹Gᵀ)⁻¹G v`."""
+    problem = _problem(projection, manifold, values, t, y, args)
+    _, jacobian = linearise(problem.residual, y)
+    gram_solver = jacobian.gram_solver(problem.weights)
+    normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(vector)))
+    return tree_sub(vector, tree_mul(normal, problem.weights))
+
+
+def relative_residual(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> Real[Array, ""]:
+    """The largest residual at `y`, relative to its scale there."""
+    return largest(relative(*measure(manifold, values, t, y, args)))
+
+
+def _problem(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+    anchor: Y | None = None,
+) -> Problem:
+    residual, magnitude = residual_of(manifold, values, t, candidate, args)
+    weights = _inverse(projection.metric, candidate)
+    return Problem(residual, magnitude, weights, t, args, values, anchor)
+
+
+def check_state(y: Y, user: str = "a projection") -> None:
+    """Raises unless every leaf of the state is a real floating-point array, as `user` needs."""
+    for leaf in jtu.tree_leaves(y):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise TypeError(
+                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but {user} needs "
+                "real floating-point states. Split a complex leaf into its real and its imaginary "
+                "part."
+            )
+
+
+def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
+    """Raises unless `metric` is structured like the state."""
+    if metric is None:
+        return
+    if jtu.tree_structure(metric) != jtu.tree_structure(y):
+        raise ValueError(
+            f"`metric` has the structure {jtu.tree_structure(metric)}, but the state has "
+            f"{jtu.tree_structure(y)}. Give one weight (or an array of weights) for each leaf of "
+            "the state."
+        )
+    for weight, leaf in zip(jtu.tree_leaves(metric), jtu.tree_leaves(y), strict=True):
+        if jnp.shape(weight) not in ((), jnp.shape(leaf)):
+            raise ValueError(
+                f"`metric` has a leaf of shape {jnp.shape(weight)} for a leaf of the state of "
+                f"shape {jnp.shape(leaf)}. Give a scalar or an array of the same shape."
+            )
+
+
+def _inverse(metric: PyTree[ArrayLike] | None, y: Y) -> Y:
+    """`M⁻¹`, shaped like `y`; an infinite weight freezes its component."""
+    if metric is None:
+        return jtu.tree_map(jnp.ones_like, y)
+    return jtu.tree_map(
+        lambda weight, leaf: jnp.broadcast_to(1 / jnp.asarray(weight, leaf.dtype), leaf.shape),
+        metric,
+        y,
+    )

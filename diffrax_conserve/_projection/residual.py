@@ -1,0 +1,110 @@
+"""What a manifold asks of a state: residuals, and what roundoff in them is relative to.
+
+For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The scale of a scalar
+constraint at a state `y` is `|I₀| + Σ_k |y_k ∂g/∂y_k|`: the conserved value, and the terms that
+cancel in the residual. Success is judged by the scale at the state that is returned.
+"""
+
+import functools as ft
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, PyTree, Real
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import evaluate
+from .._tree import tree_max, working_dtype
+from .elimination import Vector
+from .linearise import Joined, linearise
+
+# What is accepted, in units of roundoff of the scale. Rounding the state and evaluating the
+# residual cost about one unit each, so nearly every projection ends well below; where gradients are
+# almost parallel, not much.
+ROUNDOFF_MULTIPLE = 16
+
+
+def residual_of(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Joined, Real[Array, " m"]]:
+    """The residual as a function of the state, and the absolute conserved values, as vectors."""
+    dtype = working_dtype(y)
+
+    def parts(y: Y) -> list[Array]:
+        out = evaluate(manifold, t, y, args)
+        residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
+        return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
+
+    # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
+    residual = Joined(eqx.filter_closure_convert(parts, y))
+    outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), y)
+    magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)
+    return residual, jnp.concatenate(
+        [x.astype(dtype).reshape(-1) for x in jtu.tree_leaves(magnitudes)]
+    )
+
+
+def measure(
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    *,
+    uniform: bool = False,
+) -> tuple[Values, Values]:
+    """The residuals at `y` and their scales there, both shaped like `values`.
+
+    With `uniform`, the scales are those of a state whose components are all as large as the largest
+    of `y`: what a constraint on a component that is zero up to roundoff is to be compared with.
+    """
+    residual, magnitude = residual_of(manifold, values, t, y, args)
+    g, jacobian = linearise(residual, y)
+    like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
+    largest = tree_max(y)
+    sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), y) if uniform else y
+    return _shaped(g, like), _shaped(magnitude + jacobian.scale(sizes), like)
+
+
+def _shaped(vector: Real[Array, " m"], like: PyTree) -> Values:
+    leaves, treedef = jtu.tree_flatten(like)
+    ends = [sum(x.size for x in leaves[: i + 1]) for i in range(len(leaves))]
+    parts = [vector[end - x.size : end] for x, end in zip(leaves, ends, strict=True)]
+    return jtu.tree_unflatten(
+        treedef, [p.reshape(x.shape).astype(x.dtype) for p, x in zip(parts, leaves, strict=True)]
+    )
+
+
+def relative(residual: PyTree[Array], scale: PyTree[Array]) -> PyTree[Array]:
+    """Residuals relative to their scales; a scale of zero counts as one."""
+    return jtu.tree_map(lambda g, s: g / jnp.where(s > 0, s, jnp.ones_like(s)), residual, scale)
+
+
+def largest(ratios: PyTree[Array]) -> Float[Array, ""]:
+    """The largest modulus of all, NaN if one is."""
+    return ft.reduce(jnp.maximum, [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(ratios)])
+
+
+def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
+    """Whether every residual is within its tolerance, which NaN and infinity never are."""
+    satisfied = jtu.tree_map(
+        lambda g, tol: jnp.all((jnp.abs(g) <= tol) & (tol < jnp.inf)), residual, tolerance
+    )
+    return ft.reduce(jnp.logical_and, jtu.tree_leaves(satisfied))
+
+
+class Tolerance(eqx.Module):
+    """Which residual counts as zero: `atol + rtol * scale`. By default `rtol` is roundoff."""
+
+    rtol: float | Array | None
+    atol: float | Array | None
+
+    def __call__(self, scale: Vector) -> Vector:
+        def combine(x: Array) -> Array:
+            roundoff = ROUNDOFF_MULTIPLE * jnp.finfo(x.dtype).eps
+            rtol = roundoff if self.rtol is None else self.rtol
+            atol = 0.0 if self.atol is None else self.atol
+            return jnp.asarray(rtol, x.dtype) * x + jnp.asarray(atol, x.dtype)
+
+        return jtu.tree_map(combine, scale)

@@ -1,0 +1,234 @@
+"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4: the direction is frozen at
+the candidate. For candidates that are as close as an integrator's local error."""
+
+import dataclasses
+import functools as ft
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+
+from .._custom_types import Y
+from .._tree import tree_add, tree_mul, tree_scale, tree_sub, tree_tangents, working_dtype
+from .base import (
+    NEWTON_OPTIONS,
+    AbstractProjection,
+    Outcome,
+    Problem,
+    ProjectionInfo,
+    option,
+    positive_weights,
+    report,
+)
+from .certainty import certain
+from .elimination import Vector
+from .iteration import Equations, iterate
+from .lanes import continue_if_any
+from .linearise import Joined, Residual, as_array, linearise, written_out
+from .residual import Tolerance
+
+
+@final
+class SimplifiedNewton(AbstractProjection):
+    r"""Projects along the gradients at the candidate, with the constraint Jacobian frozen there.
+
+    For the candidate $\hat y$, with $G = \partial g/\partial y\,(\hat y)$ and the metric $M$,
+    solves $g(\hat y + M^{-1} G^\top \lambda) = 0$ for the multipliers $\lambda \in \mathbb{R}^m$.
+    The first two iterations are
+
+    $$\lambda \leftarrow \lambda - (G M^{-1} G^\top)^{-1} g(\hat y + M^{-1} G^\top \lambda),$$
+
+    which gain as many digits each as the step of the integrator has. That is enough for nearly
+    every step. Where it is not, the Gram matrix is computed anew in each further iteration, from
+    the Jacobian at the last state, and a step that does not reduce the residual is damped. For
+    candidates far away use [`diffrax_conserve.Newton`][].
+
+    Success is decided at the state that is returned, by the scale of the constraints there.
+
+    The result is differentiated by the implicit function theorem applied to $\lambda$: exactly for
+    the state that is returned, however many iterations were made. Where the gradients of the
+    constraints are so nearly parallel that roundoff would spoil the derivative, it is NaN.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        energy = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        projection = dfc.SimplifiedNewton(max_steps=10)
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy, projection=projection)
+        ```
+
+    ??? cite "Reference"
+
+        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
+        2006, Section IV.4, equations (4.4) to (4.6).
+    """
+
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    max_steps: int = option(20, static=True)
+    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+
+    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+        equations = Equations(
+            problem.residual,
+            candidate,
+            problem.weights,
+            problem.magnitude,
+            Tolerance(self.rtol, self.atol),
+        )
+        y, _, info = _project(equations, problem.anchor, max_steps=self.max_steps)
+        return y, info
+
+
+SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS
+
+
+# The state, the multipliers, the number of iterations and the verdict.
+_State = tuple[Y, Vector, Int[Array, ""], Outcome]
+# How many starts between the candidate and the anchor are tried.
+_STARTS = 8
+
+
+@eqx.filter_custom_jvp
+def _project(
+    equations: Equations, anchor: Y | None, *, max_steps: int
+) -> tuple[Y, Vector, ProjectionInfo]:
+    inline, join = _written_out(equations)
+    before, jacobian = linearise(inline.residual, inline.candidate)
+    gram_solver = jacobian.gram_solver(inline.weights)
+    y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
+    at_y, count = jacobian, min(jacobian.inline_steps, max_steps)
+    for _ in range(count):
+        change = gram_solver.solve(g)
+        y = tree_sub(y, inline.correction(jacobian, change))
+        multiplier = tree_sub(multiplier, change)
+        g, at_y = linearise(inline.residual, y)
+    done = inline.safely_satisfied(g, inline.scale(at_y, y))
+    # Few steps need more. These start again: if they shared what is known here, it would be written
+    # to memory at every step of the solve.
+    state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
+    finish = ft.partial(_finish, max_steps)
+    y, multiplier, count, outcome = continue_if_any(finish, ~done, state, (equations, anchor))
+    # What follows is computed only where somebody asks for it.
+    after, at_y = linearise(equations.residual, y)
+    scale, rank = equations.scale(at_y, y), gram_solver.rank
+    info = report(outcome, count, equations.candidate, y, as_array(before), after, scale, rank)
+    return y, multiplier, info
+
+
+def _written_out(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
+    """The same equations in scalars, if they are few and small, and the map from their states."""
+    assert isinstance(equations.residual, Joined)
+    residual, magnitude, split, join = written_out(
+        equations.residual, equations.magnitude, equations.candidate
+    )
+    inline = dataclasses.replace(
+        equations,
+        residual=residual,
+        candidate=split(equations.candidate),
+        weights=split(equations.weights),
+        magnitude=magnitude,
+    )
+    return inline, join
+
+
+def _finish(
+    max_steps: int,
+    unfinished: Bool[Array, ""],
+    state: _State,
+    operands: tuple[Equations, Y | None],
+) -> _State:
+    """All iterations, from the candidate; not at all unless `unfinished`.
+
+    With an anchor, a state near the manifold, they start again halfway to it where they fail.
+    """
+    equations, anchor = operands
+
+    def attempt(equations: Equations, enabled: Bool[Array, ""]) -> _State:
+        inline, join = _written_out(equations)
+        last = iterate(inline, frozen=True, max_steps=max_steps, enabled=enabled)
+        before = inline.residual(inline.candidate)
+        outcome = Outcome.of(before, last.g, last.scale, inline.tolerance)
+        return join(last.y), as_array(last.multiplier), last.num_steps, outcome
+
+    if anchor is None:
+        new = attempt(equations, unfinished)
+    else:
+        new = _from_between(attempt, equations, anchor, unfinished)
+    return jtu.tree_map(lambda a, b: jnp.where(unfinished, a, b), new, state)
+
+
+_Attempts = tuple[Bool[Array, ""], Int[Array, ""], _State]
+
+
+def _from_between(
+    attempt: Callable[[Equations, Bool[Array, ""]], _State],
+    equations: Equations,
+    anchor: Y,
+    enabled: Bool[Array, ""],
+) -> _State:
+    def body(carry: _Attempts) -> _Attempts:
+        unfinished, index, _ = carry
+        share = jnp.asarray(0.5, working_dtype(anchor)) ** index
+        offset = tree_scale(share, tree_sub(equations.candidate, anchor))
+        start = jtu.tree_map(
+            lambda a, b: jnp.where(index == 0, a, b),
+            equations.candidate,
+            tree_add(anchor, offset),
+        )
+        y, multiplier, count, outcome = attempt(
+            dataclasses.replace(equations, candidate=start), unfinished
+        )
+        # The derivative is that of the projection of the candidate, which this is not.
+        multiplier = jnp.where(index == 0, multiplier, jnp.nan)
+        failed = outcome.result != optx.RESULTS.successful
+        state = y, multiplier, count, outcome
+        return unfinished & failed & (index + 1 < _STARTS), index + 1, state
+
+    like = eqx.filter_eval_shape(attempt, equations, enabled)
+    zeros = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    carry = (jnp.asarray(enabled), jnp.asarray(0), zeros)
+    _, _, state = lax.while_loop(lambda carry: carry[0], body, carry)
+    return state
+
+
+@_project.def_jvp
+def _project_jvp(primals, tangents, *, max_steps):
+    """The implicit function theorem for `λ` in `g(ŷ + M⁻¹ G(ŷ)ᵀ λ) = 0`.
+
+    With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
+    `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`.
+    """
+    y, multiplier, info = _project(*primals, max_steps=max_steps)
+    equations, _ = primals
+    t_equations, _ = tangents
+
+    def displaced(residual: Residual, candidate: Y, weights: Y) -> tuple[Y, Vector]:
+        # `Gᵀ λ` by one reverse pass, not row by row.
+        _, vjp = eqx.filter_vjp(residual, candidate)
+        (direction,) = vjp(multiplier)
+        y = tree_add(candidate, tree_mul(direction, weights))
+        return y, residual(y)
+
+    def moving(x: Any) -> tuple[Any, Any, Any]:
+        return x.residual, x.candidate, x.weights
+
+    t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, moving(equations), moving(t_equations)))
+    _, at_candidate = linearise(equations.residual, equations.candidate)
+    _, at_y = linearise(equations.residual, y)
+    gram_solver = at_y.gram_solver(equations.weights, at_candidate)
+    t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
+    t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
+    # Of a projection that failed nobody asks for the derivative: its step is rejected, or ends all.
+    factor = jnp.where(info.ok, certain(equations, y, at_y), 1)
+    t_y = tree_scale(lax.stop_gradient(factor), t_y)
+    return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

@@ -1,0 +1,66 @@
+"""What is wrong with an initial state: the solve then ends with its first step."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Int
+
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import Constraint, FirstIntegral, is_entry
+from .._projection import AbstractProjection, measure, relative
+from .._projection.project import apply
+from .._tree import working_dtype
+
+FINE, NOT_FINITE, VIOLATED, UNREACHABLE = range(4)
+
+
+class Initial(eqx.Module):
+    """The verdict on an initial state: one of the causes above, the position of the entry of the
+    manifold that is to blame, and how far the first step may move the state because a `value` is
+    not that of the initial state."""
+
+    cause: Int[Array, ""]
+    position: Int[Array, ""]
+    offset: Array
+
+
+def judge(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Values,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+) -> Initial:
+    """A `Constraint` is violated if its residual is larger than the square root of roundoff,
+    relative to the size of its terms; smaller ones are removed by the first step. A first integral
+    with a `value` of its own may start elsewhere, if that value can be reached from there."""
+    dtype = working_dtype(y)
+    limit = jnp.finfo(dtype).eps ** 0.5
+    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
+    residuals, scales = measure(manifold, values, t, y, args, uniform=True)
+    ratios = treedef.flatten_up_to(relative(residuals, scales))
+    given = [isinstance(x, FirstIntegral) and x.value is not None for x in entries]
+    cause, position = jnp.asarray(FINE, jnp.int32), jnp.asarray(0, jnp.int32)
+    for i, (entry, ratio, scale) in reversed(
+        [*enumerate(zip(entries, ratios, treedef.flatten_up_to(scales), strict=True))]
+    ):
+        violated = _any(ratio, lambda x: ~(jnp.abs(x) <= limit)) & isinstance(entry, Constraint)
+        nonfinite = _any(ratio, lambda x: ~jnp.isfinite(x)) | _any(
+            scale, lambda x: ~jnp.isfinite(x)
+        )
+        wrong = jnp.where(nonfinite, NOT_FINITE, jnp.where(violated, VIOLATED, FINE))
+        position = jnp.where(wrong != FINE, i, position).astype(jnp.int32)
+        cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
+    offset = jnp.zeros((), dtype)
+    if any(given):
+        _, info = apply(projection, manifold, values, t, y, args)
+        unreachable = (cause == FINE) & ~info.ok
+        cause = jnp.where(unreachable, UNREACHABLE, cause).astype(jnp.int32)
+        position = jnp.where(unreachable, given.index(True), position).astype(jnp.int32)
+        offset = jnp.where(info.ok, info.correction, 0).astype(dtype)
+    return Initial(cause, position, offset)
+
+
+def _any(tree: Values, test) -> Array:
+    return jnp.any(jnp.stack([jnp.any(test(x)) for x in jtu.tree_leaves(tree)]))

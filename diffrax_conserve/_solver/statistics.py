@@ -1,0 +1,116 @@
+"""What the projections of a solve did, carried in the solver state."""
+
+import dataclasses
+from typing import Any, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, Int
+
+from .._projection import ProjectionInfo
+from .count_rejections import RejectionCount
+
+
+@final
+class ProjectionStatistics(eqx.Module):
+    """Totals over the accepted steps of a solve, including those that it was continued from.
+
+    **Attributes:**
+
+    - `num_projections`: how many steps were projected.
+    - `num_iterations`, `max_iterations`: the iterations of all projections, and of the longest.
+    - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
+        state, relative to the scale of its constraint.
+    - `correction`: the largest Euclidean norm of a projected state minus its candidate.
+    - `rank`: the smallest numerical rank of the constraints.
+    - `num_rejected`: how many steps were rejected because their projection failed, if they were
+        counted by a [`diffrax_conserve.CountRejections`][]; otherwise `None`.
+    """
+
+    num_projections: Int[Array, "..."]
+    num_iterations: Int[Array, "..."]
+    max_iterations: Int[Array, "..."]
+    residual_before: Float[Array, "..."]
+    residual_after: Float[Array, "..."]
+    correction: Float[Array, "..."]
+    rank: Int[Array, "..."]
+    num_rejected: Int[Array, "..."] | None = None
+
+    @classmethod
+    def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
+        count, size = jnp.asarray(0), jnp.zeros((), dtype)
+        return cls(count, count, count, size, size, size, jnp.asarray(num_constraints))
+
+    def add(self, info: ProjectionInfo) -> "ProjectionStatistics":
+        projected = info.num_steps > 0
+        return ProjectionStatistics(
+            self.num_projections + projected.astype(int),
+            self.num_iterations + info.num_steps,
+            jnp.maximum(self.max_iterations, info.num_steps),
+            jnp.maximum(self.residual_before, info.residual_before),
+            jnp.maximum(self.residual_after, info.residual_after),
+            jnp.maximum(self.correction, info.correction),
+            jnp.where(projected, jnp.minimum(self.rank, info.rank), self.rank),
+        )
+
+
+def statistics(sol: dfx.Solution) -> ProjectionStatistics:
+    """What the projections of a solve did.
+
+    It is part of the state of a `ManifoldProjection`, so diffrax must be asked to return that, by
+    `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
+
+    diffrax discards the solver state of a rejected step, so rejected steps count only in
+    `sol.stats["num_rejected_steps"]`. Those that a failed projection caused can be counted by a
+    [`diffrax_conserve.CountRejections`][] around the step-size controller, with
+    `SaveAt(controller_state=True)`.
+
+    **Arguments:**
+
+    - `sol`: what `diffrax.diffeqsolve` returned, with `saveat=SaveAt(..., solver_state=True)`; from
+        `jax.vmap` of it, a batch.
+
+    **Returns:**
+
+    A [`diffrax_conserve.ProjectionStatistics`][].
+
+    **Raises:**
+
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+        sol = diffrax.diffeqsolve(
+            term,
+            dfc.ManifoldProjection(diffrax.Tsit5(), square),
+            t0=0,
+            t1=9,
+            dt0=0.1,
+            y0=jnp.array([1.0, 0.0]),
+            saveat=diffrax.SaveAt(t1=True, solver_state=True),
+        )
+        print(dfc.statistics(sol).max_iterations)
+        ```
+    """
+    found = _instances(sol.solver_state, ProjectionStatistics)
+    counts = _instances(sol.controller_state, RejectionCount)
+    if not found:
+        raise ValueError(
+            "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
+            "and with `saveat=SaveAt(..., solver_state=True)`."
+        )
+    return dataclasses.replace(found[0], num_rejected=counts[0].count if counts else None)
+
+
+def _instances(tree: Any, kind: type) -> list[Any]:
+    leaves = jtu.tree_leaves(tree, is_leaf=lambda x: isinstance(x, kind))
+    return [x for x in leaves if isinstance(x, kind)]

@@ -1,0 +1,247 @@
+"""A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ..._custom_types import RealScalarLike, Y
+from ..._tree import working_dtype
+from .cores import AbstractCore, Product, Sizes
+from .domain import Box, FramedBox
+from .flat import as_state, flatten, stacked_vectors, unflatten
+from .flow_map import AbstractFlowMap
+from .frame import MakeFrame, check_frame, frame_at
+from .layer import ConservativeLayer
+from .mlp import Activation, check_sizes, find_activation
+from .taylor import Taylor
+from .trainable import LayerSchedule
+
+
+@final
+class DeepONet(AbstractFlowMap):
+    r"""A network for the flow map of an autonomous system, $(u_0, h) \mapsto u(h)$.
+
+    $$u(h) = u_0 + \frac{h}{\Delta} S G(u_0)(h), \qquad
+    G_j(u_0)(h) = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0) \, \tau_{jl}(h),$$
+
+    with a branch network $b$ and a trunk network $\tau$, both fully connected, and steps $h$ up to
+    $\Delta$ = `max_step`; $u(0) = u_0$ whatever the weights. Longer times are made of several
+    steps. With a `layer`, the output is moved to the manifold of the values at $u_0$.
+
+    Other cores than this product take the state and the step together:
+    [`diffrax_conserve.learned.Concatenated`][] is a fully connected network,
+    [`diffrax_conserve.learned.Gated`][] has the input in each of its layers. They are more accurate
+    at the same size. With `taylor` the network is
+    $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see [`diffrax_conserve.learned.Taylor`][]. With a
+    `frame` it commutes with the symmetries of the equations: see
+    [`diffrax_conserve.learned.Frame`][].
+
+    Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        keys = jax.random.split(jax.random.key(0), 100)
+        states = jax.vmap(system.sample)(keys)
+        deeponet = dfc.DeepONet(states, 0.25, key=jax.random.key(1))
+        deeponet(system.y0, 0.1)
+        ```
+
+    ??? cite "Reference"
+
+        L. Lu, P. Jin, G. Pang, Z. Zhang and G. E. Karniadakis, Nature Machine Intelligence 3
+        (2021); S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023) for the flow map.
+    """
+
+    core: AbstractCore
+    layer: ConservativeLayer | None
+    max_step: float = eqx.field(static=True)
+    sizes: Sizes = eqx.field(static=True)
+    shift: Float[Array, " k"]
+    scale: Float[Array, " k"]
+    normalise: bool = eqx.field(static=True)
+    taylor: Taylor | None
+    domain: Box | FramedBox
+
+    def __init__(
+        self,
+        states: Y,
+        max_step: RealScalarLike,
+        *,
+        key: PRNGKeyArray,
+        width: int = 40,
+        depth: int = 4,
+        latent: int = 20,
+        core: type[AbstractCore] = Product,
+        activation: str | Activation = "tanh",
+        normalise: bool = True,
+        taylor: Taylor | None = None,
+        frame: MakeFrame | None = None,
+        layer: ConservativeLayer | None = None,
+    ):
+        check_sizes(width=width, depth=depth, latent=latent)
+        if not (isinstance(core, type) and issubclass(core, AbstractCore)):
+            raise TypeError(
+                f"`core` is {core!r}, but it must be a class, such as "
+                "`diffrax_conserve.learned.Product`, `Concatenated` or `Gated`."
+            )
+        if not max_step > 0:
+            raise ValueError(f"`max_step` must be positive, but is {max_step}.")
+        vectors = _vectors(states)
+        if frame is None:
+            self.domain, seen, m = Box.around(states), vectors, vectors.shape[1]
+        else:
+            self.domain, seen, m = _framed(frame, states, layer)
+        dtype, n = vectors.dtype, seen.shape[1]
+        self.sizes = Sizes(width, depth, latent, find_activation(activation))
+        self.core = core.create(n, m, self.sizes, dtype, key)
+        self.layer = layer
+        self.taylor = taylor
+        self.max_step = float(max_step)
+        self.normalise = normalise
+        if normalise:
+            deviation = jnp.std(seen, axis=0)
+            self.shift = jnp.mean(seen, axis=0)
+            self.scale = jnp.where(deviation > 0, deviation, 1)
+        else:
+            self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
+
+    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`."""
+        candidate = self.candidate(y0, h)
+        if self.layer is None:
+            return candidate
+        values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
+        return self.layer(candidate, values, h, self.radius(), schedule)
+
+    def candidate(self, y0: Y, h: RealScalarLike) -> Y:
+        """The same before the conservative layer."""
+        start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
+        if start.size != size:
+            raise ValueError(
+                f"This `DeepONet` is for states of {size} numbers, but was given one of "
+                f"{start.size}."
+            )
+        h = jnp.asarray(h).astype(start.dtype)
+        fraction, learned = self._learned(start, y0, h)
+        if self.taylor is not None:
+            start = flatten(self.taylor(y0, h)).astype(start.dtype)
+        return unflatten(start + fraction ** (self.order + 1) * learned, y0)
+
+    def _learned(
+        self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+        """The fraction of the longest step, and what the network adds."""
+        if isinstance(self.domain, Box):
+            fraction = h / self.max_step
+            return fraction, self.scale * self._network(start, h, fraction)
+        frame = self.domain.frame(y0)
+        inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
+        own = (h * frame.clock).astype(start.dtype)
+        fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
+        return fraction, basis @ self._network(inputs, own, fraction)
+
+    def _network(
+        self, inputs: Float[Array, " k"], step: Float[Array, ""], fraction: Float[Array, ""]
+    ) -> Float[Array, " m"]:
+        inputs = (inputs - self.shift) / self.scale
+        return self.core(inputs, 2 * fraction - 1 if self.normalise else step)
+
+    @property
+    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The order that it has whatever its weights: that of its Taylor polynomial."""
+        return 0 if self.taylor is None else self.taylor.order
+
+    @property
+    def state(self) -> Y:
+        """A state of the structure, shapes and dtypes of those it is for."""
+        return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
+
+    @property
+    def frame(self) -> MakeFrame | None:
+        """The function that finds the frame of a state, if there is one."""
+        return None if isinstance(self.domain, Box) else self.domain.make
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
+        return rate if isinstance(self.domain, Box) else self.domain.frame(y0).measure(rate)
+
+    def weights(self) -> AbstractCore:
+        return self.core
+
+    def linear_weights(self) -> tuple[Any, ...]:
+        # After a conservative layer the output is not linear in them.
+        if self.layer is not None:
+            return ()
+        net = self.core.output_layer()
+        return net.weights[-1], net.biases[-1]
+
+    def radius(self) -> Float[Array, ""]:
+        """How far the conservative layer may move a state in one iteration."""
+        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
+
+
+DeepONet.__init__.__doc__ = r"""**Arguments:**
+
+- `states`: initial states as they will occur, stacked along a leading axis: any PyTree of real
+    arrays. Their structure is that of the states to come, their mean and their standard deviation
+    normalise the inputs, and the box around them is the `domain` of the flow map.
+- `max_step`: the longest step $\Delta$.
+- `key`: a random key, for the initial weights.
+- `width`, `depth`: units in each hidden layer, and hidden layers, of both networks.
+- `latent`: the number $L$ of products in each component.
+- `core`: the kind of network: [`diffrax_conserve.learned.Product`][],
+    [`diffrax_conserve.learned.Concatenated`][] or [`diffrax_conserve.learned.Gated`][]; the last
+    two do not use `latent`.
+- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
+    (which [`diffrax_conserve.save`][] cannot write).
+- `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
+    `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
+- `taylor`: a [`diffrax_conserve.learned.Taylor`][].
+- `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then
+    sees the frame's inputs, and `normalise` is for these; the domain consists of all states whose
+    inputs are in the box around those of `states` and whose clock is not faster than theirs.
+- `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
+
+**Raises:**
+
+`ValueError` or `TypeError` if a size, the step, the states or the frame are not what they must be,
+or if there are both a frame and a layer.
+"""
+
+
+def _vectors(states: Y) -> Float[Array, "samples n"]:
+    states = as_state(states)
+    shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
+    lengths = {shape[:1] for shape in shapes}
+    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
+        raise ValueError(
+            "`states` must be at least one state, stacked along a leading axis, but its leaves "
+            f"have shapes {shapes}. For a single state write "
+            "`jax.tree.map(lambda x: x[None], y0)`."
+        )
+    return stacked_vectors(jtu.tree_map(lambda x: x.astype(working_dtype(states)), states))
+
+
+def _framed(
+    frame: MakeFrame, states: Y, layer: ConservativeLayer | None
+) -> tuple[FramedBox, Float[Array, "samples k"], int]:
+    """The domain, the inputs of all states, and how many functions are to be learned."""
+    if layer is not None:
+        raise ValueError(
+            "A flow map with a `frame` cannot have a `layer`, which measures how far it may go in "
+            "the units of a whole state. Leave it out, and wrap the solver in "
+            "`diffrax_conserve.ManifoldProjection`."
+        )
+    states = as_state(states)
+    one = jtu.tree_map(lambda x: x[0], states)
+    check_frame(frame, one)
+    frames = jax.vmap(lambda y: frame_at(frame, y))(states)
+    return FramedBox.around(frame, states), frames.inputs, frames.basis.shape[-1]

@@ -1,0 +1,176 @@
+"""The states that a flow map was trained for."""
+
+import abc
+from collections.abc import Callable
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Bool, PyTree, Real, Shaped
+
+from ..._custom_types import Y
+from .flat import as_state
+from .frame import Frame, MakeFrame, frame_at
+
+
+class AbstractDomain(eqx.Module):
+    """A set of states that a training can extend."""
+
+    @abc.abstractmethod
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is in the set."""
+
+    @abc.abstractmethod
+    def extended(self, states: Y) -> "AbstractDomain":
+        """The set with `states`, which are stacked along a leading axis."""
+
+    @abc.abstractmethod
+    def can_include(self, y: Y) -> Bool[Array, ""]:
+        """Whether `extended` would include `y`."""
+
+
+@final
+class Box(AbstractDomain):
+    r"""The states between two corners, $l \le y \le u$ in every component.
+
+    The `domain` of a flow map: the option `outside` of [`diffrax_conserve.DeepONetSolver`][] says
+    what happens to a step that starts outside it. Any Module with a method `contains(y)`, which
+    returns a boolean scalar, can take its place.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        box = dfc.learned.Box.around(states)
+        assert box.contains(states[0])
+        assert not box.contains(100 * states[0])
+        ```
+    """
+
+    lower: PyTree[Real[Array, "..."]]
+    upper: PyTree[Real[Array, "..."]]
+
+    def __init__(
+        self, lower: PyTree[Shaped[ArrayLike, "..."]], upper: PyTree[Shaped[ArrayLike, "..."]]
+    ):
+        self.lower = as_state(lower)
+        self.upper = as_state(upper)
+
+    def __check_init__(self):
+        lower, upper = jtu.tree_structure(self.lower), jtu.tree_structure(self.upper)
+        shapes = [[jnp.shape(x) for x in jtu.tree_leaves(t)] for t in (self.lower, self.upper)]
+        if lower != upper or shapes[0] != shapes[1]:
+            raise ValueError(
+                f"`lower` has the structure {lower} with shapes {shapes[0]}, but `upper` has "
+                f"{upper} with {shapes[1]}. Both must be those of a state."
+            )
+
+    @classmethod
+    def around(cls, states: Y) -> "Box":
+        """The smallest box around `states`, which are stacked along a leading axis."""
+        states = as_state(states)
+        if any(jnp.ndim(x) == 0 or jnp.shape(x)[0] == 0 for x in jtu.tree_leaves(states)):
+            raise ValueError(
+                "`states` must be at least one state, stacked along a leading axis. For a single "
+                "state write `jax.tree.map(lambda x: x[None], y0)`."
+            )
+        lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
+        return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
+
+    def extended(self, states: Y) -> "Box":
+        """The smallest box around this one and `states`, which are stacked along a leading axis."""
+        other = Box.around(states)
+
+        def corner(choose: Callable[..., Array], a: Y, b: Y) -> Y:
+            return jtu.tree_map(lambda x, y: choose(x, y.astype(x.dtype)), a, b)
+
+        lower = corner(jnp.minimum, self.lower, other.lower)
+        return Box(lower, corner(jnp.maximum, self.upper, other.upper))
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is in the box, its boundary included. NaN is not."""
+        if jtu.tree_structure(y) != jtu.tree_structure(self.lower):
+            raise ValueError(
+                f"The box is for states of the structure {jtu.tree_structure(self.lower)}, but was "
+                f"given one of {jtu.tree_structure(y)}."
+            )
+        inside = jtu.tree_map(
+            lambda x, a, b: jnp.all((a <= x) & (x <= b)), y, self.lower, self.upper
+        )
+        return jnp.all(jnp.stack(jtu.tree_leaves(inside)))
+
+    def can_include(self, y: Y) -> Bool[Array, ""]:
+        del y
+        return jnp.asarray(True)
+
+
+Box.__init__.__doc__ = """**Arguments:**
+
+- `lower`, `upper`: the corners, two PyTrees like a state.
+
+**Raises:**
+
+`ValueError` or `TypeError` if they are not alike, or not real.
+"""
+
+
+@final
+class FramedBox(AbstractDomain):
+    """The states whose frames are like those of the states that a flow map was made with.
+
+    The inputs of a frame are in a box, and its clock is at most as fast as the fastest one.
+    """
+
+    make: MakeFrame
+    box: Box  # of pairs of the inputs and the clock
+    example: Y  # one of the states, for their structure
+
+    @classmethod
+    def around(cls, make: MakeFrame, states: Y) -> "FramedBox":
+        """The smallest one around `states`, which are stacked along a leading axis."""
+        frames = jax.vmap(lambda y: frame_at(make, y))(states)
+        clocks = jnp.broadcast_to(frames.clock, frames.inputs.shape[:1])
+        box = Box.around((frames.inputs, clocks))
+        # A symmetry leaves the inputs of a state unchanged only up to roundoff.
+        slack = jtu.tree_map(lambda a, b: _SLACK * (b - a), box.lower, box.upper)
+        lower = (box.lower[0] - slack[0], jnp.zeros_like(box.lower[1]))
+        upper = (box.upper[0] + slack[0], box.upper[1] + slack[1])
+        example = jtu.tree_map(lambda x: x[0], as_state(states))
+        return cls(make, Box(lower, upper), example)
+
+    def extended(self, states: Y) -> "FramedBox":
+        """The same with the inputs of `states`.
+
+        The largest clock stays: the network measures its time by it.
+        """
+        seen = FramedBox.around(self.make, states).box
+        inputs = self.box.lower[0], self.box.upper[0]
+        around = Box(*inputs).extended(jnp.stack([seen.lower[0], seen.upper[0]]))
+        box = Box((around.lower, self.box.lower[1]), (around.upper, self.box.upper[1]))
+        return FramedBox(self.make, box, self.example)
+
+    @property
+    def fastest(self) -> Array:
+        """The largest clock."""
+        return self.box.upper[1]
+
+    def frame(self, y: Y) -> Frame:
+        """The frame of `y`."""
+        return frame_at(self.make, y)
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is one of these states, up to symmetries."""
+        frame = self.frame(y)
+        return self.box.contains((frame.inputs, jnp.asarray(frame.clock)))
+
+    def can_include(self, y: Y) -> Bool[Array, ""]:
+        return jnp.asarray(self.frame(y).clock <= self.fastest)
+
+
+_SLACK = 1e-6

@@ -1,0 +1,55 @@
+"""States as vectors: what a network reads and writes."""
+
+import math
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, Float
+
+from ..._custom_types import Y
+from ..._tree import working_dtype
+
+
+def flatten(y: Y) -> Float[Array, " n"]:
+    """All components of `y` in one vector, of the dtype that holds every leaf."""
+    dtype = working_dtype(y)
+    leaves = [jnp.asarray(x).astype(dtype).reshape(-1) for x in jtu.tree_leaves(y)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def unflatten(vector: Float[Array, " n"], like: Y) -> Y:
+    """The components of `vector` in the structure, shapes and dtypes of `like`."""
+    leaves, treedef = jtu.tree_flatten(like)
+    out, start = [], 0
+    for leaf in leaves:
+        shape = jnp.shape(leaf)
+        stop = start + math.prod(shape)
+        out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
+        start = stop
+    return jtu.tree_unflatten(treedef, out)
+
+
+def as_state(y: Y) -> Y:
+    """`y` with arrays as leaves; raises unless they are real and floating-point."""
+    leaves = jtu.tree_leaves(y)
+    if not leaves:
+        raise ValueError("The state has no arrays: there is nothing to learn.")
+    for leaf in leaves:
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating):
+            raise TypeError(
+                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but a network needs real "
+                "states. Split a complex leaf into its real and its imaginary part."
+            )
+    return jtu.tree_map(_floating, y)
+
+
+def _floating(leaf: ArrayLike) -> Array:
+    """`leaf` as an array of a definite floating-point type."""
+    dtype = jnp.result_type(leaf)
+    return jnp.asarray(leaf, dtype if jnp.issubdtype(dtype, jnp.floating) else float)
+
+
+def stacked_vectors(ys: Y) -> Float[Array, "count n"]:
+    """States that are stacked along a leading axis, as vectors."""
+    leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(ys)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)

@@ -1,0 +1,177 @@
+"""Flow maps: what solvers, sweeps, policies and `fit` ask of one."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from ..._custom_types import RealScalarLike, Y
+from .flat import stacked_vectors
+from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
+
+
+class AbstractFlowMap(AbstractTrainable):
+    r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
+
+    [`diffrax_conserve.DeepONet`][] is one. [`diffrax_conserve.learned.FlowMap`][] makes one of any
+    function; solvers and [`diffrax_conserve.fit`][] do that by themselves with a Module that is
+    called as `(y0, h) -> y` and has an attribute `max_step`, and perhaps `order` and `domain`.
+
+    **Attributes:**
+
+    - `max_step`: the longest step.
+    - `order`: the error of one step falls as $h^{q+1}$ with $q$ = `order`, whatever the weights.
+    - `domain`: the states that the flow map has learned, with a method `contains(y)`; or `None`.
+    - `layer`: the conservative layer that the output has passed, or `None`.
+    """
+
+    # `Any`, so that a subclass may be more precise, or have a property.
+    max_step: eqx.AbstractVar[Any]
+    order: eqx.AbstractVar[int]
+    domain: eqx.AbstractVar[Any]
+
+    @abc.abstractmethod
+    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`.
+
+        A training passes `schedule`, the iterations of the conservative layer and the weight of
+        the last one.
+        """
+
+    @abc.abstractmethod
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
+        """A rate of change of the solution through `y0`, in the units that the loss is measured
+        in."""
+
+    def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
+        times_key, states_key = jr.split(key)
+        assert sample is not None
+        y0s = jax.vmap(sample)(jr.split(states_key, count))
+        return Points(times(times_key, count, 0.0, float(self.max_step)), y0s)
+
+    def states(
+        self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
+    ) -> PyTree[Array]:
+        # The schedule is not batched: iterations that it leaves out are not computed.
+        return jax.vmap(self, in_axes=(0, 0, None))(points.y0s, ts, schedule)
+
+    def starts(self, points: Points) -> Points:
+        return Points(jnp.zeros_like(points.ts), points.y0s)
+
+    def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
+        return jax.vmap(self.measure)(points.y0s, stacked_vectors(rates))
+
+
+@final
+class FlowMap(AbstractFlowMap):
+    """A flow map made of a function `(y0, h) -> y`.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        decay = dfc.learned.FlowMap(lambda y0, h: y0 * jnp.exp(-h), 0.5)
+        solver = dfc.learned.FlowMapSolver(decay)
+        ```
+    """
+
+    function: Callable[..., Any]
+    max_step: RealScalarLike
+    order: int = eqx.field(static=True)
+    domain: Any
+
+    # Written out, because type checkers take the abstract fields of the base class for arguments.
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        max_step: RealScalarLike,
+        *,
+        order: int = 0,
+        domain: Any = None,
+    ):
+        self.function = function
+        self.max_step = max_step
+        self.order = order
+        self.domain = domain
+
+    def __check_init__(self):
+        if not callable(self.function):
+            raise TypeError(f"`function` is {self.function!r}, not a function `(y0, h) -> y`.")
+        if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
+            raise TypeError(
+                f"The `domain` of the flow map is {self.domain!r}, which has no method "
+                "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
+                "method."
+            )
+
+    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`."""
+        del schedule
+        return self.function(y0, h)
+
+    @property
+    def layer(self) -> None:
+        """A function has no separate conservative layer."""
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
+        del y0
+        return rate
+
+    def weights(self) -> Any:
+        return self.function
+
+    def linear_weights(self) -> tuple[()]:
+        return ()
+
+
+FlowMap.__init__.__doc__ = r"""**Arguments:**
+
+- `function`: called as `(y0, h) -> y`. [`diffrax_conserve.fit`][] trains all its arrays.
+- `max_step`: the longest step.
+- `order`: its error in one step falls as $h^{q+1}$ with $q$ = `order`. Default: 0.
+- `domain`: the states that it is for: a [`diffrax_conserve.learned.Box`][], or a Module with a
+    method `contains(y)`.
+
+**Raises:**
+
+`TypeError` if `function` or `domain` is not that.
+"""
+
+
+def as_flow_map(model: Any) -> AbstractFlowMap:
+    """`model`, or the flow map of a function with an attribute `max_step`."""
+    if isinstance(model, AbstractFlowMap):
+        return model
+    if not (callable(model) and hasattr(model, "max_step")):
+        raise TypeError(
+            f"`flow_map` is {model!r}, which is no flow map. Pass a `DeepONet`, a Module that is "
+            "called as `(y0, h) -> y` and has an attribute `max_step`, the longest step, or "
+            "`diffrax_conserve.learned.FlowMap(function, max_step)`."
+        )
+    order, domain = getattr(model, "order", 0), getattr(model, "domain", None)
+    longest = model.max_step  # pyright: ignore[reportFunctionMemberAccess]
+    return FlowMap(model, longest, order=order, domain=domain)
+
+
+def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
+    """The inverse of `as_flow_map`: of the kind of `model`, with the domain of `flow_map`."""
+    if isinstance(model, AbstractFlowMap):
+        return flow_map
+    assert isinstance(flow_map, FlowMap)
+    if flow_map.domain is None:
+        return flow_map.function
+    is_missing = lambda x: x is None  # noqa: E731
+    return eqx.tree_at(lambda m: m.domain, flow_map.function, flow_map.domain, is_leaf=is_missing)
+
+
+def has_arrays(tree: Any) -> bool:
+    """Whether there is a floating-point array in `tree`, which a training could change."""
+    return any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(tree))

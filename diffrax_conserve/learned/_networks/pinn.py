@@ -1,0 +1,219 @@
+"""A physics-informed network: one solution, as a function of time."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from ..._custom_types import IntScalarLike, RealScalarLike, Y
+from ..._tree import working_dtype
+from .cores import Sizes
+from .flat import as_state, flatten, stacked_vectors, unflatten
+from .layer import ConservativeLayer
+from .mlp import MLP, Activation, check_sizes, find_activation
+from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
+
+
+@final
+class Window(AbstractTrainable):
+    """A network for the solution through one state, from the time `start` on, for a time `length`.
+
+    A `PINN` is one of these, or several that follow each other.
+    """
+
+    net: MLP
+    layer: ConservativeLayer | None
+    y0: Y
+    start: Float[Array, ""]
+    length: float = eqx.field(static=True)
+    scale: Float[Array, " n"]
+    normalise: bool = eqx.field(static=True)
+
+    def __call__(self, t: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        candidate = self.candidate(t)
+        if self.layer is None:
+            return candidate
+        values = self.layer.values(self.start, self.y0)
+        return self.layer(candidate, values, t, self.radius(), schedule)
+
+    def candidate(self, t: RealScalarLike) -> Y:
+        """The state at time `t` before the conservative layer."""
+        t = jnp.asarray(t).astype(self.scale.dtype)
+        fraction = (t - self.start) / self.length
+        out = self.net((2 * fraction - 1 if self.normalise else t)[None])
+        return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
+
+    def radius(self) -> Float[Array, ""]:
+        """How far the conservative layer may move a state in one iteration."""
+        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
+
+    def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
+        del sample
+        times_key, _ = jr.split(key)
+        return Points(self.start + times(times_key, count, 0.0, self.length), None)
+
+    def states(
+        self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
+    ) -> PyTree[Array]:
+        del points
+        # The schedule is not batched: iterations that it leaves out are not computed.
+        return jax.vmap(self, in_axes=(0, None))(ts, schedule)
+
+    def starts(self, points: Points) -> Points:
+        del points
+        return Points(self.start[None], jtu.tree_map(lambda x: x[None], self.y0))
+
+    def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
+        del points
+        return stacked_vectors(rates)
+
+    def weights(self) -> MLP:
+        return self.net
+
+    def linear_weights(self) -> tuple[Any, ...]:
+        # After a conservative layer the output is not linear in them.
+        return () if self.layer is not None else (self.net.weights[-1], self.net.biases[-1])
+
+
+@final
+class PINN(eqx.Module):
+    r"""A network for the solution through one initial state, on one interval of time.
+
+    $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
+
+    with a fully connected network $N$, so that $u(t_0) = u_0$ whatever the weights. With a `layer`,
+    the output is moved to the manifold of the values at $(t_0, u_0)$.
+
+    A long interval is cut into `windows` of equal length, each with a network of its own that
+    starts where the last one ends: small networks on short intervals are far easier to train than a
+    large one on a long interval.
+
+    Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.PINNSolver`][].
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+        import jax.numpy as jnp
+
+        y0 = {"position": jnp.array([1.0, 0.0]), "charge": jnp.array(2.0)}
+        pinn = dfc.PINN(y0, 0.0, 3.0, key=jax.random.key(0))
+        pinn(1.5)  # a dictionary like y0
+        ```
+
+    ??? cite "Reference"
+
+        M. Raissi, P. Perdikaris and G. E. Karniadakis, J. Comput. Phys. 378 (2019); the ansatz is
+        that of I. E. Lagaris, A. Likas and D. I. Fotiadis, IEEE Trans. Neural Networks 9 (1998).
+    """
+
+    nets: MLP  # every array has a leading axis of the windows, here and in `y0s`
+    layer: ConservativeLayer | None
+    y0s: Y
+    t0: float = eqx.field(static=True)
+    t1: float = eqx.field(static=True)
+    sizes: Sizes = eqx.field(static=True)
+    scale: Float[Array, " n"]
+    normalise: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        y0: Y,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        *,
+        key: PRNGKeyArray,
+        windows: int = 1,
+        width: int = 40,
+        depth: int = 4,
+        activation: str | Activation = "tanh",
+        slope: float | None = None,
+        normalise: bool = True,
+        layer: ConservativeLayer | None = None,
+    ):
+        check_sizes(width=width, depth=depth, windows=windows)
+        if not t0 < t1:
+            raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
+        if slope is not None and not slope > 0:
+            raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
+        y0 = as_state(y0)
+        dtype = working_dtype(y0)
+        self.t0, self.t1 = float(t0), float(t1)
+        self.sizes = Sizes(width, depth, 0, find_activation(activation))
+        n = flatten(y0).size
+
+        def net(key: PRNGKeyArray) -> MLP:
+            return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
+
+        self.nets = eqx.filter_vmap(net)(key[None] if windows == 1 else jr.split(key, windows))
+        self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (windows, *x.shape)), y0)
+        self.layer = layer
+        self.normalise = normalise
+        self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
+
+    def __call__(self, t: RealScalarLike) -> Y:
+        """The state at time `t`."""
+        return self.window(self._index(t))(t)
+
+    @property
+    def y0(self) -> Y:
+        """The initial state."""
+        return jtu.tree_map(lambda x: x[0], self.y0s)
+
+    @property
+    def windows(self) -> int:
+        """The number of windows."""
+        return jtu.tree_leaves(self.y0s)[0].shape[0]
+
+    def window(self, index: IntScalarLike) -> Window:
+        """The network on the interval of this number."""
+        net, y0 = jtu.tree_map(lambda x: x[index], (self.nets, self.y0s))
+        length = (self.t1 - self.t0) / self.windows
+        start = jnp.asarray(self.t0 + length * index, self.scale.dtype)
+        return Window(
+            net=net,
+            layer=self.layer,
+            y0=y0,
+            start=start,
+            length=length,
+            scale=self.scale,
+            normalise=self.normalise,
+        )
+
+    def _index(self, t: RealScalarLike) -> IntScalarLike:
+        if self.windows == 1:
+            return 0
+        position = (jnp.asarray(t) - self.t0) / (self.t1 - self.t0) * self.windows
+        return jnp.clip(jnp.floor(position).astype(int), 0, self.windows - 1)
+
+
+PINN.__init__.__doc__ = r"""**Arguments:**
+
+- `y0`: the initial state $u_0$, any PyTree of real arrays.
+- `t0`, `t1`: the interval of time.
+- `key`: a random key, for the initial weights.
+- `windows`: into how many equal intervals it is cut, each with a network of its own.
+- `width`, `depth`: units in each hidden layer, and hidden layers.
+- `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
+    (which [`diffrax_conserve.save`][] cannot write).
+- `slope`: the standard deviation of the initial slopes of the first layer, whose units are then
+    centred everywhere in the interval. Default: Glorot's initial weights, with which all units are
+    nearly straight lines in time, and so nearly the same. Levenberg-Marquardt needs about 2.
+- `normalise`: whether $N$ sees time scaled to $[-1, 1]$ and $S$ holds the largest component of each
+    leaf of $u_0$. Otherwise $N$ sees $t$, and $S = 1$.
+- `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
+
+**Raises:**
+
+`ValueError` or `TypeError` if a size or the interval has a wrong value.
+"""
+
+
+def _magnitude(leaf: Array) -> Array:
+    largest = jnp.max(jnp.abs(leaf)) if leaf.size else jnp.ones((), leaf.dtype)
+    return jnp.broadcast_to(jnp.where(largest > 0, largest, 1), leaf.shape)

@@ -1,0 +1,100 @@
+"""A long step of a flow map made of several short ones."""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from ..._custom_types import RealScalarLike, Y
+from .flow_map import AbstractFlowMap, as_flow_map
+from .mlp import check_sizes
+from .trainable import LayerSchedule
+
+
+@final
+class Repeated(AbstractFlowMap):
+    r"""The flow map of steps that are `count` times as long: $u(h) = \Phi_{h/k} \circ \dots \circ
+    \Phi_{h/k}(u_0)$.
+
+    A flow is easier to learn over shorter steps. Where the longest is fixed from outside, learn a
+    fraction of it and repeat that. Train the inner flow map; the repeated one has no weights of its
+    own. It costs as much as `count` steps.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        half = dfc.DeepONet(states, 0.125, key=jax.random.key(1))
+        flow_map = dfc.learned.Repeated(half, 2)
+        assert flow_map.max_step == 0.25
+        ```
+    """
+
+    flow_map: AbstractFlowMap
+    count: int = eqx.field(static=True)
+
+    # Written out for the same reason as in `FlowMap`.
+    def __init__(self, flow_map: AbstractFlowMap | Callable[..., Any], count: int):
+        self.flow_map = as_flow_map(flow_map)
+        self.count = count
+
+    def __check_init__(self):
+        check_sizes(count=self.count)
+
+    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`."""
+        y0 = jtu.tree_map(jnp.asarray, y0)
+        each = jnp.asarray(h) / self.count
+
+        def step(y: Y, _: None) -> tuple[Y, None]:
+            return self.flow_map(y, each, schedule), None
+
+        return lax.scan(step, y0, length=self.count)[0]
+
+    @property
+    def max_step(self) -> RealScalarLike:
+        """The longest step."""
+        return self.count * self.flow_map.max_step
+
+    @property
+    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the inner flow map."""
+        return self.flow_map.order
+
+    @property
+    def domain(self) -> Any:
+        """That of the inner flow map, or `None`. Only the start of a step is compared with it."""
+        return self.flow_map.domain
+
+    @property
+    def layer(self) -> None:
+        """None: the inner flow map applies its own in each step."""
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.flow_map.measure(y0, rate)
+
+    def weights(self) -> tuple[()]:
+        return ()
+
+    def linear_weights(self) -> tuple[()]:
+        return ()
+
+
+Repeated.__init__.__doc__ = r"""**Arguments:**
+
+- `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that
+    [`diffrax_conserve.DeepONetSolver`][] takes.
+- `count`: how many of its steps make one.
+
+**Raises:**
+
+`ValueError` or `TypeError` if they are not that.
+"""

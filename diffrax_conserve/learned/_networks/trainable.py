@@ -1,0 +1,56 @@
+"""What `fit` trains: a flow map, or one window of a PINN."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from ..._custom_types import Y
+
+# `(key, count, first, last)` to times.
+Times = Callable[[PRNGKeyArray, int, float, float], Float[Array, " points"]]
+# A random key to an initial state.
+Sampler = Callable[[PRNGKeyArray], Any]
+# The iterations of a conservative layer and the weight of the last one, `(p, s)`.
+LayerSchedule = tuple[Int[Array, ""], Float[Array, ""]]
+
+
+class Points(NamedTuple):
+    """Collocation points: times, and for a flow map the initial state of each."""
+
+    ts: Float[Array, " points"]
+    y0s: Any  # with a leading axis; None for a window
+
+
+class AbstractTrainable(eqx.Module):
+    """A network whose states are functions of time, which `fit` makes solutions."""
+
+    layer: eqx.AbstractVar[Any]  # a `ConservativeLayer`, or None
+
+    @abc.abstractmethod
+    def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
+        """`count` random collocation points."""
+
+    @abc.abstractmethod
+    def states(
+        self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
+    ) -> PyTree[Array]:
+        """The states at `ts` of the solutions to which `points` belong, stacked."""
+
+    @abc.abstractmethod
+    def starts(self, points: Points) -> Points:
+        """The initial times and states of these solutions."""
+
+    @abc.abstractmethod
+    def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
+        """Rates of change of the states as vectors, in the units that the loss is measured in."""
+
+    @abc.abstractmethod
+    def weights(self) -> Any:
+        """The part of the network that is trained."""
+
+    @abc.abstractmethod
+    def linear_weights(self) -> Any:
+        """The weights that the output is linear in, in a tuple, which may be empty."""

@@ -1,0 +1,14 @@
+from .checks import check_output as check_output
+from .flow_map_solver import DeepONetSolver as DeepONetSolver
+from .flow_map_solver import FlowMapSolver as FlowMapSolver
+from .pinn_solver import PINNSolver as PINNSolver
+from .policies import AbstractPolicy as AbstractPolicy
+from .policies import DomainStatistics as DomainStatistics
+from .policies import Refuse as Refuse
+from .policies import Replace as Replace
+from .policies import Report as Report
+from .policies import domain_statistics as domain_statistics
+from .random_features import RandomFeatureSolver as RandomFeatureSolver
+from .sweeps import AbstractSweep as AbstractSweep
+from .sweeps import NewtonSweep as NewtonSweep
+from .sweeps import Picard as Picard

@@ -1,0 +1,114 @@
+"""Dense output for solvers that can be evaluated anywhere within a step."""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, final
+
+import diffrax as dfx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ..._custom_types import RealScalarLike, Y
+from ..._tree import tree_sub
+
+
+@final
+class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
+    """The polynomial through the states at the Chebyshev points of a step, as a Chebyshev series.
+
+    A series, not the barycentric formula: it has no division by zero at the points, so its time
+    derivative exists everywhere, as the root finder of an event needs it.
+    """
+
+    t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    coefficients: PyTree[Array]  # each leaf with a leading axis
+
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> PyTree[Array]:
+        if t1 is not None:
+            return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
+        length = self.t1 - self.t0
+        # A step of length zero, as at the padding of a solution, has one state.
+        nonzero = length != 0
+        x = jnp.where(nonzero, 2 * (t0 - self.t0) / jnp.where(nonzero, length, 1) - 1, -1)
+        return jtu.tree_map(lambda c: _clenshaw(c, x.astype(c.dtype)), self.coefficients)
+
+
+def series(states: Callable[[Array], Y], count: int, dtype: Any) -> PyTree[Array]:
+    """The coefficients for `states`, a function of the fraction of the step."""
+    return coefficients(jax.vmap(states)(fractions(count, dtype)))
+
+
+def fractions(count: int, dtype: Any) -> Array:
+    """The Chebyshev points of the second kind on [0, 1]."""
+    return jnp.asarray(chebyshev_points(count), dtype)
+
+
+def coefficients(values: PyTree[Array]) -> PyTree[Array]:
+    """Those of the Chebyshev series through `values` at all points, stacked along an axis."""
+    return jtu.tree_map(lambda v: _apply(to_coefficients(v.shape[0]), v), values)
+
+
+def integrals(values: Array) -> Array:
+    """The integrals from the first point to each, of the polynomial through `values`."""
+    return _apply(_integration(values.shape[0]), values)
+
+
+def at(where: tuple[float, ...], values: Array) -> Array:
+    """The polynomial through `values` at the fractions `where`."""
+    return _apply(_evaluation(values.shape[0], where), values)
+
+
+def _apply(matrix: np.ndarray, values: Array) -> Array:
+    weights = jnp.asarray(matrix, values.dtype)
+    return jnp.tensordot(weights, values, axes=1, precision=lax.Precision.HIGHEST)
+
+
+@ft.cache
+def chebyshev_points(count: int) -> np.ndarray:
+    n = count - 1
+    return np.sin(np.pi * np.arange(count) / (2 * n)) ** 2  # (1 - cos(pi k / n)) / 2
+
+
+@ft.cache
+def to_coefficients(count: int) -> np.ndarray:
+    """The matrix from values at the points to the coefficients of the series."""
+    n = count - 1
+    index = np.arange(count)
+    # T_j at -cos(pi k / n); the sums of a type-I discrete cosine transform have halved ends.
+    cosines = np.cos(np.pi * np.outer(index, n - index) / n)
+    halves = np.where((index == 0) | (index == n), 0.5, 1.0)
+    return 2 / n * halves[:, None] * cosines * halves[None, :]
+
+
+@ft.cache
+def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
+    x = 2 * np.asarray(where) - 1
+    return np.polynomial.chebyshev.chebvander(x, count - 1) @ to_coefficients(count)
+
+
+@ft.cache
+def _integration(count: int) -> np.ndarray:
+    """Column `j` is for the polynomial that is one at point `j` and zero at the others."""
+    x = 2 * chebyshev_points(count) - 1
+    # In `x` the interval is twice as long.
+    antiderivative = np.polynomial.chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
+    basis = np.polynomial.chebyshev.chebvander(x, count)
+    matrix = basis @ antiderivative @ to_coefficients(count)
+    matrix[0] = 0.0  # exactly
+    return matrix
+
+
+def _clenshaw(coefficients: Array, x: Array) -> Array:
+    """`Σ_j c_j T_j(x)`."""
+    zero = jnp.zeros_like(coefficients[0])
+    b1, b2 = zero, zero
+    for c in coefficients[:0:-1]:
+        b1, b2 = c + 2 * x * b1 - b2, b1
+    return coefficients[0] + x * b1 - b2

@@ -1,0 +1,254 @@
+"""A learned flow map as a diffrax solver."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._networks import AbstractFlowMap, as_flow_map
+from .chebyshev import ChebyshevInterpolation, coefficients, fractions
+from .checks import check_learned_terms, check_nodes, check_output
+from .error_estimate import estimate
+from .policies import (
+    AbstractPolicy,
+    DomainStatistics,
+    StepInputs,
+    StepResult,
+    as_policy,
+    check_policy,
+    small_enough,
+)
+from .step_length import refuse_backwards, reject_too_long
+from .sweeps import AbstractSweep, Increment, Path, Picard, correct, increment
+
+
+@final
+class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
+    r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
+
+    Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
+    controller (give that `dtmax=flow_map.max_step`, so that it does not try) and fails with fixed
+    steps; a solve backwards in time is refused at run time.
+
+    **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
+    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
+
+    $$u \leftarrow y_n + h \int f(t, u, args) \quad \text{(Picard)}$$
+
+    with the vector field of the term, at all points in parallel, or by as many Newton iterations
+    for the fixed point, each with a dense linear system of the size of the state times `nodes`.
+    A Picard sweep multiplies the error by about $h \|\partial f\|$ over the number of the sweep
+    and makes a flow map of order $q$ a method of order $q + k$; a Newton iteration squares it.
+
+    **Error estimate.** Without sweeps it is the solution of the error's own differential equation,
+    driven by the defect $u' - f(u)$: 12 states of the flow map and 28 evaluations of $f$, none of
+    which is computed with fixed steps. With sweeps it is what the last one changed, for nothing.
+    So [`diffrax.PIDController`][] can drive a learned solver. Smaller steps help if the error falls
+    with them faster than the step: with sweeps, or with a flow map of order 1 or more.
+
+    **Leaving the domain.** A flow map gives no sign that it is wrong for states that it has not
+    learned. `outside` says what happens to a step that starts outside `flow_map.domain`, or whose
+    estimated error has a component larger than `max_error`:
+
+    - `None`: nothing, the default.
+    - [`diffrax_conserve.learned.Report`][]`()`: it is counted, for
+        [`diffrax_conserve.learned.domain_statistics`][].
+    - [`diffrax_conserve.learned.Refuse`][]`()`: it is counted, and the solve fails.
+    - [`diffrax_conserve.learned.Replace`][]`(solver)`, or a diffrax solver by itself: that solver
+        takes the step, and it is counted.
+
+    Dense output follows the (corrected) path inside the step: it is the polynomial through its
+    states at the `nodes` points, which without sweeps are computed only where dense output, saved
+    times or an event ask for them. The weights are not copied.
+
+    Derivatives with respect to the initial state and the weights are those of what is computed. The
+    `args` of the solve are seen by the sweeps, the error estimate and the solver `outside`, not by
+    the flow map; inside [`diffrax_conserve.ManifoldProjection`][] by the manifold too.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+
+        system = dfc.systems.get("conservative-lorenz")
+        flow_map = dfc.load_pretrained("conservative-lorenz-standard")
+        solver = dfc.DeepONetSolver(flow_map, corrections=4)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(system.vector_field),
+            dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton()),
+            t0=0.0,
+            t1=5.0,
+            dt0=0.25,
+            y0=system.y0,
+        )
+        ```
+
+    ??? cite "Reference"
+
+        S. Wang and P. Perdikaris, "Long-time integration of parametric evolution equations with
+        physics-informed DeepONets", J. Comput. Phys. 475 (2023), for the steps; A. Dutt, L.
+        Greengard and V. Rokhlin, "Spectral deferred correction methods for ordinary differential
+        equations", BIT 40 (2000), for correction by sweeps.
+    """
+
+    flow_map: AbstractFlowMap
+    outside: AbstractPolicy | None
+    max_error: RealScalarLike | None
+    sweep: AbstractSweep
+    nodes: int = eqx.field(static=True)
+    corrections: int = eqx.field(static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
+
+    def __init__(
+        self,
+        flow_map: AbstractFlowMap | Callable[..., Any],
+        *,
+        nodes: int = 12,
+        corrections: int = 0,
+        sweep: AbstractSweep = Picard(),
+        outside: AbstractPolicy | dfx.AbstractSolver | None = None,
+        max_error: RealScalarLike | None = None,
+    ):
+        self.flow_map = as_flow_map(flow_map)
+        self.nodes = nodes
+        self.corrections = corrections
+        self.sweep = sweep
+        self.outside = as_policy(outside)
+        self.max_error = max_error
+
+    def __check_init__(self):
+        check_nodes(self.nodes)
+        check_policy(self.outside, self.max_error, self.flow_map.domain)
+        if not isinstance(self.corrections, int) or self.corrections < 0:
+            raise ValueError(
+                f"`corrections` is {self.corrections!r}, but it must be a number of sweeps: zero "
+                "or a positive integer."
+            )
+        if not isinstance(self.sweep, AbstractSweep):
+            raise TypeError(
+                f"`sweep` is {self.sweep!r}, but it must be `diffrax_conserve.learned.Picard()` or "
+                "`diffrax_conserve.learned.NewtonSweep()`."
+            )
+
+    def order(self, terms: dfx.AbstractTerm) -> int | None:
+        del terms
+        # Order 0 implies no convergence, so report `None`.
+        return self._local_order(self.corrections) - 1 or None
+
+    def error_order(self, terms: dfx.AbstractTerm) -> int:
+        del terms
+        # The change by the last sweep is the error before it.
+        return self._local_order(max(self.corrections - 1, 0))
+
+    def _local_order(self, sweeps: int) -> int:
+        """The power of the step in the error of one step after so many sweeps."""
+        power = self.flow_map.order + 1
+        for _ in range(sweeps):
+            power = self.sweep.power(power)
+        # The error of the collocation itself has this power.
+        return min(power, self.nodes + 1) if sweeps else power
+
+    def init(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+    ) -> DomainStatistics | None:
+        del args
+        check_learned_terms(terms, "FlowMapSolver")
+        check_output(self.flow_map, (y0, t1 - t0), y0, "flow_map")
+        return None if self.outside is None else DomainStatistics.zero(t0)
+
+    def step(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: DomainStatistics | None,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
+        del made_jump
+        h = refuse_backwards(jnp.asarray(t1 - t0), terms, self.flow_map.max_step)
+        step = self._learned(h, y0, increment(terms, t0, t1, y0, args))
+        if self.outside is not None and solver_state is not None:
+            inside, accurate = self._inside(y0), self._accurate(step.error)
+            solver_state = solver_state.add(t0, inside & accurate)
+            inputs = StepInputs(terms, t0, t1, y0, args)
+            step = self.outside(step, inside, accurate, inputs, self.nodes)
+        step = reject_too_long(step, h, t1, self.flow_map.max_step)
+        dense_info = dict(coefficients=step.coefficients)
+        return step.y1, step.error, dense_info, solver_state, step.result
+
+    def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
+        return terms.vf(t0, y0, args)
+
+    def _learned(self, h: Array, y0: Y, increment: Increment) -> StepResult:
+        """The step of the flow map, corrected."""
+        _, unravel = ravel_pytree(y0)
+        path = self._path(h, y0)
+        if self.corrections == 0:
+            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.flow_map(y0, h), y0)
+            error = estimate(increment, path)
+        else:
+            path, error = correct(self.sweep, increment, path, self.corrections)
+            y1 = unravel(path[-1])
+        states = jax.vmap(unravel)(path)
+        return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
+
+    def _path(self, h: Array, y0: Y) -> Path:
+        """The states of the flow map at the nodes; the first is the initial state."""
+        start, _ = ravel_pytree(y0)
+
+        def state(fraction: Array) -> Array:
+            return ravel_pytree(self.flow_map(y0, fraction * h))[0].astype(start.dtype)
+
+        rows = jax.vmap(state)(fractions(self.nodes, h.dtype)[1:])
+        return jnp.concatenate([start[None], rows])
+
+    def _inside(self, y0: Y) -> Array:
+        domain = self.flow_map.domain
+        return jnp.asarray(True if domain is None else domain.contains(y0))
+
+    def _accurate(self, error: Y) -> Array:
+        return jnp.asarray(True if self.max_error is None else small_enough(error, self.max_error))
+
+
+FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
+
+- `flow_map`: a [`diffrax_conserve.DeepONet`][], any other
+    [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module that is called as `(y0, h) -> y` and
+    has an attribute `max_step`. Such a Module may have an integer `order` $q$ (its error in one
+    step falls as $h^{q+1}$; default 0) and a `domain` with a method `contains(y)`, such as a
+    [`diffrax_conserve.learned.Box`][].
+- `nodes`: the number of Chebyshev points for sweeps and dense output.
+- `corrections`: the number $k$ of correction sweeps.
+- `sweep`: [`diffrax_conserve.learned.Picard`][]`()` or
+    [`diffrax_conserve.learned.NewtonSweep`][]`()`.
+- `outside`: the policy for steps outside the domain.
+- `max_error`: the largest error of a component, in its own units, that makes a step count as
+    inside. Default: only the domain decides.
+
+**Raises:**
+
+`TypeError` or `ValueError` if the flow map cannot be called so or returns another structure than
+the state's, if a number has a wrong value, or if `outside` asks about a domain that the flow
+map does not have. At run time an error in a solve backwards in time, and a failed result for a step
+that is too long.
+"""
+
+# The name of the solver for its usual flow map.
+DeepONetSolver = FlowMapSolver

@@ -1,0 +1,143 @@
+"""The compiled part of a training: from the state after some epochs to that after more."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._tree import tree_all_finite
+from .._networks import LayerSchedule, Points
+from .defect import squared_norms
+from .objective import Carry, Objective
+from .pool import Pool, moved
+from .second_order import LeastSquares, SecondOrder
+
+
+def advance(
+    objective: Objective, carry: Carry, start: Int[Array, ""], stop: Int[Array, ""]
+) -> tuple[Carry, Float[Array, ""]]:
+    """The epochs from `start` up to `stop`, and a comparison with the best model so far.
+
+    Both may be traced, so that all rounds share one compilation.
+    """
+    carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
+    criterion, best = _compared(objective, carry)
+    better = criterion < best
+    carry = carry._replace(
+        best_weights=_where(better, carry.weights, carry.best_weights),
+        best_domain=_where(better, carry.domain, carry.best_domain),
+        best=jnp.where(better, criterion, best),
+        best_epoch=jnp.where(better, stop, carry.best_epoch),
+    )
+    return carry, criterion
+
+
+def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The criterion of the model, and that of the best one so far."""
+    if not isinstance(objective.sample, Pool):
+        return objective.criterion(carry.weights, objective.first_points), carry.best
+    # The first states are not those that it goes to. With `refresh=1` neither model has been
+    # trained on those of the next epoch.
+    best = objective.criterion(carry.best_weights, carry.points)
+    best = jnp.where(jnp.isfinite(carry.best), best, jnp.inf).astype(carry.best.dtype)
+    return objective.criterion(carry.weights, carry.points), best
+
+
+def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
+    """One update, and the points for the next one."""
+    schedule = objective.schedule(epoch)
+    update = _by_least_squares if isinstance(objective.optimiser, SecondOrder) else _by_gradient
+    weights, optimiser_state, loss = update(objective, carry, schedule, epoch)
+    finite = jnp.isfinite(loss) & tree_all_finite(weights)
+    # Skipping the update is not enough: the same points would give the same result in the next
+    # epoch. So continue from the best model.
+    fresh = objective.optimiser.init(carry.best_weights)
+    carry = carry._replace(
+        weights=_where(finite, weights, carry.best_weights),
+        optimiser_state=_where(finite, optimiser_state, fresh),
+        domain=_seen(objective, carry, epoch),
+        skipped=carry.skipped + jnp.where(finite, 0, 1),
+        losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
+    )
+    return carry._replace(points=_refreshed(objective, carry, epoch + 1))
+
+
+def _by_gradient(
+    objective: Objective, carry: Carry, schedule: LayerSchedule, epoch: Array
+) -> tuple[Any, Any, Float[Array, ""]]:
+    del epoch
+    loss, gradient = eqx.filter_value_and_grad(objective.loss)(
+        carry.weights, carry.points, schedule
+    )
+    assert not isinstance(objective.optimiser, SecondOrder)
+    updates, state = objective.optimiser.update(gradient, carry.optimiser_state, carry.weights)
+    return eqx.apply_updates(carry.weights, updates), state, loss
+
+
+def _by_least_squares(
+    objective: Objective, carry: Carry, schedule: LayerSchedule, epoch: Array
+) -> tuple[Any, Any, Float[Array, ""]]:
+    """The same by a second-order method, for which the weights are one vector."""
+    assert isinstance(objective.optimiser, SecondOrder)
+    vector, restore = ravel_pytree(carry.weights)
+    points = carry.points
+
+    def at_one(vector: Array, point: Points) -> Array:
+        single = jtu.tree_map(lambda x: x[None], point)
+        return objective.defects(restore(vector), single, schedule)[0]
+
+    least_squares = LeastSquares(
+        defects=lambda v: objective.defects(restore(v), points, schedule),
+        jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
+        loss=objective.recipe.loss,
+        typical=objective.typical,
+    )
+    fraction = epoch / objective.recipe.epochs
+    vector, state, loss = objective.optimiser.update(
+        least_squares, vector, carry.optimiser_state, fraction, objective.linear
+    )
+    return restore(vector), state, loss
+
+
+def _refreshed(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
+    """The points for that epoch."""
+    if objective.recipe.refresh is None:
+        return carry.points
+    due = epoch % objective.recipe.refresh == 0
+    return lax.cond(due, lambda: _anew(objective, carry, epoch), lambda: carry.points)
+
+
+def _anew(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
+    """Other points; the states of a pool go where the network takes them."""
+    recipe, sample = objective.recipe, objective.sample
+    key = jr.fold_in(objective.key, epoch)
+    points = objective.static.draw(recipe.times, sample, recipe.points, key)
+    if not isinstance(sample, Pool):
+        return points
+
+    def squares(steps: Points) -> Float[Array, " points"]:
+        return squared_norms(objective.defects(carry.weights, steps, objective.complete()))
+
+    model = eqx.combine(carry.weights, objective.static)
+    old, new, key = carry.points.y0s, points.y0s, jr.fold_in(key, 0)
+    y0s = moved(sample, model, objective.args, squares, objective.typical, old, new, key)
+    return points._replace(y0s=y0s)
+
+
+def _seen(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Any:
+    """The domain, extended by the states of a pool."""
+    if carry.domain is None:
+        return None
+    # Before that the network may have gone where no solution does.
+    late = 2 * epoch >= objective.recipe.epochs
+    return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
+
+
+def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
+    return jtu.tree_map(lambda x, y: jnp.where(condition, x, y), a, b)

@@ -1,0 +1,156 @@
+"""Initial states that follow the flow map while it is trained."""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..._custom_types import Args, Manifold, RealScalarLike, Y
+from ..._manifold import check_manifold, conserved_values
+from ..._projection import project
+from ..._tree import tree_all_finite
+from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
+
+# From steps, an initial state and a length each, to the squared norms of the defects at their ends.
+Squares = Callable[[Points], Float[Array, " points"]]
+
+
+@final
+class Pool(eqx.Module):
+    r"""Initial states that start at those of `sample` and are moved by the network in training.
+
+    Pass it as `sample` to [`diffrax_conserve.fit`][]. A flow map is stepped from the end of its
+    last step, so it must be trained on such states, and it can find them itself. The pool is the
+    states of one epoch. Whenever the recipe draws new points, the network moves each state by a
+    step of random length, and the result is projected onto the manifold through the state. Every
+    state starts again from `sample` after `mean_steps` steps in the mean. A move costs one
+    evaluation of the network; [`diffrax_conserve.learned.reachable_states`][] solves equations.
+
+    A step is taken only if its defect at the end is small. A wrong network takes few steps, so it
+    first learns the states of `sample`. It does not move states to where no solution goes, or where
+    the step is too long for the solution.
+
+    Make the network with `states` that are spread about as far as the solutions will be: they
+    normalise its inputs.
+
+    The `domain` of the network that is trained covers the states that the pool held in the second
+    half of the epochs, besides those that the network was made with. (With a frame its largest
+    clock stays, by which the network measures time; faster states start again.)
+
+    !!! example
+
+        ```python
+        import dataclasses
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        starts = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 200))
+        network = dfc.DeepONet(
+            starts, 0.25, width=8, depth=1, core=dfc.learned.Concatenated, key=jax.random.key(1)
+        )
+        recipe = dataclasses.replace(dfc.learned.second_order(network, epochs=50), points=50)
+        pool = dfc.learned.Pool(system.sample, manifold=system.manifold)
+        trained, log = dfc.fit(
+            network, system.vector_field, sample=pool, recipe=recipe, key=jax.random.key(2)
+        )
+        print(network.domain.upper, trained.domain.upper)
+        ```
+    """
+
+    sample: Sampler
+    manifold: Manifold = eqx.field(kw_only=True, default=None)
+    mean_steps: RealScalarLike = eqx.field(kw_only=True, default=20)
+    max_defect: RealScalarLike = eqx.field(kw_only=True, default=1.0)
+    keep: Callable[[Any], Bool[Array, ""]] | None = eqx.field(kw_only=True, default=None)
+
+    def __check_init__(self):
+        if not callable(self.sample):
+            raise TypeError(
+                f"`sample` is {self.sample!r}, but it must be a function from a random key to an "
+                "initial state. For given states write `Pool(FromStates(states))`."
+            )
+        if self.manifold is not None:
+            check_manifold(self.manifold)
+        if not self.mean_steps >= 1:
+            raise ValueError(f"`mean_steps` must be at least 1, but is {self.mean_steps}.")
+        if not self.max_defect > 0:
+            raise ValueError(f"`max_defect` must be positive, but is {self.max_defect}.")
+
+    def __call__(self, key: PRNGKeyArray) -> Y:
+        """A state to start from."""
+        return self.sample(key)
+
+
+Pool.__init__.__doc__ = r"""**Arguments:**
+
+- `sample`: a function from a random key to an initial state, where solves start.
+- `manifold`: where the states are projected; each keeps the values of its integrals from its
+    start. Default: nothing is projected.
+- `mean_steps`: after how many steps a state starts again, in the mean. They have any length up to
+    the longest, so solutions are followed for about half as many of these.
+- `max_defect`: the largest defect at the end of a step that is taken, relative to the median of
+    $|f|$ over the first states. That of a network that stands still is about one.
+- `keep`: which states to go on from: a function of one state. Others start again.
+
+**Raises:**
+
+`TypeError` or `ValueError` if an argument has a wrong type or value.
+"""
+
+
+def moved(
+    pool: Pool,
+    model: AbstractFlowMap,
+    args: Args,
+    squares: Squares,
+    typical: Float[Array, ""],
+    y0s: Y,
+    fresh: Y,
+    key: PRNGKeyArray,
+) -> Y:
+    """The states of a pool after a step each; `fresh` ones where they start again."""
+    lengths_key, restarts_key = jr.split(key)
+    count = jtu.tree_leaves(y0s)[0].shape[0]
+    lengths = jr.uniform(lengths_key, (count,), maxval=float(model.max_step))
+    small = squares(Points(lengths, y0s)) <= pool.max_defect**2 * typical
+    goes_on = small & ~jr.bernoulli(restarts_key, 1 / pool.mean_steps, (count,))
+    domain = domain_of(model)
+
+    def state(y0: Y, h: Array, fresh: Y, goes_on: Array) -> Y:
+        end = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), model(y0, h), y0)
+        end, good = _projected(pool.manifold, args, y0, end)
+        good = good & goes_on & tree_all_finite(end)
+        if pool.keep is not None:
+            good = good & pool.keep(end)
+        if domain is not None:
+            good = good & domain.can_include(end)
+        return jtu.tree_map(lambda a, b: jnp.where(good, a, b), end, fresh)
+
+    return jax.vmap(state)(y0s, lengths, fresh, goes_on)
+
+
+def _projected(manifold: Manifold, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
+    """The end of a step, on the manifold through its start, and whether it got there."""
+    if manifold is None:
+        return end, jnp.asarray(True)
+    values = conserved_values(manifold, 0.0, y0, args)
+    end, info = project(manifold, end, args=args, value=values)
+    return end, info.result == optx.RESULTS.successful
+
+
+def domain_of(flow_map: Any) -> AbstractDomain | None:
+    """The domain of a flow map, if it has one that a training can extend."""
+    domain = flow_map.domain
+    return domain if isinstance(domain, AbstractDomain) else None
+
+
+def with_domain(model: Any, domain: AbstractDomain | None) -> Any:
+    """`model` with this domain; unchanged for `None`."""
+    return model if domain is None else eqx.tree_at(lambda m: m.domain, model, domain)

@@ -1,0 +1,192 @@
+r"""Second-order training: each update solves a linear least-squares problem in the weights.
+
+With the defects of all collocation points in one vector $r(\theta)$ and its Jacobian $J$, an update
+$\delta$ minimises $|J \delta + r|^2 + \lambda |\delta - \zeta|^2$. The two methods differ in the
+points, in the damping $\lambda$, and in $\zeta$.
+
+A loss of the squared norms $q_i$ of the defects that is not their mean is made one of least squares
+by giving each point the weight $\partial \ell / \partial q_i$: the gradient is the same.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from ..._custom_types import RealScalarLike
+from .defect import squared_norms
+from .loss import Loss
+
+
+class LeastSquares(NamedTuple):
+    """The problem of one update, as a function of the weights in one vector."""
+
+    # The defects of every point, and their Jacobian.
+    defects: Callable[[Float[Array, " weights"]], Float[Array, "points n"]]
+    jacobian: Callable[[Float[Array, " weights"]], Float[Array, "points n weights"]]
+    # The loss, from the squared norms of the defects, and the typical square it is relative to.
+    loss: Loss
+    typical: Float[Array, ""]
+
+    def value(self, defects: Float[Array, "points n"]) -> Float[Array, ""]:
+        return self.loss(squared_norms(defects), self.typical)
+
+    def rows(
+        self, weights: Float[Array, " weights"]
+    ) -> tuple[Float[Array, " rows"], Float[Array, "rows weights"], Float[Array, ""]]:
+        """`r`, `J` and the loss, with every point weighted for the loss."""
+        defects = self.defects(weights)
+        squares = squared_norms(defects)
+        loss, importance = jax.value_and_grad(self.loss)(squares, self.typical)
+        root = jnp.sqrt(jnp.maximum(importance, 0))
+        jacobian = root[:, None, None] * self.jacobian(weights)
+        return (
+            (root[:, None] * defects).reshape(-1),
+            jacobian.reshape(-1, weights.size),
+            loss,
+        )
+
+
+class SpringState(NamedTuple):
+    update: Float[Array, " weights"]  # the last one
+    loss: Float[Array, ""]  # a running mean
+
+
+@final
+class SPRING(eqx.Module):
+    r"""A natural gradient in the space of samples, with momentum, for fresh points in each epoch.
+
+    Of all updates that solve the linearised equations of the epoch's points, up to the damping, it
+    takes the one nearest to $\zeta = \mu \delta_{\text{last}}$:
+
+    $$\delta = \zeta - J^\top (J J^\top + \lambda I)^{-1} (r + J \zeta),$$
+
+    with a damping $\lambda$ proportional to the loss. The matrix has as many rows as there are
+    equations, not weights: a batch of 250 points of three equations needs one Cholesky
+    factorisation of size 750, whatever the size of the network. The updates are made in full during
+    the first two fifths of the epochs; after that their length falls to zero, linearly, so that the
+    noise of the batches averages out.
+
+    ??? cite "Reference"
+
+        G. Goldshlager, N. Abrahamsen and L. Lin, J. Comput. Phys. 516 (2024), for wave functions.
+    """
+
+    momentum: float = 0.9
+    damping: float = 1e-2
+
+    def __check_init__(self):
+        if not 0 <= self.momentum < 1:
+            raise ValueError(f"`momentum` must be from 0 to below 1, but is {self.momentum}.")
+        if not self.damping > 0:
+            raise ValueError(f"`damping` must be positive, but is {self.damping}.")
+
+    def init(self, weights: Any) -> SpringState:
+        vector, _ = ravel_pytree(weights)
+        return SpringState(jnp.zeros_like(vector), jnp.asarray(jnp.inf, vector.dtype))
+
+    def update(
+        self,
+        problem: LeastSquares,
+        weights: Float[Array, " weights"],
+        state: SpringState,
+        fraction: RealScalarLike,
+        linear: Bool[Array, " weights"],
+    ) -> tuple[Float[Array, " weights"], SpringState, Float[Array, ""]]:
+        del linear
+        r, jacobian, loss = problem.rows(weights)
+        running = jnp.where(jnp.isfinite(state.loss), 0.95 * state.loss + 0.05 * loss, loss)
+        zeta = self.momentum * state.update
+        gram = jacobian @ jacobian.T + self.damping * running * jnp.eye(r.size, dtype=r.dtype)
+        factor = jsl.cho_factor(gram, lower=True)
+        update = zeta - jacobian.T @ jsl.cho_solve(factor, r + jacobian @ zeta)
+        length = jnp.minimum(1, (1 - fraction) / 0.6).astype(r.dtype)
+        return weights + length * update, SpringState(update, running), loss
+
+
+SPRING.__init__.__doc__ = r"""**Arguments:**
+
+- `momentum`: the factor $\mu$ of the last update.
+- `damping`: $\lambda$ in units of the loss.
+"""
+
+
+@final
+class LevenbergMarquardt(eqx.Module):
+    r"""Gauss-Newton steps with an adaptive damping, for small networks and the same points always.
+
+    An update that does not lessen the loss is not made, and the damping $\lambda$ is raised; after
+    one that did what the linear model promised it is lowered.
+
+    The output of a network is linear in the weights of its last layer. Those are damped far less,
+    by $10^{-12} \lambda$, so that every update solves for them almost exactly, as in variable
+    projection. It decides between a residual of $10^{-5}$ and one of $10^{-10}$: damped alike, the
+    iteration creeps along a curved valley. The problem is then ill-conditioned, and solved by a QR
+    factorisation of $J$ rather than by its normal equations.
+
+    ??? cite "Reference"
+
+        J. J. Moré, "The Levenberg-Marquardt algorithm", Lect. Notes Math. 630 (1978); G. H. Golub
+        and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), for variable projection.
+    """
+
+    damping: float = 1e-2
+
+    def __check_init__(self):
+        if not self.damping > 0:
+            raise ValueError(f"`damping` must be positive, but is {self.damping}.")
+
+    def init(self, weights: Any) -> Float[Array, ""]:
+        dtype = ravel_pytree(weights)[0].dtype
+        return jnp.asarray(self.damping, dtype)
+
+    def update(
+        self,
+        problem: LeastSquares,
+        weights: Float[Array, " weights"],
+        state: Float[Array, ""],
+        fraction: RealScalarLike,
+        linear: Bool[Array, " weights"],
+    ) -> tuple[Float[Array, " weights"], Float[Array, ""], Float[Array, ""]]:
+        del fraction
+        r, jacobian, loss = problem.rows(weights)
+        units = jnp.where(linear, jnp.asarray(_FREEDOM, r.dtype), 1)
+        scaled = _damped_least_squares(jacobian * units, -r, state)
+        update = units * scaled
+        after = problem.value(problem.defects(weights + update))
+        change = jacobian @ update
+        predicted = -(2 * r @ change + change @ change)
+        ratio = (loss - after) / predicted
+        better = after < loss
+        factor = jnp.where(ratio > 0.5, 0.1, jnp.where(ratio > 0.1, 0.5, 2.0))
+        damping = state * jnp.where(better, factor, 5.0).astype(r.dtype)
+        return jnp.where(better, weights + update, weights), damping, loss
+
+
+LevenbergMarquardt.__init__.__doc__ = r"""**Arguments:**
+
+- `damping`: $\lambda$ of the first update.
+"""
+
+# In these units the weights of the last layer are damped like all others.
+_FREEDOM = 1e6
+
+SecondOrder = SPRING | LevenbergMarquardt
+
+
+def _damped_least_squares(
+    matrix: Float[Array, "rows columns"], rhs: Float[Array, " rows"], damping: Float[Array, ""]
+) -> Float[Array, " columns"]:
+    """The minimiser of `|A x - b|² + λ |x|²`."""
+    columns = matrix.shape[1]
+    identity = jnp.sqrt(damping) * jnp.eye(columns, dtype=matrix.dtype)
+    zeros = jnp.zeros(columns, rhs.dtype)
+    extended = jnp.block([[matrix, rhs[:, None]], [identity, zeros[:, None]]])
+    # The triangular factor of the matrix with its right-hand side holds Qᵀ b in its last column.
+    r = jnp.linalg.qr(extended, mode="r")
+    return jsl.solve_triangular(r[:columns, :columns], r[:columns, columns])

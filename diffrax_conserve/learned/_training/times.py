@@ -1,0 +1,18 @@
+"""Times of the collocation points, at which the defect is made small."""
+
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+def uniform_times(
+    key: PRNGKeyArray, count: int, first: float, last: float
+) -> Float[Array, " points"]:
+    """Independent times, uniform between `first` and `last`."""
+    return jr.uniform(key, (count,), minval=first, maxval=last)
+
+
+def grid_times(key: PRNGKeyArray, count: int, first: float, last: float) -> Float[Array, " points"]:
+    """Equally spaced times from `first` to `last`."""
+    del key
+    return jnp.linspace(first, last, count)

@@ -1,0 +1,103 @@
+"""The main job: a system of the catalogue, solved with and without projection, and compared."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax as dfx
+import jax.tree_util as jtu
+
+from .._replace_file import replace_file
+from .._solver import RK4, ManifoldProjection
+from ..learned import save
+from ..systems import AbstractSystem
+from ._compare import compare
+from ._setup import SetupError, check_times, import_plot, make_writable
+from ._solve import run
+from ._tables import figures, json_text, metrics, table
+from ._trained import (
+    KINDS,
+    Learned,
+    initial_states,
+    is_learned,
+    learned,
+    learned_solvers,
+    pretrained,
+    train,
+)
+
+
+def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
+    """What is compared, in the order of the table and of the legends."""
+    classical = {
+        "rk4": RK4(),
+        "projected rk4": ManifoldProjection(RK4(), system.manifold),
+    }
+    return classical | (learned_solvers(system, networks) if networks else {})
+
+
+def reproduce(
+    system: AbstractSystem,
+    out: Path,
+    *,
+    t1: float,
+    dt: float,
+    anew: bool = False,
+    seed: int = 0,
+    epochs: int = 5000,
+    write: Callable[[str], None] = print,
+) -> bool:
+    """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
+
+    With `anew` the networks of the paper's systems are trained first; otherwise they are those that
+    come with the package. Returns whether every solver succeeded. Raises `SetupError` before any
+    work is done.
+    """
+    y0s = initial_states(system)
+    states = jtu.tree_leaves(y0s)[0].shape[0]
+    check_times(system, t1, dt, states)
+    if anew and not is_learned(system):
+        raise SetupError(
+            f"--train: there are no learned solvers for {system.name}. The paper has them for the "
+            "first five systems that `list` names."
+        )
+    plot = import_plot()
+    make_writable(out)
+    networks: dict[str, Learned] = {}
+    if is_learned(system):
+        networks = _train(system, out, seed, epochs, write) if anew else pretrained(system)
+    chosen = solvers(system, {kind: found.network for kind, found in networks.items()})
+    runs = {name: run(system, solver, y0s, t1, dt) for name, solver in chosen.items()}
+    comparison = compare(system, y0s, runs)
+    numbers = metrics(system, runs, comparison, t1, dt, states)
+    drawn = {} if plot is None else figures(plot, system, runs, comparison, networks)
+    for name, figure in drawn.items():
+        assert plot is not None
+        for suffix in ("png", "pdf"):
+            replace_file(out / f"{name}.{suffix}", lambda path, f=figure: plot.save(f, path))
+    text = json_text(numbers)
+    replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
+    write(table(system, numbers, t1, dt, states))
+    if plot is None:
+        write("\nThere are no figures: they need matplotlib. Install it by")
+        write("    pip install 'diffrax-conserve[plots]'")
+    write(f"\n{'metrics.json is' if plot is None else 'The figures and metrics.json are'} in {out}")
+    return comparison.failure is None and all(run.failure is None for run in runs.values())
+
+
+def _train(
+    system: AbstractSystem, out: Path, seed: int, epochs: int, write: Callable[[str], None]
+) -> dict[str, Learned]:
+    """Trains the standard and the conservative network, and writes them beside the figures."""
+    networks = {}
+    for kind in KINDS:
+        write(f"Training the {kind} network: {epochs} epochs, seed {seed}")
+        network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
+        write(
+            f"  {log.seconds:.0f} s after {log.compile_seconds:.0f} s of compilation; "
+            f"loss {log.best:.3g} at epoch {log.best_epoch}"
+        )
+        info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
+        save(out / f"{kind}.network", network, info=info)
+        networks[kind] = learned(network, log)
+    return networks

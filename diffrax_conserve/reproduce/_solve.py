@@ -1,0 +1,142 @@
+"""The solves: one solver, from one or from many initial states."""
+
+import dataclasses
+import math
+import re
+import time
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._diagnostics.drift import drift
+from ..systems import AbstractSystem
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What one solver did: its states at `ts`, from the initial time, or why there are none.
+
+    The states and the drifts have a leading axis of initial states. Where a solve failed they are
+    NaN.
+    """
+
+    ts: np.ndarray
+    ys: Any
+    drift: dict[str, np.ndarray]  # by integral, at each of `ts`
+    steps: int
+    seconds: float
+    compile_seconds: float
+    failure: str | None = None
+
+
+def run(system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float, dt: float) -> Run:
+    """Solves from each of `y0s`, in steps of `dt` from 0 to `t1`."""
+    try:
+        return _timed(system, solver, y0s, t1, dt)
+    except (RuntimeError, TypeError, ValueError) as error:
+        # One solver that cannot start must not cost the results of the others.
+        nothing = np.zeros(0)
+        return Run(nothing, nothing, {}, 0, 0.0, 0.0, f"at the start: {_reason(error)}")
+
+
+def _reason(error: Exception) -> str:
+    """What an error says, without the lines that equinox and jax put around it."""
+    found = re.search(r"EquinoxRuntimeError: (.*)", str(error))
+    return str(error) if found is None else found[1]
+
+
+@eqx.filter_jit
+def _solve(
+    system: AbstractSystem,
+    solver: dfx.AbstractSolver,
+    y0s: Any,
+    t1: jax.Array,
+    dt: jax.Array,
+    max_steps: int,
+) -> dfx.Solution:
+    def one(y0: Any) -> dfx.Solution:
+        return dfx.diffeqsolve(
+            dfx.ODETerm(system.vector_field),
+            solver,
+            t0=0.0,
+            t1=t1,
+            dt0=dt,
+            y0=y0,
+            args=system.args,
+            saveat=dfx.SaveAt(t0=True, steps=True),
+            stepsize_controller=dfx.ConstantStepSize(),
+            max_steps=max_steps,
+            throw=False,
+        )
+
+    return jax.vmap(one)(y0s)
+
+
+def _timed(
+    system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float, dt: float
+) -> Run:
+    arguments = (system, solver, y0s, jnp.asarray(t1), jnp.asarray(dt), math.ceil(t1 / dt) + 1)
+    started = time.perf_counter()
+    compiled = _solve.lower(*arguments).compile()  # pyright: ignore[reportFunctionMemberAccess]
+    compile_seconds = time.perf_counter() - started
+    jax.block_until_ready(compiled(*arguments).ys)
+    started = time.perf_counter()
+    solution = compiled(*arguments)
+    jax.block_until_ready(solution.ys)
+    seconds = time.perf_counter() - started
+
+    batch_drift = jax.vmap(lambda sol: drift(sol, system.manifold, system.args))
+    drifts = eqx.filter_jit(batch_drift)(solution)
+    saved = np.isfinite(np.asarray(solution.ts))  # the rest is padding
+    longest = int(np.argmax(saved.sum(axis=1)))
+    count = int(saved[longest].sum())
+
+    def keep(x: Any) -> np.ndarray:
+        x = np.asarray(x)[:, :count]
+        return np.where(saved[:, :count].reshape(x.shape[:2] + (1,) * (x.ndim - 2)), x, np.nan)
+
+    ts, ys = np.asarray(solution.ts)[longest, :count], jtu.tree_map(keep, solution.ys)
+    largest = {name: keep(_largest_component(drifts[name])) for name in system.manifold}
+    steps = int(np.max(solution.stats["num_steps"]))
+    failure = _failure(solution.result, saved.sum(axis=1), ts, ys, largest)
+    return Run(ts, ys, largest, steps, seconds, compile_seconds, failure)
+
+
+def _largest_component(values: Any) -> np.ndarray:
+    leaves = [np.abs(np.asarray(x)) for x in jtu.tree_leaves(values)]
+    return np.max(np.concatenate([x.reshape(*x.shape[:2], -1) for x in leaves], axis=2), axis=2)
+
+
+def _failure(
+    result: dfx.RESULTS, counts: np.ndarray, ts: np.ndarray, ys: Any, drifts: dict[str, np.ndarray]
+) -> str | None:
+    """What went wrong at the first initial state where something did, and at how many it did."""
+    values = [*jtu.tree_leaves(ys), *drifts.values()]
+    reasons = [
+        _failure_of_one(
+            jtu.tree_map(lambda x, i=i: x[i], result),
+            ts[: counts[i]],
+            [x[i, : counts[i]] for x in values],
+        )
+        for i in range(len(counts))
+    ]
+    failed = [reason for reason in reasons if reason is not None]
+    if not failed:
+        return None
+    return failed[0] if len(reasons) == 1 else f"for {len(failed)} of {len(reasons)}: {failed[0]}"
+
+
+def _failure_of_one(result: dfx.RESULTS, ts: np.ndarray, values: list[np.ndarray]) -> str | None:
+    if result != dfx.RESULTS.successful:
+        reason = " ".join(dfx.RESULTS[result].split())
+        return f"after t = {ts[-1]:.6g}: {reason}"
+    finite = np.all([np.isfinite(x).reshape(len(ts), -1).all(axis=1) for x in values], axis=0)
+    if not finite.all():
+        first = ts[np.argmin(finite)]
+        return f"at t = {first:.6g}: the state is not finite any more. Choose a smaller dt."
+    return None

@@ -1,0 +1,167 @@
+"""The learned solvers of the paper's five systems, trained anew or as the package has them."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from .._projection import Newton
+from .._solver import ManifoldProjection
+from ..learned import (
+    PINN,
+    ConservativeLayer,
+    DeepONet,
+    DeepONetSolver,
+    FitLog,
+    PINNSolver,
+    fit,
+    load,
+    paper,
+    pretrained_path,
+    read_info,
+)
+from ..systems import AbstractSystem
+
+Network = PINN | DeepONet
+
+KINDS = ("standard", "conservative")
+# The paper learns one solution of the first two systems, and the flow map of the others.
+_ITERATIONS = {
+    "harmonic-oscillator": 5,
+    "rigid-body": 5,
+    "double-pendulum": 3,
+    "conservative-lorenz": 3,
+    "point-vortices": 3,
+}
+_PINNS = ("harmonic-oscillator", "rigid-body")
+
+# Flow maps are judged on so many initial states.
+_STATES = 20
+# Closer vortices turn about each other by more than half a radian in a step: RK4 fails there too.
+_SEPARATION = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A trained network, and its loss against the epoch."""
+
+    network: Network
+    epochs: np.ndarray
+    losses: np.ndarray
+
+
+def is_learned(system: AbstractSystem) -> bool:
+    """Whether the paper has learned solvers for this system."""
+    return system.name in _ITERATIONS
+
+
+def is_flow_map(system: AbstractSystem) -> bool:
+    """Whether these are for many initial states."""
+    return is_learned(system) and system.name not in _PINNS
+
+
+def initial_states(system: AbstractSystem) -> Any:
+    """What all solvers are compared on, with a leading axis: the system's own initial state, and
+    for a flow map random ones."""
+    own = jax.tree.map(lambda x: x[None], system.y0)
+    if not is_flow_map(system):
+        return own
+    drawn = jax.vmap(system.sample)(jr.split(jr.key(1234), 4 * _STATES))
+    if system.name == "point-vortices":
+        drawn = drawn[_separations(drawn) >= _SEPARATION]
+    return jnp.concatenate([own, drawn[: _STATES - 1]])
+
+
+def pretrained(system: AbstractSystem) -> dict[str, Learned]:
+    """The networks that come with the package."""
+    found = {}
+    for kind in KINDS:
+        path = pretrained_path(f"{system.name}-{kind}")
+        history = read_info(path)["info"]["history"]
+        network = load(path)
+        assert isinstance(network, Network)
+        found[kind] = Learned(network, np.array(history["epochs"]), np.array(history["losses"]))
+    return found
+
+
+def build(
+    system: AbstractSystem, kind: str, net_key: PRNGKeyArray, states_key: PRNGKeyArray
+) -> Any:
+    """An untrained network of the paper's size."""
+    layer = None
+    if kind == "conservative":
+        layer = ConservativeLayer(system.manifold, steps=_ITERATIONS[system.name])
+    if not is_flow_map(system):
+        return PINN(system.y0, 0.0, system.t1, key=net_key, layer=layer)
+    states = jax.vmap(system.sample)(jr.split(states_key, 1000))
+    return DeepONet(states, system.dt, key=net_key, layer=layer)
+
+
+def train(
+    system: AbstractSystem,
+    kind: str,
+    *,
+    seed: int = 0,
+    epochs: int = 5000,
+    points: int | None = None,
+    progress: bool = False,
+) -> tuple[Network, FitLog]:
+    """A network trained by the recipe `paper`; `kind` is one of `KINDS`."""
+    net_key, states_key, fit_key = jr.split(jr.key(seed), 3)
+    network = build(system, kind, net_key, states_key)
+    return fit(
+        network,
+        system.vector_field,
+        key=fit_key,
+        sample=system.sample if is_flow_map(system) else None,
+        args=system.args,
+        recipe=paper(network, epochs=epochs, points=points),
+        progress=progress,
+    )
+
+
+def learned(network: Network, log: FitLog) -> Learned:
+    return Learned(network, *history(log))
+
+
+def history(log: FitLog, points: int = 250) -> tuple[np.ndarray, np.ndarray]:
+    """The training loss at about so many epochs, each the median of those round it."""
+    width = max(len(log.losses) // points, 1)
+    count = len(log.losses) // width
+    blocks = log.losses[: count * width].reshape(count, width)
+    return (np.arange(count) + 0.5) * width, np.nanmedian(blocks, axis=1)
+
+
+def learned_solvers(
+    system: AbstractSystem, networks: dict[str, Network]
+) -> dict[str, dfx.AbstractSolver]:
+    """The standard network, the conservative one, and the standard one projected afterwards.
+
+    A network can be far from the manifold, so `Newton` projects; and the conservative layer makes
+    few iterations, so the conservative network is projected too.
+    """
+
+    def solver(network: Network) -> dfx.AbstractSolver:
+        if isinstance(network, PINN):
+            return PINNSolver(network)
+        return DeepONetSolver(network)
+
+    def projected(network: Network) -> dfx.AbstractSolver:
+        return ManifoldProjection(solver(network), system.manifold, projection=Newton())
+
+    return {
+        "standard": solver(networks["standard"]),
+        "conservative": projected(networks["conservative"]),
+        "standard projected": projected(networks["standard"]),
+    }
+
+
+def _separations(ys: Array) -> Array:
+    """The smallest distance of two vortices, in each of many states."""
+    squares = jnp.sum((ys[:, :, None] - ys[:, None, :]) ** 2, axis=-1)
+    return jnp.sqrt(jnp.min(squares + 1e9 * jnp.eye(ys.shape[1]), axis=(1, 2)))

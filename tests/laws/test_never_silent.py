@@ -1,0 +1,174 @@
+"""Laws of honesty: success means on the manifold, a derivative is right or NaN, and NaN is failure.
+
+What is right is computed here in numpy, with gradients by hand.
+"""
+
+import diffrax as dfx
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from hypothesis import given
+
+import diffrax_conserve as dfc
+
+# ---- Success ----
+
+PROJECTIONS = {
+    "simplified": dfc.SimplifiedNewton(),
+    "newton": dfc.Newton(),
+    "formula": dfc.ClosedForm(lambda t, y, args, values: args[2]),
+}
+
+
+def steep(t, y, args):
+    """A wall and a wave: far away its gradient is larger by many orders than on the manifold."""
+    a, b, _ = args
+    return jnp.stack([y[0] + jnp.exp(a * y[1]), jnp.sum(y**4) - b * y[2]])
+
+
+def steep_in_numpy(y, a, b):
+    """The values, and the rows of the gradients."""
+    y, a, b = (np.asarray(x, np.longdouble) for x in (y, a, b))
+    zero, wall = np.zeros_like(a), np.exp(a * y[1])
+    values = np.stack([y[0] + wall, np.sum(y**4) - b * y[2]])
+    rows = np.stack([np.stack([1 + zero, a * wall, zero]), 4 * y**3 - np.stack([zero, zero, b])])
+    return values, rows
+
+
+@eqx.filter_jit
+def projected(projection, y, value, args):
+    found, info = dfc.project(
+        dfc.FirstIntegral(steep), y, value=value, args=args, projection=projection
+    )
+    return found, info.result == optx.RESULTS.successful, info.ok
+
+
+coordinates = st.floats(-3, 3, allow_nan=False).map(lambda x: round(x, 6))
+
+
+@pytest.mark.parametrize("name", PROJECTIONS)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@given(
+    state=st.tuples(coordinates, coordinates, coordinates),
+    direction=st.tuples(coordinates, coordinates, coordinates),
+    decade=st.floats(-16, 3),
+    a=st.floats(0.1, 30),
+    b=coordinates,
+)
+def test_success_means_on_the_manifold_at_the_state_that_is_returned(
+    name, dtype, state, direction, decade, a, b
+):
+    state, direction = np.asarray(state, dtype), np.asarray(direction, dtype)
+    a, b = dtype(a), dtype(b)
+    value = steep_in_numpy(state, a, b)[0].astype(dtype)
+    candidate = (state + 10.0**decade * direction).astype(dtype)
+    y, success, ok = projected(PROJECTIONS[name], candidate, value, (a, b, candidate))
+    assert bool(success) == bool(ok)
+    if not success:
+        return
+    y = np.asarray(y)
+    assert np.all(np.isfinite(y))
+    values, rows = steep_in_numpy(y, a, b)
+    size = np.abs(value) + np.sum(np.abs(rows * y.astype(np.longdouble)), axis=1)
+    numbers = np.finfo(dtype)  # below `tiny` a number counts as zero
+    assert np.all(np.abs(values - value) <= 64 * numbers.eps * size + numbers.tiny)
+
+
+@pytest.mark.parametrize("factor", [5.97e24, 1e-27])
+@given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0.5, 2))
+def test_units_do_not_matter_in_single_precision(factor, displacement, size):
+    """The energy of a planet in joules, or of an atom: squares of its gradient overflow, or vanish,
+    in float32."""
+    y = np.float32(size) * np.array([0.6, 0.8], np.float32)
+    candidate = y + 1e-3 * np.asarray(displacement, np.float32)
+    value = jnp.float32(factor * size**2)
+    for projection in (PROJECTIONS["simplified"], PROJECTIONS["newton"]):
+        found, ok = in_units(projection, candidate, value, jnp.float32(factor))
+        assert ok
+        np.testing.assert_allclose(np.linalg.norm(found), size, rtol=2e-6)
+
+
+@eqx.filter_jit
+def in_units(projection, y, value, factor):
+    square = dfc.FirstIntegral(lambda t, y, args: args * jnp.sum(y**2))
+    found, info = dfc.project(square, y, value=value, args=factor, projection=projection)
+    return found, info.ok
+
+
+# ---- Derivatives ----
+
+
+def kepler(t, y, args):
+    q, p = y
+    return p, -q / jnp.sum(q**2) ** 1.5
+
+
+ENERGY = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y[1] ** 2) / 2 - jnp.sum(y[0] ** 2) ** -0.5)
+MOMENTUM = dfc.FirstIntegral(lambda t, y, args: y[0][0] * y[1][1] - y[0][1] * y[1][0])
+
+
+def orbit(solver, e, direction):
+    """The end of an arc, and its derivative along a change of the initial state."""
+    y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
+
+    def end(y0):
+        term, adjoint = dfx.ODETerm(kepler), dfx.ForwardMode()
+        ys = dfx.diffeqsolve(term, solver, 0.0, 0.5, 0.05, y0, adjoint=adjoint, throw=False).ys
+        return jax.tree.map(lambda x: x[-1], ys)
+
+    return jax.jvp(end, (y0,), ((direction[:2], direction[2:]),))
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, 0, 0))
+def tangents(projection, e, direction):
+    solver = dfc.ManifoldProjection(dfc.RK4(), (ENERGY, MOMENTUM), projection=projection)
+    exact = orbit(dfx.Dopri8(), e, direction)
+    return orbit(solver, e, direction), exact
+
+
+@pytest.mark.parametrize("name", ["simplified", "newton"])
+def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
+    """Of the projected solve it must be close to that of the flow: the orbit differs by 1e-7."""
+    rng = np.random.default_rng(0)
+    e = np.concatenate([[0.0], 10.0 ** rng.uniform(-14, -1, 399)])
+    direction = rng.normal(size=(400, 4))
+    (y, t), (exact, t_exact) = tangents(PROJECTIONS[name], e, direction)
+    found, expected = (np.concatenate(x, axis=-1) for x in (t, t_exact))
+    assert np.max(np.abs(np.concatenate(y, -1) - np.concatenate(exact, -1))) < 1e-5
+    error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
+    assert not np.any(error > 1e-3)  # NaN is right
+    assert np.all(error[e > 1e-2] <= 1e-3)
+
+
+# ---- NaN ----
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(0, 0))
+def long_steps(e, dt):
+    y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(kepler),
+        dfc.ManifoldProjection(dfc.RK4(), (ENERGY, MOMENTUM)),
+        0.0,
+        6.0,
+        dt,
+        y0,
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.1, 5.9, 41)),
+        throw=False,
+        max_steps=256,
+    )
+    return solution.ys, dfx.is_okay(solution.result)
+
+
+def test_a_solve_that_succeeds_has_no_nan_at_saved_times():
+    rng = np.random.default_rng(1)
+    ys, okay = long_steps(rng.uniform(0, 0.8, 500), rng.uniform(0.05, 0.4, 500))
+    finite = np.all(np.isfinite(np.concatenate(ys, axis=-1)), axis=(1, 2))
+    assert np.mean(okay) > 0.2
+    assert np.all(finite[okay])

@@ -1,0 +1,121 @@
+"""Attack: adaptive solves whose projection becomes hopeless, with `max_steps=None` too.
+
+They are to end in a failure that names the constraint `alpha`, at most 40 steps after the hopeless
+time. A solve that never ends is killed by the runner, and found wrong.
+"""
+
+import functools
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffrax_conserve as dfc
+
+from .oracle import Tally, blames, log_uniform
+
+LANES, TIMEOUT = 10, 60
+T1, MORE = 6.0, 40
+
+
+def energy(t: Any, y: Any, args: Any) -> Any:
+    """Of a pendulum: it is nowhere below -1."""
+    return 0.5 * y[1] ** 2 - jnp.cos(y[0])
+
+
+def later(t: Any, args: Any, before: Any, after: Any) -> Any:
+    return jnp.where(t > args[0], after, before)
+
+
+HOPELESS = -5.0
+ALPHAS = {
+    "unreachable value": dfc.FirstIntegral(energy, value=HOPELESS),
+    "unreachable square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**4), value=-1.0),
+    "NaN at the start": dfc.FirstIntegral(lambda t, y, args: energy(t, y, args) * jnp.nan),
+    "infinite at the start": dfc.FirstIntegral(lambda t, y, args: energy(t, y, args) + jnp.inf),
+    "NaN later": dfc.FirstIntegral(lambda t, y, a: energy(t, y, a) * later(t, a, 1, jnp.nan)),
+    "NaN gradient later": dfc.FirstIntegral(
+        lambda t, y, a: energy(t, y, a) + 0 * jnp.sqrt(later(t, a, 1, -1) + 0 * y[0])
+    ),
+    "jump": dfc.FirstIntegral(lambda t, y, a: energy(t, y, a) + later(t, a, 0, 9)),
+    "jump of a constant": dfc.FirstIntegral(lambda t, y, a: later(t, a, 0.0, 1.0) + 0 * y[0]),
+    "jump of a constraint": dfc.Constraint(lambda t, y, a: later(t, a, 0.0, 1.0) + 0 * y[0]),
+    "runs away": dfc.FirstIntegral(lambda t, y, a: energy(t, y, a) + 10 * jnp.maximum(t - a[0], 0)),
+    "keeps q²": dfc.FirstIntegral(lambda t, y, args: y[0] ** 2),
+    "keeps p": dfc.FirstIntegral(lambda t, y, args: y[1]),
+}
+AT_START = {k for k in ALPHAS if "start" in k or "unreachable" in k}
+# From which time on it is hopeless is not defined; only that it must not succeed.
+NEVER_CONSERVED = {"keeps q²", "keeps p"}
+SOLVERS = {"Tsit5": dfx.Tsit5(), "Bosh3": dfx.Bosh3(), "Dopri8": dfx.Dopri8(), "Heun": dfx.Heun()}
+
+
+def manifold_of(case: str, beside: bool) -> dict[str, Any]:
+    # The second constraint contradicts the first, or not.
+    return {"alpha": ALPHAS[case]} | ({"good": dfc.FirstIntegral(energy)} if beside else {})
+
+
+@functools.cache
+def compiled(case: str, solver: str, newton: bool, endless: bool, beside: bool) -> Any:
+    projection = dfc.Newton() if newton else dfc.SimplifiedNewton()
+
+    def solve(manifold: Any, t1: Any, y0: Any, args: Any, rtol: Any) -> Any:
+        return dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])])),
+            dfc.ManifoldProjection(SOLVERS[solver], manifold, projection=projection),
+            0.0,
+            t1,
+            None,
+            y0,
+            args,
+            stepsize_controller=dfx.PIDController(rtol, rtol),
+            max_steps=None if endless else 4096,
+            throw=False,
+        )
+
+    good, manifold = dfc.FirstIntegral(energy), manifold_of(case, beside)
+
+    def both(y0: Any, args: Any, rtol: Any) -> Any:
+        bad = solve(manifold, T1, y0, args, rtol)
+        before = solve({"good": good}, args[0], y0, args, rtol)
+        return bad.result, bad.stats["num_steps"], before.stats["num_steps"], bad.ys[-1]
+
+    return eqx.filter_jit(eqx.filter_vmap(both))
+
+
+def run(seed: int, number: int, lanes: int) -> Tally:
+    rng = np.random.default_rng([seed, number])
+    cases = list(ALPHAS)
+    case, solver = cases[(seed + number) % len(cases)], str(rng.choice(list(SOLVERS)))
+    newton, endless, beside = rng.random(3) < (0.25, 0.5, 0.3)
+    # Two constraints would determine a pendulum.
+    beside = bool(beside and case not in NEVER_CONSERVED)
+    y0 = rng.uniform(0.3, 1.5, (lanes, 2))
+    args = rng.uniform(0.5, 4, (lanes, 1))
+    rtol = log_uniform(rng, 1e-8, 1e-3, lanes)
+    solve = compiled(case, solver, bool(newton), bool(endless), beside)
+    result, steps, before, y = solve(*map(jnp.asarray, (y0, args, rtol)))
+    steps, before, y = map(np.asarray, (steps, before, y))
+    okay = np.asarray(result == dfx.RESULTS.successful)
+    messages = [dfx.RESULTS[jax.tree.map(lambda x, i=i: x[i], result)] for i in range(lanes)]
+    unnamed = (
+        np.array([not blames(m, manifold_of(case, beside), "alpha") for m in messages]) & ~okay
+    )
+    allowed = np.where(case in AT_START, 0, before) + MORE
+    if case == "runs away":
+        # What is taken away reaches -1 at the latest 0.5 after; at the same pace of steps.
+        allowed = allowed + np.ceil(before * 0.5 / args[:, 0])
+    tally = Tally(lanes, int(okay.sum()))
+
+    def show(i: int) -> str:
+        what = f"{case}, {solver}, {newton=}, {endless=}, {beside=}, y0 = {y0[i]}, {args[i]}"
+        return f"{what}, {rtol[i]=}: {steps[i]} steps ({before[i]}), y = {y[i]}, {messages[i]!r}"
+
+    tally.blame(f"{case}: success", okay, show)
+    tally.blame(f"{case}: no name", unnamed, show)
+    if case not in NEVER_CONSERVED:
+        tally.blame(f"{case}: more than {MORE} more steps", ~okay & (steps > allowed), show)
+    return tally

@@ -1,0 +1,327 @@
+"""The paper's five systems, typed from what it prints, against the catalogue.
+
+E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131. Its misprints, corrected here:
+
+1. Rigid body, L: `w_3^3` for `w_3^2`.
+2. Double pendulum, H: the bracket that `(m_1 + m_2 sin^2` opens is never closed.
+3. Lorenz, in the text: none in the formulas; what it calls H is our Casimir over `-sigma`.
+4. Vortices, r_ij: `(x_i - x_i)^2` for `(x_i - x_j)^2`.
+5. Vortices, equations and positions: sums and indices start at 0, which makes n + 1 vortices.
+6. Vortices, H: `1/(4 pi)` with a sum over `i < j` is half of the Hamiltonian of these equations.
+   It is conserved all the same; ours is the Hamiltonian.
+7. Loss: the defect in it is not squared. (Also: `R^{n-m}` for `R^n` in the definition of M, and
+   figures in "the (q, q) plane".)
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve import reproduce as _reproduce
+from diffrax_conserve import systems
+from diffrax_conserve.reproduce._trained import build
+
+COUNT = 100
+RELATIVE = 1e-13
+
+
+# ---- The formulas, as printed ----
+
+
+def oscillator_energy(y, m, k):
+    q, p = y
+    return p**2 / (2 * m) + k * q**2 / 2
+
+
+def oscillator_field(y, m, k):
+    q, p = y
+    return jnp.stack([p / m, -k * q])
+
+
+def rigid_body_field(w, i1, i2, i3):
+    w1, w2, w3 = w
+    return jnp.stack(
+        [
+            (i2 - i3) / (i2 * i3) * w2 * w3,
+            (i3 - i1) / (i1 * i3) * w1 * w3,
+            (i1 - i2) / (i1 * i2) * w1 * w2,
+        ]
+    )
+
+
+def rigid_body_energy(w, i1, i2, i3):
+    w1, w2, w3 = w
+    return (w1**2 / i1 + w2**2 / i2 + w3**2 / i3) / 2
+
+
+def rigid_body_momentum(w):
+    w1, w2, w3 = w
+    return (w1**2 + w2**2 + w3**2) / 2
+
+
+def pendulum_energy(y, m1, m2, l1, l2, g):
+    q1, q2, p1, p2 = y
+    above = m2 * l2**2 * p1**2 + (m1 + m2) * l1**2 * p2**2
+    above = above - 2 * m2 * l1 * l2 * p1 * p2 * jnp.cos(q1 - q2)
+    below = 2 * m2 * l1**2 * l2**2 * (m1 + m2 * jnp.sin(q1 - q2) ** 2)
+    return above / below - (m1 + m2) * g * l1 * jnp.cos(q1) - m2 * g * l2 * jnp.cos(q2)
+
+
+def pendulum_field(y, *parameters):
+    dq1, dq2, dp1, dp2 = jax.grad(pendulum_energy)(y, *parameters)
+    return jnp.stack([dp1, dp2, -dq1, -dq2])
+
+
+def lorenz_field(y, sigma, rho, m=0, beta=8 / 3):
+    x, y, z = y
+    return jnp.stack([sigma * (y - m * x), x * (rho - z) - m * y, x * y - beta * m * z])
+
+
+def lorenz_h(y, sigma):
+    x, _, z = y
+    return z - x**2 / (2 * sigma)
+
+
+def lorenz_l(y, rho):
+    _, y, z = y
+    return (y**2 + z**2) / 2 - rho * z
+
+
+def pairs(n):
+    return [(i, j) for i in range(n) for j in range(n) if i != j]
+
+
+def distance(y, i, j):
+    return jnp.sqrt((y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2)
+
+
+def vortex_field(y, gamma):
+    dx, dy = [0.0] * len(gamma), [0.0] * len(gamma)
+    for i, j in pairs(len(gamma)):
+        r = distance(y, i, j)
+        dx[i] = dx[i] - gamma[j] * (y[i, 1] - y[j, 1]) / (2 * jnp.pi * r**2)
+        dy[i] = dy[i] + gamma[j] * (y[i, 0] - y[j, 0]) / (2 * jnp.pi * r**2)
+    return jnp.stack([jnp.stack(dx), jnp.stack(dy)], axis=1)
+
+
+def vortex_energy(y, gamma):
+    terms = [
+        gamma[i] * gamma[j] * jnp.log(distance(y, i, j)) for i, j in pairs(len(gamma)) if i < j
+    ]
+    return -sum(terms) / (4 * jnp.pi)
+
+
+# ---- Against the catalogue ----
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A system as a function of its parameters, and what the paper has for its equations."""
+
+    make: object  # from parameters to a system of the catalogue
+    field: object  # from a state and parameters
+    integrals: dict  # by our name: from a state and parameters to what ours must be
+    parameters: int
+    ours: object = lambda y, *parameters: y  # our state, from the paper's
+    theirs: object = lambda rate, *parameters: rate  # the paper's rate of change, from ours
+
+
+CASES = {
+    # Ours is for unit mass: its momentum is the velocity, its energy that of a unit of mass.
+    "harmonic-oscillator": Case(
+        lambda m, k: systems.HarmonicOscillator(jnp.sqrt(k / m)),
+        oscillator_field,
+        {"energy": lambda y, m, k: oscillator_energy(y, m, k) / m},
+        2,
+        ours=lambda y, m, k: jnp.stack([y[0], y[1] / m]),
+        theirs=lambda rate, m, k: jnp.stack([rate[0], rate[1] * m]),
+    ),
+    "rigid-body": Case(
+        lambda *inertia: systems.RigidBody(jnp.stack(inertia)),
+        rigid_body_field,
+        {
+            "energy": rigid_body_energy,
+            "squared angular momentum": lambda w, *inertia: rigid_body_momentum(w),
+        },
+        3,
+    ),
+    "double-pendulum": Case(
+        lambda m1, m2, l1, l2, g: systems.DoublePendulum(
+            jnp.stack([m1, m2]), jnp.stack([l1, l2]), g
+        ),
+        pendulum_field,
+        {"energy": pendulum_energy},
+        5,
+    ),
+    "conservative-lorenz": Case(
+        lambda sigma, rho: systems.ConservativeLorenz(sigma, rho),
+        lorenz_field,
+        {
+            "Casimir": lambda y, sigma, rho: -sigma * lorenz_h(y, sigma),
+            "energy": lambda y, sigma, rho: lorenz_l(y, rho),
+        },
+        2,
+    ),
+    "point-vortices": Case(
+        lambda *gamma: systems.PointVortices(jnp.stack(gamma)),
+        lambda y, *gamma: vortex_field(y, gamma),
+        {
+            "energy": lambda y, *gamma: 2 * vortex_energy(y, gamma),
+            "linear impulse": lambda y, *gamma: jnp.stack(gamma) @ y,
+            "angular impulse": lambda y, *gamma: jnp.stack(gamma) @ jnp.sum(y**2, axis=1),
+        },
+        3,
+    ),
+}
+
+
+def largest_relative(ours, theirs):
+    """Relative to the largest component: of the state if there are many, else of all states."""
+    ours, theirs = (np.asarray(x).reshape(COUNT, -1) for x in (ours, theirs))
+    size = np.max(np.abs(theirs), axis=1) if theirs.shape[1] > 1 else np.max(np.abs(theirs))
+    return np.max(np.max(np.abs(ours - theirs), axis=1) / size)
+
+
+@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("given", ["random parameters", "the default ones"])
+def test_equations_and_integrals_are_those_printed(name, given):
+    case = CASES[name]
+    system = systems.get(name)
+    state_key, parameter_key = jr.split(jr.key(13))
+    ys = jax.jit(jax.vmap(system.sample))(jr.split(state_key, COUNT))
+    shape = (COUNT, case.parameters)
+    parameters = jr.uniform(parameter_key, shape, minval=0.5, maxval=2.0)
+    if given == "the default ones":
+        parameters = jnp.broadcast_to(jnp.array(DEFAULTS[name]), shape)
+
+    @jax.jit
+    @jax.vmap
+    def both(y, p):
+        own = case.make(*p) if given == "random parameters" else system
+        state = case.ours(y, *p)
+        rates = case.theirs(own.vector_field(0.0, state, None), *p), case.field(y, *p)
+        values = {
+            key: (own.manifold[key].fn(0.0, state, None), printed(y, *p))
+            for key, printed in case.integrals.items()
+        }
+        return rates, values
+
+    rates, values = both(ys, parameters)
+    assert values.keys() == system.manifold.keys()
+    assert largest_relative(*rates) <= RELATIVE
+    for ours, theirs in values.values():
+        assert largest_relative(ours, theirs) <= RELATIVE
+
+
+# ---- The numbers that it states ----
+
+DEFAULTS = {
+    "harmonic-oscillator": (1.0, 1.0),  # m, k
+    "rigid-body": (0.1, 0.2, 0.3),
+    "double-pendulum": (1.0, 1.0, 1.0, 1.0, 9.81),  # m_1, m_2, l_1, l_2, g
+    "conservative-lorenz": (1.0, 0.5),  # sigma, rho
+    "point-vortices": (1.0, 1.0, 1.0),
+}
+# The paper names single initial states, and horizons, of its PINNs; steps of its flow maps.
+HORIZONS = {"harmonic-oscillator": 30.0, "rigid-body": 1.75}
+STARTS = {"harmonic-oscillator": [1.0, 1.0], "rigid-body": [1.0, 1.0, 1.0]}
+STEPS = {
+    "double-pendulum": (0.5, 20),
+    "conservative-lorenz": (0.25, 500),
+    "point-vortices": (0.5, 500),
+}
+
+
+@pytest.mark.parametrize("name", list(HORIZONS))
+def test_single_solutions_start_and_end_where_the_paper_says(name):
+    system = systems.get(name)
+    assert system.t1 == HORIZONS[name]
+    np.testing.assert_array_equal(system.y0, STARTS[name])
+
+
+@pytest.mark.parametrize("name", list(STEPS))
+def test_flow_maps_take_the_papers_steps(name):
+    system = systems.get(name)
+    step, number = STEPS[name]
+    assert system.dt == step
+    assert system.t1 == step * number
+
+
+def test_the_rigid_body_turns_one_and_a_half_times():
+    system = systems.RigidBody()
+    assert 1.5 < system.t1 / float(system.period()) < 1.6
+
+
+def drawn(name):
+    return np.asarray(jax.jit(jax.vmap(systems.get(name).sample))(jr.split(jr.key(0), 4000)))
+
+
+def assert_fills(values, low, high):
+    """Uniform draws from an interval stay in it, and come close to both ends."""
+    assert low <= values.min() <= low + 0.02 * (high - low)
+    assert high - 0.02 * (high - low) <= values.max() <= high
+
+
+def test_initial_states_fill_the_papers_domains():
+    for component in drawn("double-pendulum").T:
+        assert_fills(component, -np.pi / 6, np.pi / 6)
+    x, y, z = drawn("conservative-lorenz").T
+    assert_fills(np.hypot(x, y), 0.5, 1.5)
+    assert_fills(z, 0.5, 1.5)
+    assert_fills(np.linalg.norm(drawn("point-vortices"), axis=-1), 0.5, 1.5)
+
+
+def hidden(net):
+    """Widths of the hidden layers."""
+    return [w.shape[-1] for w in net.weights[:-1]]
+
+
+@pytest.mark.parametrize("kind", ["standard", "conservative"])
+@pytest.mark.parametrize("name", list(DEFAULTS))
+def test_networks_have_the_papers_sizes(name, kind):
+    network = build(systems.get(name), kind, jr.key(0), jr.key(1))
+    if name in HORIZONS:
+        assert (network.t0, network.t1) == (0.0, HORIZONS[name])
+        nets = [network.nets]
+    else:
+        assert network.max_step == STEPS[name][0]
+        nets = [network.core.branch, network.core.trunk]
+    for net in nets:
+        assert hidden(net) == [40] * 4
+        assert net.activation is jnp.tanh
+    assert (network.layer is not None) == (kind == "conservative")
+
+
+@pytest.mark.parametrize("name", list(DEFAULTS))
+def test_the_recipe_has_the_papers_numbers(name):
+    network = build(systems.get(name), "standard", jr.key(0), jr.key(1))
+    recipe = dfc.learned.paper(network)
+    assert recipe.epochs == 5000
+    assert recipe.points == (2000 if name in HORIZONS else 5000)
+    assert recipe.refresh is None  # the full batch
+    # The first update of Adam is the learning rate, whatever the gradient.
+    update, _ = recipe.optimiser.update(jnp.array(3.0), recipe.optimiser.init(jnp.array(1.0)))
+    np.testing.assert_allclose(update, -1e-3, rtol=1e-6)
+
+
+def test_the_schedule_is_the_papers():
+    """p(e) = floor(e (P + 1) / E), which would be P + 1 at e = E, a step never made; s = e / E."""
+    epochs, most = 5000, 3
+    e = jnp.arange(epochs)
+    p = dfc.learned.staged_iterations(e, epochs, most)
+    np.testing.assert_array_equal(p, np.floor(np.arange(epochs) * (most + 1) / epochs))
+    assert (p[0], p[-1]) == (0, most)
+    np.testing.assert_allclose(
+        dfc.learned.linear_weight(e, epochs, most), np.arange(epochs) / epochs
+    )
+
+
+def test_the_reproduction_has_all_five():
+    assert {n for n in systems.names() if _reproduce._trained.is_learned(systems.get(n))} == set(
+        DEFAULTS
+    )

@@ -1,0 +1,132 @@
+"""A batch that is spread over devices, or over processes, is the batch on one device.
+
+Bit for bit: a lane is computed by the same instructions wherever it is. The number of devices is
+fixed when JAX starts, so each test starts its own interpreters, which run a function of this file.
+"""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import NamedSharding, PartitionSpec
+
+import diffrax_conserve as dfc
+
+ROOT = Path(__file__).parents[1]
+LANES = 16
+
+
+def solve(y0, projected=True):
+    """Ten steps of RK4 for one rigid body."""
+    system = dfc.systems.RigidBody()
+    solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold) if projected else dfc.RK4()
+    term = dfx.ODETerm(system.vector_field)
+    return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y0).ys[-1]
+
+
+def spread_over_eight_devices():
+    """The answers to the tests below, as JSON."""
+    mesh = jax.make_mesh((8,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
+    lanes = PartitionSpec("lanes")
+    y0s = jax.vmap(dfc.systems.RigidBody().sample)(jax.random.split(jax.random.key(0), LANES))
+    spread = jax.device_put(y0s, NamedSharding(mesh, lanes))
+    batched = jax.vmap(solve)
+    alone = np.asarray(jax.jit(batched)(y0s))
+    mapped = jax.shard_map(batched, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
+    programs = {
+        "automatic sharding": jax.jit(batched).lower(spread).compile(),
+        "shard_map": jax.jit(mapped).lower(spread).compile(),
+    }
+    found = {name: np.asarray(program(spread)) for name, program in programs.items()}
+    found["pmap"] = np.asarray(jax.pmap(batched)(y0s.reshape(8, -1, 3))).reshape(LANES, 3)
+    print(
+        json.dumps(
+            {
+                "equal": {name: np.array_equal(ys, alone) for name, ys in found.items()},
+                "ulps": {
+                    name: float(np.max(np.abs(ys - alone) / np.spacing(np.abs(alone))))
+                    for name, ys in found.items()
+                },
+                "spread": len(programs["shard_map"](spread).sharding.device_set),
+                "all-reduces": {
+                    name: program.as_text().count(" all-reduce(")
+                    for name, program in programs.items()
+                },
+            }
+        )
+    )
+
+
+def one_of_two_processes(port, index):
+    """Half of the lanes each, in one program; prints whether this half is that of one process."""
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.distributed.initialize(f"localhost:{port}", num_processes=2, process_id=int(index))
+    assert jax.process_count() == 2
+    assert jax.device_count() == 2
+    mesh = jax.make_mesh((2,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
+    y0s = jax.vmap(dfc.systems.RigidBody().sample)(jax.random.split(jax.random.key(0), LANES))
+    y0s = np.asarray(y0s)
+    alone = np.asarray(jax.jit(jax.vmap(solve))(y0s))
+    sharding = NamedSharding(mesh, PartitionSpec("lanes"))
+    spread = jax.make_array_from_callback(y0s.shape, sharding, lambda index: y0s[index])
+    ys = jax.jit(jax.vmap(solve))(spread)
+    (shard,) = ys.addressable_shards
+    equal = np.array_equal(np.asarray(shard.data), alone[shard.index])
+    largest = float(jax.jit(jnp.max)(ys))  # of the lanes of both processes
+    print(json.dumps({"equal": equal, "lanes": len(shard.data), "largest": largest}))
+    assert largest == np.max(alone)
+
+
+def start(devices, *arguments):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.test_devices", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def answer(process):
+    out, err = process.communicate(timeout=600)
+    assert process.returncode == 0, err
+    return json.loads(out.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def spread():
+    return answer(start(8, "spread_over_eight_devices"))
+
+
+@pytest.mark.parametrize("way", ["automatic sharding", "shard_map", "pmap"])
+def test_a_batch_over_eight_devices_is_the_batch_on_one(spread, way):
+    assert spread["spread"] == 8
+    assert spread["equal"][way], f"up to {spread['ulps'][way]} ulp apart"
+
+
+def test_shard_map_has_no_communication(spread):
+    assert spread["all-reduces"]["shard_map"] == 0
+
+
+def test_a_batch_over_two_processes_is_the_batch_in_one():
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    processes = [start(1, "one_of_two_processes", port, index) for index in range(2)]
+    for found in map(answer, processes):
+        assert found["equal"]
+        assert found["lanes"] == LANES // 2
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,36 @@
+"""A law over many cases, of which `make test` runs some and `make slow` the others."""
+
+import itertools
+import zlib
+from collections.abc import Callable, Iterable
+
+import pytest
+
+
+def some_of(arguments: str, cases: Iterable, *, ids: Iterable[str], period: int) -> Callable:
+    """Parametrises a test by all `cases`; one in `period` runs by default, others for each test.
+
+    Which ones follows from the name of the test, so that several laws reach all cases together.
+    """
+
+    def decorate(test: Callable) -> Callable:
+        first = zlib.crc32(test.__name__.encode()) % period
+        params = [
+            pytest.param(
+                *(case if "," in arguments else (case,)),
+                id=name,
+                marks=() if i % period == first else pytest.mark.slow,
+            )
+            for i, (case, name) in enumerate(zip(cases, ids, strict=True))
+        ]
+        return pytest.mark.parametrize(arguments, params)(test)
+
+    return decorate
+
+
+def combinations(*choices: dict) -> dict[str, tuple]:
+    """All combinations of named choices, named."""
+    return {
+        "-".join(names): tuple(choice[name] for choice, name in zip(choices, names, strict=True))
+        for names in itertools.product(*choices)
+    }
