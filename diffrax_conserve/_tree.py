@@ -23,6 +23,21 @@ def tree_sub(a: Y, b: Y) -> Y:
     return jtu.tree_map(lambda x, y: x - y, a, b)
 
 
+def tree_cancel(a: Y, b: Y) -> Y:
+    """`a - b`, where what is left of `a` up to its roundoff is zero.
+
+    A component whose true value is zero is then reached, and not only approached: by itself it
+    would never be small beside its own size.
+    """
+
+    def subtract(x: Array, y: Array) -> Array:
+        rest = x - y
+        roundoff = 2 * float(jnp.finfo(x.dtype).eps) * jnp.abs(x)
+        return jnp.where(jnp.abs(rest) <= roundoff, jnp.zeros_like(rest), rest)
+
+    return jtu.tree_map(subtract, a, b)
+
+
 def tree_scale(factor: RealScalarLike, a: Y) -> Y:
     """`factor * a`, in the dtypes of `a`."""
     return jtu.tree_map(lambda x: jnp.asarray(factor, x.dtype) * x, a)

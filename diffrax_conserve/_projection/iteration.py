@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_mul, tree_scale, tree_sub
+from .._tree import tree_cancel, tree_mul, tree_scale, tree_sub
 from .elimination import Vector
 from .jacobian import AbstractJacobian
 from .linearise import Elements, Joined, linearise
@@ -54,23 +54,27 @@ class Iterate(NamedTuple):
 
 class _Carry(NamedTuple):
     unfinished: Bool[Array, ""]
+    returned: Bool[Array, ""]  # to `best`, from a state that was worse
     damping: Array
-    last: Array
-    iterate: Iterate
+    merit: Array  # of `best`
+    y: Y
+    multiplier: Vector
+    best: Iterate
 
 
 def iterate(
     equations: Equations, *, frozen: bool, max_steps: int, enabled: Bool[Array, ""] | bool = True
-) -> Iterate:
-    r"""Newton's method from the candidate.
+) -> tuple[Vector, Iterate]:
+    r"""Newton's method from the candidate: the residual there, and where it ends.
 
     Each step solves $(G(y) M^{-1} B^\top + D)\, \Delta = g(y)$ and moves $y$ by
     $-M^{-1} B^\top \Delta$. With `frozen`, $B$ is the Jacobian at the candidate, so that the
     result is $\hat y + M^{-1} B^\top \lambda$; otherwise it is that at $y$, which is a Gauss-Newton
     iteration. The damping $D = \mu \min(10^{-2}, |g|^2)$, relative to the diagonal, vanishes with
     the relative residual: it passes near points where gradients are parallel, and convergence is
-    quadratic elsewhere. A step that does not reduce the residual is not made, but tried again with
-    ten times the $\mu$, as in the method of Levenberg and Marquardt.
+    quadratic elsewhere. From a state whose residual is larger than the last one the iteration goes
+    back, and takes that step again with ten times the $\mu$, as in the method of Levenberg and
+    Marquardt.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
     first = equations.scale(at_candidate, equations.candidate)
@@ -78,37 +82,44 @@ def iterate(
     # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
     # and then never ends: so the condition is evaluated once, and carried.
     def body(carry: _Carry) -> _Carry:
-        _, damping, last, (y, multiplier, _, _, count) = carry
+        _, returned, damping, last, y, multiplier, best = carry
         g, jacobian = linearise(equations.residual, y)
         scale = equations.scale(jacobian, y)
         merit = _squares(g, scale)
+        better = (_squares(g, best.scale) < last) & (merit < jnp.inf)
+        stays = better | returned
+        count = best.num_steps + (better & ~returned & (last < jnp.inf)).astype(int)
+        success = within(g, equations.tolerance(scale))
+        stalled = returned | (merit > 0.25 * last)
+        ended = success & (equations.safely_satisfied(g, scale) | stalled)
+        # Without a first state there is none to return to.
+        lost = ~stays & ((damping > _MOST_DAMPING) | ~(last < jnp.inf))
+        unfinished = ~lost & ~(stays & (ended | (count >= max_steps)))
+
         base = at_candidate if frozen else jacobian
         # Near a state of which all terms vanish the residual is never small beside them.
         vanishing = jnp.minimum(1e-2, _squares(g, jtu.tree_map(jnp.maximum, scale, first)))
         change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
-        trial = tree_sub(y, equations.correction(base, change))
-        better = _squares(equations.residual(trial), scale) < merit
+        trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
 
-        success = within(g, equations.tolerance(scale))
-        ended = success & (equations.safely_satisfied(g, scale) | (merit > 0.25 * last) | ~better)
-        moves = better & ~ended & (count < max_steps)
-        stuck = jnp.where(better, count >= max_steps, damping > _MOST_DAMPING)
-        unfinished = ~ended & ~stuck & (merit < jnp.inf)
-        y, multiplier = jtu.tree_map(
-            lambda a, b: jnp.where(moves, a, b),
-            (trial, tree_sub(multiplier, change)),
-            (y, multiplier),
-        )
-        damping = jnp.where(better, jnp.maximum(0.1 * damping, 1.0), 10.0 * damping)
-        last = jnp.where(better, merit, last)
-        new = Iterate(y, multiplier, g, scale, count + moves.astype(count.dtype))
-        return _Carry(unfinished, damping, last, new)
+        def choose(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
+            return jtu.tree_map(lambda a, b: jnp.where(stays, a, b), a, b)
 
-    zeros = jtu.tree_map(jnp.zeros_like, before)
-    one = jnp.ones_like(jtu.tree_leaves(before)[0], shape=())
-    start = Iterate(equations.candidate, zeros, before, zeros, jnp.asarray(0))
-    carry = _Carry(jnp.asarray(enabled), one, one * jnp.inf, start)
-    return lax.while_loop(lambda carry: carry.unfinished, body, carry).iterate
+        best = choose(Iterate(y, multiplier, g, scale, count), best)
+        y, multiplier = choose(trial, (best.y, best.multiplier))
+        less = jnp.where(returned, damping, jnp.maximum(0.1 * damping, 1.0))
+        damping, merit = choose((less, merit), (10.0 * damping, last))
+        return _Carry(unfinished, ~stays, damping, merit, y, multiplier, best)
+
+    # All that a batch carries is batched from the start: else jax traces the body again to see it.
+    enabled = jnp.asarray(enabled)
+    zero = jnp.where(enabled, 0, 0)
+    zeros = jtu.tree_map(lambda x: jnp.zeros_like(x) + zero.astype(x.dtype), before)
+    one = 1 + zero.astype(jtu.tree_leaves(before)[0].dtype)
+    y = equations.candidate
+    start = Iterate(y, zeros, before, first, zero)
+    carry = _Carry(enabled, zero > 0, one, one * jnp.inf, y, zeros, start)
+    return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
 
 
 def _squares(g: Vector, scale: Vector) -> Array:

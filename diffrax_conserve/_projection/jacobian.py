@@ -21,6 +21,7 @@ from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
 # Up to this many constraints are unrolled: the ten integrals of gravitating bodies. Compile time
 # grows as m³, against a loop that costs some microseconds however small the matrix.
 UNROLLED_MAX = 10
+_UNROLLED_IN_ARRAYS_MAX = 3
 
 
 class AbstractJacobian(eqx.Module):
@@ -157,7 +158,7 @@ class Dense(AbstractJacobian):
             return _contract(row.reshape(m, -1), weighted.reshape(m, -1).T).astype(dtype)
 
         gram = ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(product, rows, columns, weights)))
-        if len(gram) > UNROLLED_MAX:
+        if len(gram) > _UNROLLED_IN_ARRAYS_MAX:
             solver = dense_solver(gram, damping)
         else:
             unrolled = unrolled_solver([[*row] for row in gram], damping)

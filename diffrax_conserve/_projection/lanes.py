@@ -1,5 +1,6 @@
 """A branch that few lanes of a batch take, at the cost of those few."""
 
+import functools as ft
 import math
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -52,16 +53,16 @@ def continue_if_any(
         out = _lanes(flags, states, batch, shared)
         return out, jtu.tree_map(lambda _: True, out)
 
+    # The loop of a solve is traced more than once. Compiled functions are traced once.
+    finish = jax.jit(ft.partial(_finish, lane), inline=True)
+
     # A batch of batches is one batch.
     @jax.custom_batching.custom_vmap
     def _lanes(flags, states, batch, shared):
-        def taken(flags, states, batch, shared):
-            return _finish(lane, flags, states, batch, shared)
-
         def not_taken(flags, states, batch, shared):
             return states
 
-        return lax.cond(jnp.any(flags), taken, not_taken, flags, states, batch, shared)
+        return lax.cond(jnp.any(flags), finish, not_taken, flags, states, batch, shared)
 
     @_lanes.def_vmap
     def batch_of_batches(size, axes, flags, states, batch, shared):

@@ -13,7 +13,9 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Real
 
 from .._custom_types import Y
@@ -87,6 +89,15 @@ def written_out(
         return Elements.of(residual, y), tuple(magnitude), _same, _same
     fns, split, join = converted
     return Elements(fns), tuple(magnitude), split, join
+
+
+def flattened(residual: Joined, y: Y) -> tuple[Joined, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same residual of states in one vector, if their dtypes agree, and the maps to it and
+    back: fewer operations, each on more numbers."""
+    if len({x.dtype for x in jtu.tree_leaves(y)}) > 1:
+        return residual, _same, _same
+    _, join = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, y))
+    return Joined(lambda x: residual.parts(join(x))), lambda y: jfu.ravel_pytree(y)[0], join
 
 
 def _same(y: Y) -> Y:

@@ -114,8 +114,7 @@ Newton.__init__.__doc__ = NEWTON_OPTIONS
 
 @eqx.filter_custom_jvp
 def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, ProjectionInfo]:
-    reached = iterate(equations, frozen=False, max_steps=max_steps)
-    before = equations.residual(equations.candidate)
+    before, reached = iterate(equations, frozen=False, max_steps=max_steps)
     nearest, multiplier, along = _nearest(equations, reached.y, max_steps)
 
     def residuals(y: Y) -> tuple[Vector, Vector]:

@@ -14,7 +14,16 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_add, tree_mul, tree_scale, tree_sub, tree_tangents, working_dtype
+from .._tree import (
+    tree_add,
+    tree_cancel,
+    tree_mul,
+    tree_scale,
+    tree_size,
+    tree_sub,
+    tree_tangents,
+    working_dtype,
+)
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
@@ -29,7 +38,7 @@ from .certainty import certain
 from .elimination import Vector
 from .iteration import Equations, iterate
 from .lanes import continue_if_any
-from .linearise import Joined, Residual, as_array, linearise, written_out
+from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
 from .residual import Tolerance
 
 
@@ -94,6 +103,9 @@ SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS
 
 # The state, the multipliers, the number of iterations and the verdict.
 _State = tuple[Y, Vector, Int[Array, ""], Outcome]
+# Up to so many products in a Gram matrix, further iterations are in scalars too. They are twice as
+# fast, but the time to compile them grows with that number.
+_RARE_SCALARS_MAX = 64
 # How many starts between the candidate and the anchor are tried.
 _STARTS = 8
 
@@ -102,14 +114,15 @@ _STARTS = 8
 def _project(
     equations: Equations, anchor: Y | None, *, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    inline, join = _written_out(equations)
+    inline, join = _in_scalars(equations)
     before, jacobian = linearise(inline.residual, inline.candidate)
     gram_solver = jacobian.gram_solver(inline.weights)
     y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
     at_y, count = jacobian, min(jacobian.inline_steps, max_steps)
-    for _ in range(count):
+    for step in range(count):
         change = gram_solver.solve(g)
-        y = tree_sub(y, inline.correction(jacobian, change))
+        subtract = tree_cancel if step == count - 1 else tree_sub
+        y = subtract(y, inline.correction(jacobian, change))
         multiplier = tree_sub(multiplier, change)
         g, at_y = linearise(inline.residual, y)
     done = inline.safely_satisfied(g, inline.scale(at_y, y))
@@ -125,20 +138,32 @@ def _project(
     return y, multiplier, info
 
 
-def _written_out(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
+def _in_scalars(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
     """The same equations in scalars, if they are few and small, and the map from their states."""
     assert isinstance(equations.residual, Joined)
     residual, magnitude, split, join = written_out(
         equations.residual, equations.magnitude, equations.candidate
     )
-    inline = dataclasses.replace(
+    return _of_states(equations, residual, split, magnitude=magnitude), join
+
+
+def _in_vectors(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
+    """The same equations with a state in one array, and the map from such states."""
+    assert isinstance(equations.residual, Joined)
+    residual, split, join = flattened(equations.residual, equations.candidate)
+    return _of_states(equations, residual, split), join
+
+
+def _of_states(
+    equations: Equations, residual: Joined | Elements, split: Callable[[Y], Y], **changes: Vector
+) -> Equations:
+    return dataclasses.replace(
         equations,
         residual=residual,
         candidate=split(equations.candidate),
         weights=split(equations.weights),
-        magnitude=magnitude,
+        **changes,
     )
-    return inline, join
 
 
 def _finish(
@@ -154,10 +179,11 @@ def _finish(
     equations, anchor = operands
 
     def attempt(equations: Equations, enabled: Bool[Array, ""]) -> _State:
-        inline, join = _written_out(equations)
-        last = iterate(inline, frozen=True, max_steps=max_steps, enabled=enabled)
-        before = inline.residual(inline.candidate)
-        outcome = Outcome.of(before, last.g, last.scale, inline.tolerance)
+        products = equations.magnitude.size**2 * tree_size(equations.candidate)
+        convert = _in_scalars if products <= _RARE_SCALARS_MAX else _in_vectors
+        equations, join = convert(equations)
+        before, last = iterate(equations, frozen=True, max_steps=max_steps, enabled=enabled)
+        outcome = Outcome.of(before, last.g, last.scale, equations.tolerance)
         return join(last.y), as_array(last.multiplier), last.num_steps, outcome
 
     if anchor is None:
