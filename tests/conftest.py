@@ -18,6 +18,9 @@ CACHE = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
 CACHE_BYTES_MAX = 2**30
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+# The interpreters that tests start share it.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 # Before the first import of the package: its annotations are then checked at every call.
 install_import_hook("diffrax_conserve", "beartype.beartype")

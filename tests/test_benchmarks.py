@@ -319,6 +319,7 @@ def test_the_pools_results_are_what_the_documentation_shows(monkeypatch):
     assert pool.table(json.loads(pool.OUT.read_text())) in page
 
 
+@pytest.mark.slow
 def test_a_smoke_run_of_the_paper():
     standard, conservative = benchmark("paper").main(["--smoke"])
     assert standard["plain"]["drift"] > 1e-6

@@ -116,6 +116,7 @@ def test_a_window_is_learned_to_ten_digits():
     assert log.skipped == 0
 
 
+@pytest.mark.slow
 def test_windows_follow_each_other():
     pinn = turns(9.0, windows=3)
     recipe = dfc.learned.second_order(pinn, epochs=15)
@@ -142,6 +143,7 @@ def test_a_window_knows_what_time_it_is():
     np.testing.assert_allclose(jax.vmap(pinn)(ts)[:, 0], ts**2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_conservative_window_is_trained_through_its_layer():
     pinn = turns(3.0, layer=dfc.learned.ConservativeLayer(RADIUS, steps=3))
     pinn, _ = dfc.fit(pinn, oscillator, key=KEY, recipe=dfc.learned.second_order(pinn, epochs=40))
