@@ -23,28 +23,25 @@ _SHARES = 8
 
 
 def continue_if_any(
-    fn: Callable[[Bool[Array, ""], _State, Any], _State],
+    fn: Callable[[Bool[Array, ""], Any], _State],
     flag: Bool[Array, ""],
     state: _State,
     operands: Any,
 ) -> _State:
-    """`fn(flag, state, operands)` if `flag` is set, and `state` if not.
+    """`fn(flag, operands)` if `flag` is set, and `state` if not.
 
     In a batch, the lanes whose flag is set are gathered, some at a time, finished by one copy of
-    `fn`, and put back. (A `lax.cond` in a batch runs both branches for every lane.) `fn` must leave
-    a lane alone whose flag is not set, and may close over no arrays.
+    `fn`, and put back. (A `lax.cond` in a batch runs both branches for every lane.) What `fn`
+    returns for a lane whose flag is not set is not used. It may close over no arrays.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
-    def lane(flag: Array, state: _State, arrays: Any) -> _State:
-        return fn(flag, state, eqx.combine(arrays, static))
+    def lane(flag: Array, arrays: Any) -> _State:
+        return fn(flag, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
     def alone(flag, state, arrays):
-        def taken(state, arrays):
-            return lane(flag, state, arrays)
-
-        return lax.cond(flag, taken, lambda state, _: state, state, arrays)
+        return lax.cond(flag, lambda: lane(flag, arrays), lambda: state)
 
     @alone.def_vmap
     def batched(size, axes, flag, state, arrays):
@@ -101,10 +98,10 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
             def taken(x: Array) -> Array:
                 return x.at[index].get(mode="clip")
 
-            def finished(flag: Array, state: Any, batch: Any) -> Any:
-                return lane(flag, state, eqx.combine(batch, shared))
+            def finished(flag: Array, batch: Any) -> Any:
+                return lane(flag, eqx.combine(batch, shared))
 
-            out = jax.vmap(finished)(index < length, *jtu.tree_map(taken, (states, batch)))
+            out = jax.vmap(finished)(index < length, jtu.tree_map(taken, batch))
             return jtu.tree_map(lambda x, y: x.at[index].set(y, mode="drop"), states, out)
 
         return start + width, jax.vmap(of_block)(states, batch, index)

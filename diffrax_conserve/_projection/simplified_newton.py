@@ -167,12 +167,9 @@ def _of_states(
 
 
 def _finish(
-    max_steps: int,
-    unfinished: Bool[Array, ""],
-    state: _State,
-    operands: tuple[Equations, Y | None],
+    max_steps: int, unfinished: Bool[Array, ""], operands: tuple[Equations, Y | None]
 ) -> _State:
-    """All iterations, from the candidate; not at all unless `unfinished`.
+    """All iterations, from the candidate; none unless `unfinished`.
 
     With an anchor, a state near the manifold, they start again halfway to it where they fail.
     """
@@ -187,10 +184,8 @@ def _finish(
         return join(last.y), as_array(last.multiplier), last.num_steps, outcome
 
     if anchor is None:
-        new = attempt(equations, unfinished)
-    else:
-        new = _from_between(attempt, equations, anchor, unfinished)
-    return jtu.tree_map(lambda a, b: jnp.where(unfinished, a, b), new, state)
+        return attempt(equations, unfinished)
+    return _from_between(attempt, equations, anchor, unfinished)
 
 
 _Attempts = tuple[Bool[Array, ""], Int[Array, ""], _State]
