@@ -116,21 +116,21 @@ def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
 def error_of_training(
     panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]],
 ) -> Figure:
-    """Errors against the seconds of training: one panel for each problem, one curve for each kind
+    """Errors against the epochs of training: one panel for each problem, one curve for each kind
     of error."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(3.5 * len(panels), 2.7), layout="constrained")
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for ax, (title, curves) in zip(axes, panels.items(), strict=True):
-            for name, (seconds, errors) in curves.items():
+            for name, (epochs, errors) in curves.items():
                 ax.plot(
-                    seconds, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
+                    epochs, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
                 )
             ax.set_xlim(left=0)
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_yscale("log")
             ax.set_title(title)
-            ax.set_xlabel("processor time of the training (s)")
+            ax.set_xlabel("epochs of training")
         axes[0].set_ylabel("error")
         _legend(figure, *axes[0].get_legend_handles_labels())
         return figure
