@@ -420,7 +420,9 @@ def cells(kind, rows):
         ]
     if kind == "ns":
         return [nanoseconds(label) for label in ("plain", "projected", "RK4", "projected RK4")]
-    labels, first = (("RK4", "projected RK4"), []) if kind == "RK4" else (("plain", "projected"), first)
+    labels, first = (
+        (("RK4", "projected RK4"), []) if kind == "RK4" else (("plain", "projected"), first)
+    )
     return [
         *first,
         error(labels[0], "one_step_rms"),

@@ -358,7 +358,9 @@ def test_a_smoke_run_of_learning_from_data():
 
 def test_the_results_of_learning_from_data_are_what_the_documentation_shows():
     learning = benchmark("learning_from_data")
-    page = (FOLDER.parent / "docs" / "appendix" / "learning-from-data.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "learning-from-data.md").read_text(
+        encoding="utf-8"
+    )
     lines = list(learning.table(json.loads(learning.OUT.read_text())))
     assert len(lines) > 20
     assert [line for line in lines if line not in page] == []

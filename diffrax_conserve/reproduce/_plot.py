@@ -123,9 +123,7 @@ def error_of_training(
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for ax, (title, curves) in zip(axes, panels.items(), strict=True):
             for name, (epochs, errors) in curves.items():
-                ax.plot(
-                    epochs, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
-                )
+                ax.plot(epochs, errors, "o-", markersize=3, label=name, color=_colour(name, curves))
             ax.set_xlim(left=0)
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_yscale("log")

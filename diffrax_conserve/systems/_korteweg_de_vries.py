@@ -51,7 +51,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
     name: ClassVar[str] = "korteweg-de-vries"
     title: ClassVar[str] = "Korteweg-de Vries equation, a soliton"
     citation: ClassVar[str] = (
-        "P. G. Drazin and R. S. Johnson, Solitons: an Introduction, Cambridge University Press 1989."
+        "P. G. Drazin and R. S. Johnson, Solitons: an Introduction, Cambridge 1989."
     )
     t1: ClassVar[float] = 16.0
     dt: ClassVar[float] = 0.008

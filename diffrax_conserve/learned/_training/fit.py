@@ -63,7 +63,7 @@ def fit(
     sample: Sampler | None = None,
     args: Args = None,
     recipe: Recipe | None = None,
-    manifold: Manifold = None,
+    manifold: Manifold | None = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone: no solution is needed.
