@@ -224,7 +224,7 @@ def _solve(fn, unknowns: PyTree[Array], right: PyTree[Array]) -> PyTree[Array]:
     operator = lx.MatrixLinearOperator(jnp.where(finite, scaled, jnp.eye(x.size, dtype=x.dtype)))
     # Dependent constraints make the system singular but consistent.
     solver = lx.SVD(rcond=64 * float(jnp.finfo(x.dtype).eps))
-    solution = lx.linear_solve(operator, jnp.where(finite, b / rows, 0), solver).value
+    solution = lx.linear_solve(operator, jnp.where(finite, b / rows, 0), solver, throw=False).value
     return unravel(jnp.where(finite, 1, jnp.nan) * solution / columns)
 
 

@@ -46,6 +46,7 @@ class Own(eqx.Module):
     """Any function as a flow map."""
 
     function: Any
+    weight: Any = eqx.field(default_factory=lambda: jnp.zeros(()))
     max_step: float = 1.0
 
     def __call__(self, y0, h):
@@ -360,14 +361,17 @@ def test_a_pool_that_cannot_be(options, error, match):
         dfc.learned.Pool(**(dict(sample=near_east) | options))
 
 
-def test_given_states_are_no_sampler():
-    """As users see it: the run-time type checker of the suite would answer first."""
+@pytest.fixture
+def as_users_see_it():
+    """Without the run-time type checker of the suite, which would answer first."""
     jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        with pytest.raises(TypeError, match=r"Pool\(FromStates\(states\)\)"):
-            dfc.learned.Pool(Y0S)  # pyright: ignore
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_given_states_are_no_sampler(as_users_see_it):
+    with pytest.raises(TypeError, match=r"Pool\(FromStates\(states\)\)"):
+        dfc.learned.Pool(Y0S)  # pyright: ignore
 
 
 @pytest.mark.parametrize("refresh", [None, 40, 100])
@@ -376,7 +380,7 @@ def test_a_pool_that_would_never_grow(refresh):
         train(refresh=refresh)
 
 
-def test_a_pool_for_something_else():
+def test_a_pool_for_something_else(as_users_see_it):
     pinn = dfc.PINN(EAST, 0.0, 1.0, key=KEY, **SMALL)
     with pytest.raises(ValueError, match="leave `sample` out"):
         dfc.fit(pinn, oscillator, key=KEY, sample=dfc.learned.Pool(near_east))
