@@ -65,7 +65,7 @@ class Pool(eqx.Module):
     """
 
     sample: Sampler
-    manifold: Manifold = eqx.field(kw_only=True, default=None)
+    manifold: Manifold | None = eqx.field(kw_only=True, default=None)
     mean_steps: RealScalarLike = eqx.field(kw_only=True, default=20)
     max_defect: RealScalarLike = eqx.field(kw_only=True, default=1.0)
     keep: Callable[[Any], Bool[Array, ""]] | None = eqx.field(kw_only=True, default=None)
@@ -136,7 +136,7 @@ def moved(
     return jax.vmap(state)(y0s, lengths, fresh, goes_on)
 
 
-def _projected(manifold: Manifold, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
+def _projected(manifold: Manifold | None, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
     """The end of a step, on the manifold through its start, and whether it got there."""
     if manifold is None:
         return end, jnp.asarray(True)
