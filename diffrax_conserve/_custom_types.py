@@ -1,7 +1,7 @@
 """The type aliases of the package: jaxtyping shapes under the names that diffrax uses."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree, Real, Shaped
@@ -36,5 +36,5 @@ if TYPE_CHECKING:
     # The state's type comes back.
     State = TypeVar("State")
 else:
-    Manifold = Any
+    Manifold = Annotated[Any, "FirstIntegral, Constraint, or a PyTree of them"]
     State = Y

@@ -24,8 +24,8 @@ SCHEMES = {"dark": 0, "light": 1}
 HARNESS = "seen-in-a-browser.html"
 SECONDS_MAX = 240
 
-# Every page in a frame as wide as the screen, one after the other. What is wider than the screen may
-# only be what scrolls by itself, as code, formulas and tables do.
+# Every page in a frame as wide as the screen, one after the other. Only what scrolls by itself, as
+# code, formulas and tables do, may be wider than the screen.
 SCRIPT = """
 <!doctype html><body><script>
 const pages = PAGES, widths = WIDTHS, found = [];

@@ -2,7 +2,8 @@
 
 The table of solvers in `solvers.md` is the one that the tests run.
 
-The link to the repository, at the foot of the pages, is the `place` of `pyproject.toml`, if there is one.
+The link to the repository, at the foot of the pages, is the `place` of `pyproject.toml`, if there
+is one.
 
 Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
 

@@ -120,18 +120,21 @@ def _run_one(page: Page, block: Block, module: types.ModuleType) -> str:
 
 
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\bnan\b|\binf\b)")
-# What is smaller is roundoff, which differs between machines.
-ROUNDOFF = 1e-12
 
 
-def agree(printed: str, shown: str) -> bool:
+def roundoff(page: Page) -> float:
+    """What is smaller may be roundoff, which differs between machines."""
+    return 1e-12 if any("jax_enable_x64" in block.code for block in page.blocks) else 1e-5
+
+
+def agree(printed: str, shown: str, roundoff: float = 1e-12) -> bool:
     """Whether what was printed is what the page shows, up to the last digit of its numbers."""
     texts = [" ".join(NUMBER.sub("#", text).split()) for text in (printed, shown)]
     pairs = zip(NUMBER.findall(printed), NUMBER.findall(shown), strict=False)
-    return texts[0] == texts[1] and all(_numbers_agree(*pair) for pair in pairs)
+    return texts[0] == texts[1] and all(_numbers_agree(*pair, roundoff) for pair in pairs)
 
 
-def _numbers_agree(printed: str, shown: str) -> bool:
+def _numbers_agree(printed: str, shown: str, roundoff: float) -> bool:
     if printed == shown:
         return True
     a, b = float(printed), float(shown)
@@ -140,7 +143,7 @@ def _numbers_agree(printed: str, shown: str) -> bool:
     if mantissa == shown.lstrip("+-") and "." not in shown:
         return abs(a - b) <= 0.01 * larger  # a number of steps
     digits = min(len(mantissa.replace(".", "").lstrip("0")), 4)
-    return larger < ROUNDOFF or abs(a - b) <= 5 * 10.0**-digits * larger
+    return larger < roundoff or abs(a - b) <= 5 * 10.0**-digits * larger
 
 
 def write(file: Path) -> None:

@@ -10,7 +10,7 @@ import sys
 import jax
 import pytest
 
-from .pages import FIGURES, PAGES, ROOT, agree, blocks, example_pages, run
+from .pages import FIGURES, PAGES, ROOT, agree, blocks, example_pages, roundoff, run
 
 EXAMPLES = [page for page in example_pages() if page.blocks]
 
@@ -30,7 +30,7 @@ def new_interpreter(tmp_path, monkeypatch):
 def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
     write = f"`python -m tests.pages {page.file.relative_to(ROOT)}` writes it"
     for block, printed in run(page):
-        assert agree(printed, block.shown), (
+        assert agree(printed, block.shown, roundoff(page)), (
             f"below the code of line {block.line} the page shows\n{block.shown}\n"
             f"but this was printed ({write}):\n{printed}"
         )
@@ -38,6 +38,34 @@ def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
     for figure in new_interpreter.glob("*.svg"):
         assert (FIGURES / figure.name).exists(), f"the figure is not kept: {write}"
         assert f"images/pages/{figure.name})" in text, f"{figure.name} is not on the page"
+
+
+GUIDES = sorted((ROOT / "docs").glob("*.md"))
+SHOWN_EXAMPLES = [page for page in EXAMPLES if page.file.parent.name == "examples"]
+
+
+@pytest.mark.parametrize("file", GUIDES, ids=lambda file: file.stem)
+def test_guides_are_short(file):
+    assert len(file.read_text(encoding="utf-8").split()) <= 1500
+
+
+@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(ROOT).as_posix())
+def test_tables_fit_on_a_screen(file):
+    heads = re.findall(r"^(\|.*\|)\n\|[-|: ]+\|$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [head for head in heads if head.count("|") - 1 > 7] == []
+
+
+def test_there_are_ten_examples():
+    assert len(SHOWN_EXAMPLES) >= 10
+
+
+@pytest.mark.parametrize("page", SHOWN_EXAMPLES, ids=lambda page: page.file.stem)
+def test_an_example_is_short_and_has_a_figure_and_output(page):
+    lines = [line for block in page.blocks for line in block.code.splitlines() if line.strip()]
+    assert len(lines) <= 60
+    assert any(block.shown for block in page.blocks)
+    assert (FIGURES / f"{page.file.stem}.svg").exists()
+    assert f"images/pages/{page.file.stem}.svg)" in page.file.read_text(encoding="utf-8")
 
 
 def commands() -> list[str]:
@@ -110,6 +138,11 @@ def test_what_a_page_must_not_have_fails_the_build(html, tmp_path):
     else:
         assert len(found) == 1
         assert expected in found[0]
+
+
+def test_a_page_in_single_precision_has_another_roundoff():
+    assert agree("drift 1.2e-7", "drift 4e-8", 1e-5)
+    assert not agree("drift 1.2e-7", "drift 4e-8")
 
 
 AGREE = {

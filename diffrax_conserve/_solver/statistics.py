@@ -109,6 +109,18 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         )
         print(dfc.statistics(sol))
         ```
+
+        ```text
+        projections of the accepted steps
+          num_projections  90
+          num_iterations   180
+          max_iterations   2
+          residual_before  4.0e-08
+          residual_after   4.0e-08
+          correction       8.4e-08
+          rank             1
+          num_rejected     not counted; CountRejections counts them
+        ```
     """
     found = _instances(sol.solver_state, ProjectionStatistics)
     counts = _instances(sol.controller_state, RejectionCount)

@@ -51,8 +51,8 @@ def reproduce(
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
     With `anew` the networks of the paper's systems are trained first; otherwise they are those that
-    come with the package. `progress` is told what begins. Returns whether every solver succeeded. Raises `SetupError` before any
-    work is done.
+    come with the package. `progress` is told what begins. Returns whether every solver succeeded.
+    Raises `SetupError` before any work is done.
     """
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]

@@ -269,6 +269,10 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         )
         print(dfc.learned.domain_statistics(sol).fraction_outside)
         ```
+
+        ```text
+        0.0
+        ```
     """
 
     def is_found(x: Any) -> bool:

@@ -118,6 +118,10 @@ def fit(
         print(log.best, log.best_epoch)
         ```
 
+        ```text
+        0.005223008804023266 200
+        ```
+
     ??? cite "Reference"
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.

@@ -62,6 +62,10 @@ class Pool(eqx.Module):
         )
         print(network.domain.upper, trained.domain.upper)
         ```
+
+        ```text
+        [1.4831942 1.4630916 1.4979132] [1.6686324 1.4688746 2.2528794]
+        ```
     """
 
     sample: Sampler
