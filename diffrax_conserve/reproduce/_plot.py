@@ -52,6 +52,9 @@ _STYLE: dict[Any, Any] = {
     "savefig.dpi": 300,
 }
 
+# In the order of the solvers: shapes that can be told apart where they cover each other.
+_MARKERS = (("o", 5.0), (".", 3.0), ("s", 5.0), ("x", 4.0), ("^", 4.0))
+
 _Curves = dict[str, np.ndarray]  # by solver, or by part of the system
 
 
@@ -195,18 +198,18 @@ def _draw_paths(
         style = dict(color="#BDBDBD", linewidth=0.5 if _is_long(paths) else 1.5, zorder=1)
         ax.plot(*reference.T[:dimension], label="reference", **style)
     for i, (name, path) in enumerate(paths.items()):
-        # Large rings round small dots: one solver cannot hide another.
+        # Open shapes round each other: one solver cannot hide another.
         last = path[-_MARKED_MAX - 1 :].T[:dimension]
-        ring = dict(markersize=4.5, markerfacecolor="none")
-        dots = dict(markersize=max(2.6 - 0.4 * i, 0.8)) if len(paths) > 2 else dict(markersize=2.2)
+        marker, size = _MARKERS[i % len(_MARKERS)]
         ax.plot(
             *last,
             linestyle="none",
-            marker="o",
+            marker=marker,
+            markersize=size,
+            markerfacecolor="none",
             label=_NAMES.get(name, name),
             color=_colour(name, paths),
             zorder=2 + 0.1 * i,
-            **(ring if i == 0 else dots),
         )
     for axis, text in zip("xyz", axis_labels, strict=False):
         getattr(ax, f"set_{axis}label")(text)
