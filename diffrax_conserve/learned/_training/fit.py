@@ -115,11 +115,11 @@ def fit(
         pinn = dfc.PINN(system.y0, 0.0, 1.0, width=10, depth=2, key=jax.random.key(0))
         recipe = dfc.learned.paper(pinn, epochs=200, points=50)
         pinn, log = dfc.fit(pinn, system.vector_field, key=jax.random.key(1), recipe=recipe)
-        print(log.best, log.best_epoch)
+        print(f"loss {log.best:.0e} at epoch {log.best_epoch}")
         ```
 
         ```text
-        0.005223008804023266 200
+        loss 5e-03 at epoch 200
         ```
 
     ??? cite "Reference"

@@ -60,11 +60,11 @@ class Pool(eqx.Module):
         trained, log = dfc.fit(
             network, system.vector_field, sample=pool, recipe=recipe, key=jax.random.key(2)
         )
-        print(network.domain.upper, trained.domain.upper)
+        print(network.domain.upper.round(1), trained.domain.upper.round(1))
         ```
 
         ```text
-        [1.4831942 1.4630916 1.4979132] [1.6686324 1.4688746 2.2528794]
+        [1.5 1.5 1.5] [1.7 1.5 2.3]
         ```
     """
 
