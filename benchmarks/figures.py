@@ -9,22 +9,23 @@ from matplotlib.figure import Figure
 # M. Okabe and K. Ito's palette, told apart also by those who see fewer colours.
 ORANGE, SKY, GREEN, BLUE = "#E69F00", "#56B4E9", "#009E73", "#0072B2"
 RED, PURPLE, GREY, BLACK = "#D55E00", "#CC79A7", "#999999", "#000000"
+# One colour for one program, in every panel; the line tells how it was used.
 STYLES = {
     "plain Tsit5": (RED, "--", "o"),
     "projected Tsit5": (RED, "-", "o"),
+    "projected Tsit5, fixed steps": (RED, ":", "o"),
+    "projected Tsit5, unrolled": (ORANGE, "-", "o"),
     "plain Dopri8": (BLUE, "--", "s"),
     "projected Dopri8": (BLUE, "-", "s"),
-    "projected Dopri8, unrolled": (BLACK, "-", "s"),
-    "projected Tsit5, unrolled": (BLACK, ":", "o"),
-    "projected Tsit5, fixed steps": (ORANGE, "-", "o"),
-    "projected Dopri8, fixed steps": (SKY, "-", "s"),
-    "projected RK4, fixed steps": (PURPLE, "-", "^"),
+    "projected Dopri8, fixed steps": (BLUE, ":", "s"),
+    "projected Dopri8, unrolled": (SKY, "-", "s"),
     "plain RK4": (PURPLE, "--", "^"),
     "projected RK4": (PURPLE, "-", "^"),
+    "projected RK4, fixed steps": (PURPLE, ":", "^"),
     "CVODE, Adams": (GREY, "--", "v"),
     "CVODE, BDF with projection": (GREY, "-", "v"),
-    "scipy DOP853": (SKY, "--", "D"),
-    "homproj DOP853": (SKY, "-", "D"),
+    "scipy DOP853": (BLACK, "--", "D"),
+    "homproj DOP853": (BLACK, "-", "D"),
     "heyoka": (GREEN, "-", "*"),
     "heyoka, 8 at a time": (GREEN, "-", "*"),
     "heyoka, 16 at a time": (GREEN, ":", "*"),
@@ -45,14 +46,17 @@ LOOK: dict[Any, Any] = {
     "lines.markersize": 4,
     "legend.frameon": False,
     "savefig.dpi": 200,
+    "svg.hashsalt": "diffrax-conserve",
 }
 MAX_DRIFT = 1e-14
 
 
 def save(figure: Figure, path: Path) -> None:
+    """Writes `path` with the suffixes `.png` and `.svg`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(LOOK):
-        figure.savefig(path)
+        figure.savefig(path.with_suffix(".png"))
+        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
 
 
 def work_precision(results: dict[str, Any]) -> Figure:
@@ -63,17 +67,19 @@ def work_precision(results: dict[str, Any]) -> Figure:
         "batch": "rigid bodies, batch of 1,000",
     }
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(9.6, 4.4), layout="constrained")
-        axes = figure.subplots(1, 3)
+        # As wide as a page, so that the text keeps its size there.
+        figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+        *axes, key = figure.subplots(2, 2).flat
         legend = {}
         for ax, (part, title) in zip(axes, titles.items(), strict=True):
             for name, rows in results["parts"][part]["curves"].items():
                 legend.setdefault(name, _curve(ax, name, rows))
-            ax.set(xscale="log", yscale="log", title=title, xlabel="ms per trajectory to t = 100")
+            ax.set(xscale="log", yscale="log", title=title, xlabel="ms per trajectory")
             if ax.get_xlim()[1] < 100 * ax.get_xlim()[0]:
                 ax.xaxis.set_minor_formatter("")  # of powers of ten, which would overlap
-        axes[0].set_ylabel("error at t = 100")
-        figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4)
+            ax.set_ylabel("error at t = 100")
+        key.set_axis_off()
+        key.legend(legend.values(), legend.keys(), loc="center")
         return figure
 
 
@@ -91,8 +97,9 @@ def scaling(results: dict[str, Any]) -> Figure:
     """The batch, the constraints and the bodies, a panel each."""
     parts = results["parts"]
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(9.6, 3.8), layout="constrained")
-        axes = figure.subplots(1, 3)
+        figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+        *axes, empty = figure.subplots(2, 2).flat
+        empty.set_axis_off()
         for name in ("plain RK4", "projected RK4", "plain Tsit5", "projected Tsit5"):
             points = [(row["batch"], row["rows"][name]["ns"]) for row in parts["batch"]]
             colour, line, marker = STYLES[name]

@@ -256,12 +256,12 @@ def table(found):
     """The lines of the tables that the documentation shows."""
     marks = list(next(iter(found["unknown"].values()))["plain"]["error"])
     head = " | ".join(f"error, t = {t}" for t in marks)
-    yield f"| noise | trained | solved | {head} | largest | drift |"
-    yield "|---|---|---|" + "---|" * (len(marks) + 2)
+    yield f"| noise | trained, solved | {head} | largest | drift |"
+    yield "|---|---|" + "---|" * (len(marks) + 2)
     for noise, trainings in found["known"].items():
         for training, entry in trainings.items():
             for name, row in entry["solved"].items():
-                yield f"| {noise} | {training} | {name} | {cells(row)} |"
+                yield f"| {noise} | {training}, {name} | {cells(row)} |"
     yield ""
     yield f"| solver | projected on | {head} | largest | drift |"
     yield "|---|---|" + "---|" * (len(marks) + 2)

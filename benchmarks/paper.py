@@ -140,14 +140,14 @@ def record(system, kind, seed, epochs, network, log, ship, out=RESULTS):
 def table(results):
     """A Markdown table of all results, worst and best seed where there are several."""
     lines = [
-        "| system | network | seeds | loss | one step | largest error | projected | s |",
-        "|---|---|---|---|---|---|---|---|",
+        "| network | seeds | loss | one step | largest error | projected | s |",
+        "|---|---|---|---|---|---|---|",
     ]
     for name in SYSTEMS:
         for kind in KINDS:
             rows = [r for r in results if r["system"] == name and r["kind"] == kind]
             if rows:
-                lines.append("| " + " | ".join([f"`{name}`", kind, *cells(rows)]) + " |")
+                lines.append("| " + " | ".join([f"`{name}`, {kind}", *cells(rows)]) + " |")
     return "\n".join(lines)
 
 

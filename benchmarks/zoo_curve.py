@@ -1,8 +1,8 @@
-"""The error of the zoo's flow maps against the time of their training.
+"""The error of the zoo's flow maps against the length of their training.
 
     python benchmarks/zoo_curve.py            # trains with fewer epochs: ten minutes
     python benchmarks/zoo_curve.py --table    # only print the table of the results
-    python benchmarks/zoo_curve.py --figure docs/images/zoo-training.png
+    python benchmarks/zoo_curve.py --figure docs/images/zoo-training.svg
     python benchmarks/zoo_curve.py --smoke    # toy sizes, to see that it runs
 
 The last point of each curve is the network of the zoo with the same seed. One JSON file for each
@@ -75,11 +75,12 @@ def draw(results, path):
 
     panels = {}
     for name, points in results.items():
-        seconds = np.array([p["cpu_seconds"] for p in points])
+        # Not the seconds: other work on the cores puts some of them in the wrong order.
+        epochs = np.array([p["epochs"] for p in points])
         curves = {}
         for key, label in ERRORS.items():
             errors = [np.nan if p[key] is None else p[key] for p in points]
-            curves[label] = (seconds, np.array(errors))
+            curves[label] = (epochs, np.array(errors))
         panels[dfc.systems.get(name).title] = curves
     _plot.save(_plot.error_of_training(panels), Path(path))
 

@@ -1,3 +1,25 @@
+"""Keep any diffrax solve exactly on the manifold that its physics prescribes.
+
+Say what is conserved, wrap the solver, and leave the rest of `diffrax.diffeqsolve` as it is:
+
+    import diffrax, diffrax_conserve as dfc, jax.numpy as jnp
+
+    energy = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
+    term = diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -jnp.sin(y[0])]))
+    solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
+    solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
+
+What is conserved    FirstIntegral, Constraint, check_invariance, drift
+Solvers              ManifoldProjection, RK4, Unrolled, statistics
+Projections          SimplifiedNewton (the default), Newton, ClosedForm, project
+Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
+Systems              systems.get("kepler"), systems.names()
+Your own tests       import diffrax_conserve.testing
+
+A projection that fails is never reported as a success. Keeping the energy does not make a solution
+accurate: measure its error too.
+"""
+
 from . import learned as learned
 from . import systems as systems
 from ._diagnostics import InvarianceEntry as InvarianceEntry

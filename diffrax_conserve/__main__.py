@@ -43,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             anew=options.train,
             seed=options.seed or 0,
             epochs=options.epochs or 5000,
+            progress=lambda text: print(text, file=sys.stderr, flush=True),
         )
     except _reproduce.SetupError as error:
         parser.error(str(error))

@@ -1,7 +1,7 @@
 """The type aliases of the package: jaxtyping shapes under the names that diffrax uses."""
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree, Real, Shaped
@@ -22,7 +22,19 @@ DenseInfo = dict[str, PyTree[Array]]
 
 # The value of a constraint function, or a conserved value: any PyTree of real arrays.
 Values = PyTree[Real[ArrayLike, "..."]]
-# A PyTree of `FirstIntegral`s and `Constraint`s. (Not spelled as a `PyTree[...]`: those are
-# themselves PyTrees with leaves of any kind.)
-Manifold = Any
 ConstraintFn = Callable[[RealScalarLike, Any, Any], Values]
+
+# A PyTree of `FirstIntegral`s and `Constraint`s. (Not spelled as a `PyTree[...]`: those are
+# themselves PyTrees with leaves of any kind.) A type checker refuses a bare function, as we do.
+if TYPE_CHECKING:
+
+    class _Entry(Protocol):
+        @property
+        def fn(self) -> Callable[..., Any]: ...
+
+    Manifold: TypeAlias = "_Entry | Sequence[Manifold] | Mapping[Any, Manifold]"
+    # The state's type comes back.
+    State = TypeVar("State")
+else:
+    Manifold = Annotated[Any, "FirstIntegral, Constraint, or a PyTree of them"]
+    State = Y

@@ -172,6 +172,10 @@ def entry_name(manifold: Manifold, position: int) -> str:
         sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
         print(dfc.entry_name({"sphere": sphere}, 0))  # manifold['sphere']
         ```
+
+        ```text
+        manifold['sphere']
+        ```
     """
     names = [name for name, _ in named_entries(manifold)]
     if not 0 <= position < len(names):

@@ -1,6 +1,9 @@
-"""Two things that the pages cannot do themselves.
+"""Three things that the pages cannot do themselves.
 
 The table of solvers in `solvers.md` is the one that the tests run.
+
+The link to the repository, at the foot of the pages, is the `place` of `pyproject.toml`, if there
+is one.
 
 Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
 
@@ -9,6 +12,7 @@ network; a name that is not in it fails the strict build, as a misspelt name of 
 """
 
 import runpy
+import tomllib
 from pathlib import Path
 
 DIFFRAX = "https://docs.kidger.site/diffrax/api"
@@ -51,6 +55,8 @@ PAGES = {
     f"{OPTIMISTIX}/root_find/": "optimistix.root_find optimistix.Newton optimistix.Chord",
 }
 
+ROOT = Path(__file__).parent.parent
+
 # Described on a page, without an anchor of their own.
 MENTIONED = {"diffrax.RESULTS": f"{DIFFRAX}/solution/"}
 
@@ -62,9 +68,13 @@ def on_config(config):
             autorefs.register_url(name, f"{page}#{name}")
     for name, page in MENTIONED.items():
         autorefs.register_url(name, page)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    place = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["place"]
+    if place:
+        config.extra["social"] = [{"icon": "fontawesome/brands/git-alt", "link": place}]
 
 
-CONFORMANCE = Path(__file__).parent.parent / "tests" / "solver" / "conformance_table.py"
+CONFORMANCE = ROOT / "tests" / "solver" / "conformance_table.py"
 
 
 def on_page_markdown(markdown, **kwargs):

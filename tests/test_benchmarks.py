@@ -245,9 +245,11 @@ def test_the_figures_show_every_curve(tmp_path):
     report = benchmark("report")
     results = report.read_results()
     report.write_figures(results, tmp_path)
-    assert {x.name for x in tmp_path.iterdir()} == {"work-precision.png", "scaling.png"}
+    assert {x.name for x in tmp_path.iterdir()} == {
+        f"{name}.{suffix}" for name in ("work-precision", "scaling") for suffix in ("png", "svg")
+    }
     figure = report.figures.work_precision(results["work_precision"])
-    (legend,) = figure.legends
+    legend = figure.axes[-1].get_legend()
     parts = results["work_precision"]["parts"]
     names = {name for part in parts.values() for name in part.get("curves", ())}
     assert {text.get_text() for text in legend.get_texts()} == names
@@ -282,7 +284,7 @@ def test_a_smoke_run_of_the_zoo():
 
 def test_the_zoos_results_are_what_the_documentation_shows():
     zoo = benchmark("zoo")
-    page = (FOLDER.parent / "docs" / "zoo.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "zoo.md").read_text(encoding="utf-8")
     assert zoo.tables(benchmark("trained").read_results(zoo.RESULTS)) in page
 
 
@@ -298,7 +300,7 @@ def test_the_zoos_curve_is_what_the_documentation_shows(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(FOLDER)
     curve = benchmark("zoo_curve")
     results = curve.read_results()
-    page = (FOLDER.parent / "docs" / "zoo.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "zoo.md").read_text(encoding="utf-8")
     assert curve.table(results) in page
     curve.draw(results, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 1000
@@ -315,7 +317,7 @@ def test_a_smoke_run_of_the_pool(monkeypatch):
 def test_the_pools_results_are_what_the_documentation_shows(monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     pool = benchmark("pool")
-    page = (FOLDER.parent / "docs" / "training.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "training.md").read_text(encoding="utf-8")
     assert pool.table(json.loads(pool.OUT.read_text())) in page
 
 
@@ -331,7 +333,7 @@ def test_a_smoke_run_of_the_paper():
 def test_the_papers_results_are_what_the_documentation_shows():
     """The table of all seeds is that of the result files."""
     paper = benchmark("paper")
-    page = (FOLDER.parent / "docs" / "paper.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "paper.md").read_text(encoding="utf-8")
     assert paper.table(benchmark("trained").read_results(paper.RESULTS)) in page
 
 
@@ -357,7 +359,9 @@ def test_a_smoke_run_of_learning_from_data():
 
 def test_the_results_of_learning_from_data_are_what_the_documentation_shows():
     learning = benchmark("learning_from_data")
-    page = (FOLDER.parent / "docs" / "learning-from-data.md").read_text(encoding="utf-8")
+    page = (FOLDER.parent / "docs" / "appendix" / "learning-from-data.md").read_text(
+        encoding="utf-8"
+    )
     lines = list(learning.table(json.loads(learning.OUT.read_text())))
     assert len(lines) > 20
     assert [line for line in lines if line not in page] == []

@@ -57,6 +57,13 @@ def rotation(t):
     return np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
 
 
+def test_it_says_what_it_is_doing_before_it_is_done(tmp_path, capsys):
+    reproduce(tmp_path, "kepler", "--t1", "1")
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "[1/2] rk4: compiles and solves"
+    assert said[1] == "[2/2] projected rk4: compiles and solves"
+
+
 def test_metrics_of_the_harmonic_oscillator(tmp_path, monkeypatch):
     monkeypatch.setattr(_job, "is_learned", lambda system: False)  # the others are slow to compile
     t1, h, steps = 3.0, 0.25, 12

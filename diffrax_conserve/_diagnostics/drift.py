@@ -66,7 +66,11 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             y0=jnp.array([1.0, 0.0]),
             saveat=diffrax.SaveAt(t0=True, steps=True),
         )
-        print(jnp.max(jnp.abs(dfc.drift(sol, square))))
+        print(f"{jnp.max(jnp.abs(dfc.drift(sol, square))):.0e}")
+        ```
+
+        ```text
+        4e-08
         ```
     """
     check_manifold(manifold)

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, RealScalarLike, Values, Y
+from .._printing import is_traced, printed
 from .._tree import tree_all_finite, tree_norm, tree_sub
 from .elimination import Vector
 from .linearise import Joined
@@ -45,9 +46,21 @@ class ProjectionInfo(eqx.Module):
     worst: Int[Array, ""]
 
     @property
-    def ok(self) -> Bool[Array, ""]:
+    def ok(self) -> Bool[Array, "..."]:
         """Whether the projection succeeded."""
         return self.result == optx.RESULTS.successful
+
+    def __str__(self) -> str:
+        if is_traced(self):
+            return repr(self)
+        ok = np.asarray(self.ok)
+        if ok.ndim > 0:
+            title = f"{ok.sum()} of {ok.size} projections succeeded"
+        else:
+            title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
+        names = ("num_steps", "residual_before", "residual_after", "correction", "rank")
+        rows = {name: getattr(self, name) for name in names}
+        return printed(title, rows if ok.all() else rows | {"worst": self.worst})
 
 
 class Problem(eqx.Module):

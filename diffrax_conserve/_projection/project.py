@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree, Real
 
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
     Constraint,
     FirstIntegral,
@@ -23,13 +23,13 @@ from .residual import largest, measure, relative, residual_of
 
 def project(
     manifold: Manifold,
-    y: Y,
+    y: State,
     *,
     t: RealScalarLike = 0.0,
     args: Args = None,
     value: Values | None = None,
     projection: AbstractProjection | None = None,
-) -> tuple[Y, ProjectionInfo]:
+) -> tuple[State, ProjectionInfo]:
     r"""Projects one state to the manifold $\{y : g(t, y, args) = 0\}$.
 
     Use it to make an initial state consistent, or to move a state to another value of its

@@ -43,6 +43,10 @@ class CountRejections(dfx.AbstractAdaptiveStepSizeController[Any, Any]):
         )
         print(dfc.statistics(sol).num_rejected)
         ```
+
+        ```text
+        0
+        ```
     """
 
     controller: dfx.AbstractAdaptiveStepSizeController[Any, Any]

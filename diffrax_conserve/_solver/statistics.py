@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from .._printing import is_traced, printed
 from .._projection import ProjectionInfo
 from .count_rejections import RejectionCount
 
@@ -42,6 +43,14 @@ class ProjectionStatistics(eqx.Module):
     def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
         count, size = jnp.asarray(0), jnp.zeros((), dtype)
         return cls(count, count, count, size, size, size, jnp.asarray(num_constraints))
+
+    def __str__(self) -> str:
+        if is_traced(self):
+            return repr(self)
+        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        if self.num_rejected is None:
+            rows["num_rejected"] = "not counted; CountRejections counts them"
+        return printed("projections of the accepted steps", rows)
 
     def add(self, info: ProjectionInfo) -> "ProjectionStatistics":
         projected = info.num_steps > 0
@@ -98,7 +107,19 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
             y0=jnp.array([1.0, 0.0]),
             saveat=diffrax.SaveAt(t1=True, solver_state=True),
         )
-        print(dfc.statistics(sol).max_iterations)
+        print(dfc.statistics(sol))
+        ```
+
+        ```text
+        projections of the accepted steps
+          num_projections  90
+          num_iterations   180
+          max_iterations   2
+          residual_before  4.0e-08
+          residual_after   4.0e-08
+          correction       8.4e-08
+          rank             1
+          num_rejected     not counted; CountRejections counts them
         ```
     """
     found = _instances(sol.solver_state, ProjectionStatistics)

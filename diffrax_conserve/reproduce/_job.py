@@ -46,12 +46,13 @@ def reproduce(
     seed: int = 0,
     epochs: int = 5000,
     write: Callable[[str], None] = print,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> bool:
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
     With `anew` the networks of the paper's systems are trained first; otherwise they are those that
-    come with the package. Returns whether every solver succeeded. Raises `SetupError` before any
-    work is done.
+    come with the package. `progress` is told what begins. Returns whether every solver succeeded.
+    Raises `SetupError` before any work is done.
     """
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]
@@ -67,7 +68,11 @@ def reproduce(
     if is_learned(system):
         networks = _train(system, out, seed, epochs, write) if anew else pretrained(system)
     chosen = solvers(system, {kind: found.network for kind, found in networks.items()})
-    runs = {name: run(system, solver, y0s, t1, dt) for name, solver in chosen.items()}
+    runs = {}
+    for i, (name, solver) in enumerate(chosen.items(), start=1):
+        progress(f"[{i}/{len(chosen)}] {name}: compiles and solves")
+        runs[name] = run(system, solver, y0s, t1, dt)
+    progress("reference and figures")
     comparison = compare(system, y0s, runs)
     numbers = metrics(system, runs, comparison, t1, dt, states)
     drawn = {} if plot is None else figures(plot, system, runs, comparison, networks)

@@ -52,6 +52,9 @@ _STYLE: dict[Any, Any] = {
     "savefig.dpi": 300,
 }
 
+# In the order of the solvers: shapes that can be told apart where they cover each other.
+_MARKERS = (("o", 5.0), (".", 3.0), ("s", 5.0), ("x", 4.0), ("^", 4.0))
+
 _Curves = dict[str, np.ndarray]  # by solver, or by part of the system
 
 
@@ -116,21 +119,19 @@ def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
 def error_of_training(
     panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]],
 ) -> Figure:
-    """Errors against the seconds of training: one panel for each problem, one curve for each kind
+    """Errors against the epochs of training: one panel for each problem, one curve for each kind
     of error."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(3.5 * len(panels), 2.7), layout="constrained")
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for ax, (title, curves) in zip(axes, panels.items(), strict=True):
-            for name, (seconds, errors) in curves.items():
-                ax.plot(
-                    seconds, errors, "o-", markersize=3, label=name, color=_colour(name, curves)
-                )
+            for name, (epochs, errors) in curves.items():
+                ax.plot(epochs, errors, "o-", markersize=3, label=name, color=_colour(name, curves))
             ax.set_xlim(left=0)
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_yscale("log")
             ax.set_title(title)
-            ax.set_xlabel("processor time of the training (s)")
+            ax.set_xlabel("epochs of training")
         axes[0].set_ylabel("error")
         _legend(figure, *axes[0].get_legend_handles_labels())
         return figure
@@ -197,18 +198,18 @@ def _draw_paths(
         style = dict(color="#BDBDBD", linewidth=0.5 if _is_long(paths) else 1.5, zorder=1)
         ax.plot(*reference.T[:dimension], label="reference", **style)
     for i, (name, path) in enumerate(paths.items()):
-        # Large rings round small dots: one solver cannot hide another.
+        # Open shapes round each other: one solver cannot hide another.
         last = path[-_MARKED_MAX - 1 :].T[:dimension]
-        ring = dict(markersize=4.5, markerfacecolor="none")
-        dots = dict(markersize=max(2.6 - 0.4 * i, 0.8)) if len(paths) > 2 else dict(markersize=2.2)
+        marker, size = _MARKERS[i % len(_MARKERS)]
         ax.plot(
             *last,
             linestyle="none",
-            marker="o",
+            marker=marker,
+            markersize=size,
+            markerfacecolor="none",
             label=_NAMES.get(name, name),
             color=_colour(name, paths),
             zorder=2 + 0.1 * i,
-            **(ring if i == 0 else dots),
         )
     for axis, text in zip("xyz", axis_labels, strict=False):
         getattr(ax, f"set_{axis}label")(text)

@@ -6,6 +6,7 @@ from ._construct import nambu_vector_field as nambu_vector_field
 from ._double_pendulum import DoublePendulum as DoublePendulum
 from ._henon_heiles import HenonHeiles as HenonHeiles
 from ._kepler import Kepler as Kepler
+from ._korteweg_de_vries import KortewegDeVries as KortewegDeVries
 from ._lorenz import ConservativeLorenz as ConservativeLorenz
 from ._lotka_volterra import LotkaVolterra as LotkaVolterra
 from ._oscillator import HarmonicOscillator as HarmonicOscillator

@@ -8,6 +8,7 @@ from ._cartesian_pendulum import CartesianPendulum
 from ._double_pendulum import DoublePendulum
 from ._henon_heiles import HenonHeiles
 from ._kepler import Kepler
+from ._korteweg_de_vries import KortewegDeVries
 from ._lorenz import ConservativeLorenz
 from ._lotka_volterra import LotkaVolterra
 from ._oscillator import HarmonicOscillator
@@ -30,6 +31,7 @@ _SYSTEMS: dict[str, type[AbstractSystem]] = {
         HenonHeiles,
         LotkaVolterra,
         TodaLattice,
+        KortewegDeVries,
         CartesianPendulum,
         RigidBodyAttitude,
     )

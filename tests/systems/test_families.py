@@ -183,3 +183,28 @@ def test_the_body_axis_turns_by_the_angular_velocity():
     axis = system.trajectories(system.reference(ts, y0))["third axis of the body"]
     expected = np.stack([0 * ts, -np.sin(0.5 * ts), np.cos(0.5 * ts)], axis=1)
     np.testing.assert_allclose(axis, expected, atol=1e-13)
+
+
+def test_the_soliton_solves_the_equation_on_the_ring():
+    """Against the exact solution on the line, which differs where it has died away."""
+    wave = systems.KortewegDeVries()
+    ts = np.array([0.0, 8.0, 16.0])
+    exact = np.stack([wave.soliton(t) for t in ts])
+    np.testing.assert_allclose(wave.reference(ts), exact, atol=2e-8)
+    # Its integrals on the line, from the integral of powers of sech².
+    kappa, y0 = 0.5, wave.y0
+    values = [entry.fn(0.0, y0, None) for entry in wave.manifold.values()]
+    expected = [4 * kappa, 8 * kappa**3 / 3, -32 * kappa**5 / 5]
+    np.testing.assert_allclose(values, expected, rtol=1e-8)
+
+
+def test_the_waves_conserve_at_every_state_also_with_modes_that_are_left_out():
+    for points in (5, 64):
+        wave = systems.KortewegDeVries(points=points)
+        states = jr.normal(jr.key(0), (20, points))
+        assert dfc.check_invariance(wave.vector_field, wave.manifold, states).ok
+
+
+def test_waves_need_a_mode_besides_the_mean():
+    with pytest.raises(ValueError, match="at least 4 points"):
+        systems.KortewegDeVries(points=3)

@@ -19,7 +19,7 @@ def test_every_exported_system_is_listed():
         and not x.__name__.startswith("Abstract")
     }
     assert exported == set(systems.names())
-    assert len(exported) == 12
+    assert len(exported) == 13
 
 
 def test_the_systems_of_the_paper_come_first():

@@ -151,6 +151,10 @@ def read_info(path: PathLike) -> dict[str, Any]:
         found = dfc.learned.read_info(dfc.learned.pretrained_path("rigid-body-conservative"))
         print(found["info"]["command"])
         ```
+
+        ```text
+        python benchmarks/paper.py --system rigid-body --seed 0 --ship
+        ```
     """
     header, _ = _read(path)
     return header

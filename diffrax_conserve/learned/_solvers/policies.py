@@ -1,6 +1,7 @@
 """Policies: what a solver does with a step that its flow map should not be trusted with."""
 
 import abc
+import dataclasses
 from typing import Any, final
 
 import diffrax as dfx
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
+from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
@@ -52,6 +54,12 @@ class DomainStatistics(eqx.Module):
     def fraction_outside(self) -> Float[Array, "..."]:
         """`num_outside / num_steps`."""
         return self.num_outside / jnp.maximum(self.num_steps, 1)
+
+    def __str__(self) -> str:
+        if is_traced(self):
+            return repr(self)
+        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return printed("steps of a learned solver", rows)
 
     @classmethod
     def zero(cls, t0: RealScalarLike) -> "DomainStatistics":
@@ -260,6 +268,10 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
             saveat=diffrax.SaveAt(t1=True, solver_state=True),
         )
         print(dfc.learned.domain_statistics(sol).fraction_outside)
+        ```
+
+        ```text
+        0.0
         ```
     """
 

@@ -41,7 +41,7 @@ def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress:
         )
 
 
-def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
+def check_arguments(model: Any, sample: Any, manifold: Manifold | None) -> None:
     """Raises unless model, sampler and manifold fit each other."""
     if manifold is not None:
         check_manifold(manifold)

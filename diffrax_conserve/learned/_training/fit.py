@@ -63,7 +63,7 @@ def fit(
     sample: Sampler | None = None,
     args: Args = None,
     recipe: Recipe | None = None,
-    manifold: Manifold = None,
+    manifold: Manifold | None = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone: no solution is needed.
@@ -115,7 +115,11 @@ def fit(
         pinn = dfc.PINN(system.y0, 0.0, 1.0, width=10, depth=2, key=jax.random.key(0))
         recipe = dfc.learned.paper(pinn, epochs=200, points=50)
         pinn, log = dfc.fit(pinn, system.vector_field, key=jax.random.key(1), recipe=recipe)
-        print(log.best, log.best_epoch)
+        print(f"loss {log.best:.0e} at epoch {log.best_epoch}")
+        ```
+
+        ```text
+        loss 5e-03 at epoch 200
         ```
 
     ??? cite "Reference"

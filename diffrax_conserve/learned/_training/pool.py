@@ -60,12 +60,16 @@ class Pool(eqx.Module):
         trained, log = dfc.fit(
             network, system.vector_field, sample=pool, recipe=recipe, key=jax.random.key(2)
         )
-        print(network.domain.upper, trained.domain.upper)
+        print(network.domain.upper.round(1), trained.domain.upper.round(1))
+        ```
+
+        ```text
+        [1.5 1.5 1.5] [1.7 1.5 2.3]
         ```
     """
 
     sample: Sampler
-    manifold: Manifold = eqx.field(kw_only=True, default=None)
+    manifold: Manifold | None = eqx.field(kw_only=True, default=None)
     mean_steps: RealScalarLike = eqx.field(kw_only=True, default=20)
     max_defect: RealScalarLike = eqx.field(kw_only=True, default=1.0)
     keep: Callable[[Any], Bool[Array, ""]] | None = eqx.field(kw_only=True, default=None)
@@ -136,7 +140,7 @@ def moved(
     return jax.vmap(state)(y0s, lengths, fresh, goes_on)
 
 
-def _projected(manifold: Manifold, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
+def _projected(manifold: Manifold | None, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
     """The end of a step, on the manifold through its start, and whether it got there."""
     if manifold is None:
         return end, jnp.asarray(True)

@@ -23,7 +23,7 @@ class WindowEnds(NamedTuple):
     args: Args
 
     @classmethod
-    def of(cls, pinn: PINN, manifold: Manifold, args: Args) -> "WindowEnds | None":
+    def of(cls, pinn: PINN, manifold: Manifold | None, args: Args) -> "WindowEnds | None":
         if manifold is None:
             if pinn.layer is None:
                 return None

@@ -1,0 +1,32 @@
+"""How records of numbers are printed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.core
+import jax.tree_util as jtu
+import numpy as np
+
+
+def printed(title: str, rows: Mapping[str, Any]) -> str:
+    """`title`, and a line for each row: its name and its number, or the range of a batch."""
+    width = max(map(len, rows), default=0)
+    return "\n".join([title, *(f"  {name:{width}}  {_text(x)}" for name, x in rows.items())])
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether there are no numbers yet, as inside `jax.jit`."""
+    return any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    array = np.asarray(value)
+    if array.ndim == 0:
+        integer = np.issubdtype(array.dtype, np.integer)
+        return f"{int(array):,}" if integer else f"{float(array):.1e}"
+    if array.size == 0:
+        return "none"
+    lowest, highest = _text(array.min()), _text(array.max())
+    return lowest if lowest == highest else f"{lowest} to {highest}"

@@ -1,0 +1,81 @@
+"""What `print` shows of the records of the package."""
+
+import pydoc
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffrax_conserve as dfc
+from diffrax_conserve._printing import printed
+
+SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+
+
+def test_the_record_of_a_projection_prints_numbers():
+    _, info = dfc.project(SPHERE, jnp.array([1.0, 2.0, 2.0]))
+    lines = str(info).splitlines()
+    assert lines[0] == "projected"
+    assert f"  num_steps        {int(info.num_steps)}" in lines
+    assert "  correction       2.0e+00" in lines
+    assert "rank" in lines[-1]
+
+
+def test_a_failure_is_printed_as_one():
+    apart = (SPHERE, dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 2))
+    _, info = dfc.project(apart, jnp.array([1.0, 2.0, 2.0]))
+    assert str(info).startswith("NOT PROJECTED: ")
+    assert f"worst            {int(info.worst)}" in str(info)
+
+
+def test_a_batch_is_printed_by_its_ranges():
+    ys = jnp.array([[2.0, 0.0], [5.0, 0.0], [jnp.nan, 0.0]])
+    _, info = jax.vmap(lambda y: dfc.project(SPHERE, y))(ys)
+    assert str(info).startswith("2 of 3 projections succeeded")
+    _, info = jax.vmap(lambda y: dfc.project(SPHERE, y))(ys[:2])
+    assert "correction       1.0e+00 to 4.0e+00" in str(info)
+
+
+def test_inside_a_compiled_function_there_are_no_numbers_to_print():
+    def text(y):
+        nonlocal seen
+        seen = str(dfc.project(SPHERE, y)[1])
+        return y
+
+    seen = ""
+    jax.jit(text)(jnp.ones(2))
+    assert "ProjectionInfo" in seen
+
+
+def test_statistics_print_numbers():
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]])),
+        dfc.ManifoldProjection(dfc.RK4(), SPHERE),
+        t0=0.0,
+        t1=1.0,
+        dt0=0.125,
+        y0=jnp.array([1.0, 0.0]),
+        saveat=dfx.SaveAt(t1=True, solver_state=True),
+    )
+    text = str(dfc.statistics(sol))
+    assert text.splitlines()[1] == "  num_projections  8"
+    assert "CountRejections" in text
+
+
+def test_rows_are_aligned_and_an_empty_batch_is_none():
+    rows = {"a": 1234567, "long": np.float32(0.5), "none": np.zeros(0), "same": np.ones(3)}
+    assert printed("title", rows).splitlines() == [
+        "title",
+        "  a     1,234,567",
+        "  long  5.0e-01",
+        "  none  none",
+        "  same  1.0e+00",
+    ]
+
+
+def test_help_opens_with_an_introduction():
+    text = pydoc.plain(pydoc.render_doc(dfc))
+    assert "diffrax_conserve - Keep any diffrax solve" in text
+    names = [name for name in dfc.__doc__.replace(",", " ").split() if hasattr(dfc, name)]
+    assert {"FirstIntegral", "ManifoldProjection", "drift", "project"} <= set(names)
