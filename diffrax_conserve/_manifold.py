@@ -25,10 +25,16 @@ class AbstractConserved(eqx.Module):
 
 @final
 class FirstIntegral(AbstractConserved):
-    r"""A function $I(t, y, args)$ that is constant along the exact solution.
+    r"""A function $I(t, y, args)$ that is constant along the exact solution, or of known rate.
 
     The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
     that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
+
+    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*: the conserved
+    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve integrates
+    it step by step, by Gauss quadrature with four nodes along the dense output of the wrapped
+    solver, and carries it in the solver state. So one keeps the balance of energy and dissipated
+    power, or an entropy that decreases; see "Balance laws" in the guide.
 
     !!! example
 
@@ -45,9 +51,13 @@ class FirstIntegral(AbstractConserved):
 
     fn: ConstraintFn
     value: Values | None
+    rate: ConstraintFn | None
 
-    def __init__(self, fn: ConstraintFn, *, value: Values | None = None):
+    def __init__(
+        self, fn: ConstraintFn, *, value: Values | None = None, rate: ConstraintFn | None = None
+    ):
         self.fn = fn
+        self.rate = rate
         # Arrays, so that another value does not compile again.
         self.value = jtu.tree_map(
             lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
@@ -55,13 +65,15 @@ class FirstIntegral(AbstractConserved):
 
     def __check_init__(self):
         _check_callable(self)
+        if self.rate is not None and not callable(self.rate):
+            raise TypeError(
+                f"`rate` of a `FirstIntegral` is {self.rate!r}, which is not callable. Pass a "
+                "function `rate(t, y, args)`, the derivative of `fn` along the solution, or `None` "
+                "where that is zero."
+            )
 
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return self.fn(t, y, args) if self.value is None else self.value
-
-
-def _as_array(x: Any) -> Any:
-    return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
@@ -70,7 +82,9 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
     be differentiated) that returns a PyTree of real arrays. Every array element is one first
     integral.
 - `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
-    from the initial state of the solve.
+    from the initial state of the solve. With `rate` it is the value at the start of the solve.
+- `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
+    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
 """
 
 
@@ -118,6 +132,26 @@ def _check_callable(entry: AbstractConserved) -> None:
 
 def is_entry(x: Any) -> bool:
     return isinstance(x, AbstractConserved)
+
+
+def rate_of(entry: Any) -> ConstraintFn | None:
+    return entry.rate if isinstance(entry, FirstIntegral) else None
+
+
+def has_rates(manifold: Manifold) -> bool:
+    """Whether a conserved value of the manifold changes along a solution."""
+    return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
+
+
+def refuse_rates(manifold: Manifold, user: str) -> None:
+    """Raises if an entry has a rate, whose integral `user` does not compute."""
+    for name, entry in named_entries(manifold):
+        if rate_of(entry) is not None:
+            raise ValueError(
+                f"`{name}` is a balance law, a `FirstIntegral` with a `rate`, but {user} keeps "
+                "conserved values that do not change. Leave it out of this manifold; a "
+                "`ManifoldProjection` keeps it."
+            )
 
 
 def check_manifold(manifold: Manifold) -> None:
@@ -206,6 +240,7 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
             _check_output(name, leaf)
             count += math.prod(jnp.shape(leaf))
+        _check_rate(name, entry, t, y, args)
     unknowns = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
@@ -213,6 +248,17 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         raise ValueError(
             f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
             "unknowns: no state can satisfy them in general. Remove dependent ones."
+        )
+
+
+def _check_rate(name: str, entry: Any, t: RealScalarLike, y: Y, args: Args) -> None:
+    if rate_of(entry) is None:
+        return
+    rates, outputs = (eqx.filter_eval_shape(fn, t, y, args) for fn in (entry.rate, entry.fn))
+    if tree_shapes(rates) != tree_shapes(outputs):
+        raise ValueError(
+            f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "
+            f"{tree_shapes(outputs)}. Return the derivative of each element in its place."
         )
 
 

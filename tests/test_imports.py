@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _TREE = _TYPES | {"_tree"}
 _MANIFOLD = _TREE | {"_manifold"}
-_PROJECTION = _MANIFOLD | {"_projection"}
+_BALANCE = _MANIFOLD | {"_balance"}
+_PROJECTION = _BALANCE | {"_projection"}
 _CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
 _GUESTS = {"_replace_file", "learned", "systems"}
 MAY_IMPORT = {
@@ -28,7 +29,8 @@ MAY_IMPORT = {
     "_replace_file": set(),
     "_tree": _TYPES,
     "_manifold": _TREE,
-    "_projection": _MANIFOLD,
+    "_balance": _MANIFOLD,
+    "_projection": _BALANCE,
     "_interpolation": _PROJECTION,
     "_solver": _PROJECTION | {"_interpolation"},
     "_diagnostics": _PROJECTION,

@@ -21,6 +21,7 @@ from .._manifold import (
     evaluate,
     is_entry,
     named_entries,
+    refuse_rates,
 )
 from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
@@ -84,6 +85,7 @@ def assert_conserved(
         ```
     """
     check_manifold(manifold)
+    refuse_rates(manifold, "`assert_conserved`, unlike `diffrax_conserve.drift`,")
     _refuse_unsuccessful(solution)
     kinds = _sampled(solution, num_dense)
     lanes = jnp.shape(solution.t0)

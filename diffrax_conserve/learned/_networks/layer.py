@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ..._manifold import check_manifold, conserved_values
+from ..._manifold import check_manifold, conserved_values, refuse_rates
 from ..._projection.elimination import Vector
 from ..._projection.linearise import Residual, linearise, written_out
 from ..._projection.residual import residual_of
@@ -73,6 +73,7 @@ class ConservativeLayer(eqx.Module):
 
     def __check_init__(self):
         check_manifold(self.manifold)
+        refuse_rates(self.manifold, "a `ConservativeLayer`")
         check_sizes(steps=self.steps)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:

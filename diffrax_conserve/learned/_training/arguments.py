@@ -9,7 +9,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 
 from ..._custom_types import Args, Manifold
-from ..._manifold import check_manifold, check_outputs
+from ..._manifold import check_manifold, check_outputs, refuse_rates
 from ..._projection import check_state
 from .._networks import PINN, AbstractFlowMap, as_flow_map, has_arrays
 from .._solvers import check_output
@@ -45,6 +45,7 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
     """Raises unless model, sampler and manifold fit each other."""
     if manifold is not None:
         check_manifold(manifold)
+        refuse_rates(manifold, "a training")
         if not (isinstance(model, PINN) and model.windows > 1):
             raise ValueError(
                 "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "

@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, Manifold, RealScalarLike, Y
-from ..._manifold import check_manifold, conserved_values
+from ..._manifold import check_manifold, conserved_values, refuse_rates
 from ..._projection import project
 from ..._tree import tree_all_finite
 from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
@@ -78,6 +78,7 @@ class Pool(eqx.Module):
             )
         if self.manifold is not None:
             check_manifold(self.manifold)
+            refuse_rates(self.manifold, "a `Pool`")
         if not self.mean_steps >= 1:
             raise ValueError(f"`mean_steps` must be at least 1, but is {self.mean_steps}.")
         if not self.max_defect > 0:
