@@ -1,16 +1,15 @@
 """Balance laws: what the rates of first integrals add up to along a solution."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ._manifold import evaluate, is_entry, rate_of
+from ._manifold import rates
 
 # Gauss quadrature of order eight, which is that of the solver of diffrax with the highest.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -32,28 +31,12 @@ def integrated_rates(
 
     def at(node: RealScalarLike) -> Values:
         t = start + (1 + node) * half
-        y = path(t)
-        values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-        return jtu.tree_map(
-            lambda entry, like: _rate(entry, like, t * direction, y, args),
-            manifold,
-            values,
-            is_leaf=is_entry,
-        )
+        return rates(manifold, t * direction, path(t), args)
 
     dtype = jnp.result_type(half)
-    rates = jax.vmap(at)(jnp.asarray(_NODES, dtype))
+    found = jax.vmap(at)(jnp.asarray(_NODES, dtype))
     weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
-    return jtu.tree_map(lambda x: _weighted_sum(weights.astype(x.dtype), x), rates)
-
-
-def _rate(
-    entry: Any, like: PyTree[jax.ShapeDtypeStruct], t: RealScalarLike, y: Y, args: Args
-) -> Values:
-    fn = rate_of(entry)
-    if fn is None:
-        return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), fn(t, y, args), like)
+    return jtu.tree_map(lambda x: _weighted_sum(weights.astype(x.dtype), x), found)
 
 
 def _weighted_sum(weights: Array, x: Array) -> Array:

@@ -2,6 +2,7 @@
 
 import abc
 import math
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -109,6 +110,36 @@ class Constraint(AbstractConserved):
     def __check_init__(self):
         _check_callable(self)
 
+    def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
+        r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
+
+        Where $g = 0$ holds all the time, so does this. For the positions of a mechanism it is the
+        constraint of the velocities, and any field with the right $q' = v$ will do.
+
+        **Arguments:**
+
+        - `vector_field`: $f$, called as `vector_field(t, y, args)`.
+
+        **Returns:**
+
+        A [`diffrax_conserve.Constraint`][].
+
+        !!! example
+
+            ```python
+            import diffrax_conserve as dfc
+            import jax.numpy as jnp
+
+            def free_fall(t, y, args):
+                q, v = y
+                return v, jnp.array([0.0, -9.81])
+
+            rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
+            along_the_circle = rod.derivative(free_fall)
+            ```
+        """
+        return Constraint(_Along(self.fn, vector_field))
+
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
 
@@ -119,6 +150,25 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
     be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
     constraint.
 """
+
+
+class _Along(eqx.Module):
+    """The derivative of a function along a vector field."""
+
+    fn: ConstraintFn
+    vector_field: Callable[[RealScalarLike, Any, Args], Any]
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        y = jtu.tree_map(jnp.asarray, y)
+        slope = slope_like(y, self.vector_field(t, y, args))
+        _, along = jax.jvp(lambda t, y: self.fn(t, y, args), (t, y), (jnp.ones_like(t), slope))
+        return along
+
+
+def slope_like(y: Y, slope: Y) -> Y:
+    """What a vector field returned, in the shapes and dtypes of the state."""
+    return jtu.tree_map(lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope)
 
 
 def _check_callable(entry: AbstractConserved) -> None:
@@ -221,6 +271,19 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     return jtu.tree_map(
         lambda entry: jtu.tree_map(jnp.asarray, entry.fn(t, y, args)), manifold, is_leaf=is_entry
     )
+
+
+def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """`manifold` with each entry replaced by its rate, zero where it has none."""
+
+    def rate(entry: AbstractConserved, like: Any) -> Values:
+        fn = rate_of(entry)
+        if fn is None:
+            return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), fn(t, y, args), like)
+
+    values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
+    return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)
 
 
 def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
