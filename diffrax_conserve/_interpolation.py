@@ -71,7 +71,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         y, info = target.project(t0, candidate, anchor)
         okay = info.ok
         if not isinstance(target.projection, SimplifiedNewton):
-            again = SimplifiedNewton(metric=target.projection.metric)
+            lower, upper = (getattr(target.projection, name, None) for name in ("lower", "upper"))
+            metric = target.projection.metric
+            again = SimplifiedNewton(metric=metric, lower=lower, upper=upper)
             second, info = dataclasses.replace(target, projection=again).project(
                 t0, candidate, anchor
             )

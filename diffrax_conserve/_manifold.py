@@ -188,22 +188,6 @@ def rate_of(entry: Any) -> ConstraintFn | None:
     return entry.rate if isinstance(entry, FirstIntegral) else None
 
 
-def has_rates(manifold: Manifold) -> bool:
-    """Whether a conserved value of the manifold changes along a solution."""
-    return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
-
-
-def refuse_rates(manifold: Manifold, user: str) -> None:
-    """Raises if an entry has a rate, whose integral `user` does not compute."""
-    for name, entry in named_entries(manifold):
-        if rate_of(entry) is not None:
-            raise ValueError(
-                f"`{name}` is a balance law, a `FirstIntegral` with a `rate`, but {user} keeps "
-                "conserved values that do not change. Leave it out of this manifold; a "
-                "`ManifoldProjection` keeps it."
-            )
-
-
 def check_manifold(manifold: Manifold) -> None:
     """Raises unless `manifold` is a non-empty PyTree of `FirstIntegral`s and `Constraint`s."""
     entries = named_entries(manifold)
@@ -271,19 +255,6 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     return jtu.tree_map(
         lambda entry: jtu.tree_map(jnp.asarray, entry.fn(t, y, args)), manifold, is_leaf=is_entry
     )
-
-
-def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`manifold` with each entry replaced by its rate, zero where it has none."""
-
-    def rate(entry: AbstractConserved, like: Any) -> Values:
-        fn = rate_of(entry)
-        if fn is None:
-            return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), fn(t, y, args), like)
-
-    values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-    return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)
 
 
 def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:

@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._balance import integrated_rates
+from .._balance import has_rates, integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     FirstIntegral,
     check_manifold,
     conserved_values,
     evaluate,
-    has_rates,
     named_entries,
 )
 from .._projection import measure, relative

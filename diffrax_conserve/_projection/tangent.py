@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     FirstIntegral,
@@ -19,7 +20,6 @@ from .._manifold import (
     evaluate,
     named_entries,
     rate_of,
-    rates,
     slope_like,
 )
 from .._tree import tree_add, tree_mul

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._balance import has_rates
 from .._custom_types import (
     VF,
     Args,
@@ -28,7 +29,6 @@ from .._manifold import (
     check_outputs,
     check_values,
     conserved_values,
-    has_rates,
 )
 from .._projection import (
     AbstractProjection,
@@ -141,6 +141,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             raise ValueError(
                 f"`every` is {self.every!r}, but it must be a positive integer: every how many "
                 "steps the state is projected."
+            )
+        bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
+        if bounds != [None, None] and (self.threshold is not None or self.every > 1):
+            raise ValueError(
+                "`projection` has bounds, which a step that is not projected does not keep. Leave "
+                "out `threshold` and `every`, or `lower` and `upper`."
             )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     Constraint,
@@ -21,7 +22,6 @@ from .._manifold import (
     evaluate,
     is_entry,
     named_entries,
-    refuse_rates,
 )
 from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ..._manifold import check_manifold, conserved_values, refuse_rates
+from ..._manifold import check_manifold, conserved_values
 from ..._projection.elimination import Vector
 from ..._projection.linearise import Residual, linearise, written_out
 from ..._projection.residual import residual_of

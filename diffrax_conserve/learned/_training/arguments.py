@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 
+from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold
-from ..._manifold import check_manifold, check_outputs, refuse_rates
+from ..._manifold import check_manifold, check_outputs
 from ..._projection import check_state
 from .._networks import PINN, AbstractFlowMap, as_flow_map, has_arrays
 from .._solvers import check_output
