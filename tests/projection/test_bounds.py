@@ -85,8 +85,7 @@ def test_it_solves_the_quadratic_program(kind, count):
 def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     atoms, values, candidates = chemistry(np.random.default_rng(2), count)
     y, ok, _ = project(kind, atoms, values, candidates, jnp.ones(8))
-    # One in some ten thousand of these, where bounds and balances nearly contradict each other, is
-    # given up, and says so.
+    # Few of these, whose bounds and balances nearly contradict each other, may fail, and say so.
     assert jnp.mean(ok) >= 0.9999
     assert jnp.min(y) >= 0
     amounts = jnp.einsum("ijk,ik->ij", atoms, y)
