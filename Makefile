@@ -100,12 +100,13 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/unlike_lanes.py
 	$(BIN)/python benchmarks/devices.py
+	$(BIN)/python benchmarks/balance.py
 	$(BIN)/python benchmarks/report.py --write
 
 # At toy sizes nearly all of it is compilation, which takes half as long with XLA's older emitters.
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
-	printf '%s\n' overhead gradients work_precision scaling random_features devices unlike_lanes \
+	printf '%s\n' overhead gradients work_precision scaling random_features devices unlike_lanes balance \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/report.py
 

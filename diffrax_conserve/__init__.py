@@ -35,7 +35,9 @@ from ._projection import Newton as Newton
 from ._projection import Problem as Problem
 from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
+from ._projection import TangentField as TangentField
 from ._projection import project as project
+from ._projection import tangent as tangent
 from ._solver import RK4 as RK4
 from ._solver import CountRejections as CountRejections
 from ._solver import ManifoldProjection as ManifoldProjection

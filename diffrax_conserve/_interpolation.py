@@ -66,11 +66,14 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         t0 = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         early = jnp.abs(t0 - self.t0) < jnp.abs(self.t1 - t0)
         anchor = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
-        candidate, target = self.inner.evaluate(t0, left=left), self.target.unpack()
+        candidate = self.inner.evaluate(t0, left=left)
+        target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         y, info = target.project(t0, candidate, anchor)
         okay = info.ok
         if not isinstance(target.projection, SimplifiedNewton):
-            again = SimplifiedNewton(metric=target.projection.metric)
+            lower, upper = (getattr(target.projection, name, None) for name in ("lower", "upper"))
+            metric = target.projection.metric
+            again = SimplifiedNewton(metric=metric, lower=lower, upper=upper)
             second, info = dataclasses.replace(target, projection=again).project(
                 t0, candidate, anchor
             )

@@ -2,6 +2,7 @@
 
 import abc
 import math
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -25,10 +26,16 @@ class AbstractConserved(eqx.Module):
 
 @final
 class FirstIntegral(AbstractConserved):
-    r"""A function $I(t, y, args)$ that is constant along the exact solution.
+    r"""A function $I(t, y, args)$ that is constant along the exact solution, or of known rate.
 
     The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
     that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
+
+    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*: the conserved
+    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve integrates
+    it step by step, by Gauss quadrature with four nodes along the dense output of the wrapped
+    solver, and carries it in the solver state. So one keeps the balance of energy and dissipated
+    power, or an entropy that decreases; see "Balance laws" in the guide.
 
     !!! example
 
@@ -45,9 +52,13 @@ class FirstIntegral(AbstractConserved):
 
     fn: ConstraintFn
     value: Values | None
+    rate: ConstraintFn | None
 
-    def __init__(self, fn: ConstraintFn, *, value: Values | None = None):
+    def __init__(
+        self, fn: ConstraintFn, *, value: Values | None = None, rate: ConstraintFn | None = None
+    ):
         self.fn = fn
+        self.rate = rate
         # Arrays, so that another value does not compile again.
         self.value = jtu.tree_map(
             lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
@@ -55,13 +66,15 @@ class FirstIntegral(AbstractConserved):
 
     def __check_init__(self):
         _check_callable(self)
+        if self.rate is not None and not callable(self.rate):
+            raise TypeError(
+                f"`rate` of a `FirstIntegral` is {self.rate!r}, which is not callable. Pass a "
+                "function `rate(t, y, args)`, the derivative of `fn` along the solution, or `None` "
+                "where that is zero."
+            )
 
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return self.fn(t, y, args) if self.value is None else self.value
-
-
-def _as_array(x: Any) -> Any:
-    return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
@@ -70,7 +83,9 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
     be differentiated) that returns a PyTree of real arrays. Every array element is one first
     integral.
 - `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
-    from the initial state of the solve.
+    from the initial state of the solve. With `rate` it is the value at the start of the solve.
+- `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
+    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
 """
 
 
@@ -95,6 +110,36 @@ class Constraint(AbstractConserved):
     def __check_init__(self):
         _check_callable(self)
 
+    def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
+        r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
+
+        Where $g = 0$ holds all the time, so does this. For the positions of a mechanism it is the
+        constraint of the velocities, and any field with the right $q' = v$ will do.
+
+        **Arguments:**
+
+        - `vector_field`: $f$, called as `vector_field(t, y, args)`.
+
+        **Returns:**
+
+        A [`diffrax_conserve.Constraint`][].
+
+        !!! example
+
+            ```python
+            import diffrax_conserve as dfc
+            import jax.numpy as jnp
+
+            def free_fall(t, y, args):
+                q, v = y
+                return v, jnp.array([0.0, -9.81])
+
+            rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
+            along_the_circle = rod.derivative(free_fall)
+            ```
+        """
+        return Constraint(_Along(self.fn, vector_field))
+
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
 
@@ -105,6 +150,25 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
     be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
     constraint.
 """
+
+
+class _Along(eqx.Module):
+    """The derivative of a function along a vector field."""
+
+    fn: ConstraintFn
+    vector_field: Callable[[RealScalarLike, Any, Args], Any]
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        y = jtu.tree_map(jnp.asarray, y)
+        slope = slope_like(y, self.vector_field(t, y, args))
+        _, along = jax.jvp(lambda t, y: self.fn(t, y, args), (t, y), (jnp.ones_like(t), slope))
+        return along
+
+
+def slope_like(y: Y, slope: Y) -> Y:
+    """What a vector field returned, in the shapes and dtypes of the state."""
+    return jtu.tree_map(lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope)
 
 
 def _check_callable(entry: AbstractConserved) -> None:
@@ -118,6 +182,10 @@ def _check_callable(entry: AbstractConserved) -> None:
 
 def is_entry(x: Any) -> bool:
     return isinstance(x, AbstractConserved)
+
+
+def rate_of(entry: Any) -> ConstraintFn | None:
+    return entry.rate if isinstance(entry, FirstIntegral) else None
 
 
 def check_manifold(manifold: Manifold) -> None:
@@ -210,6 +278,7 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
             _check_output(name, leaf)
             count += math.prod(jnp.shape(leaf))
+        _check_rate(name, entry, t, y, args)
     unknowns = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
@@ -217,6 +286,17 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         raise ValueError(
             f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
             "unknowns: no state can satisfy them in general. Remove dependent ones."
+        )
+
+
+def _check_rate(name: str, entry: Any, t: RealScalarLike, y: Y, args: Args) -> None:
+    if rate_of(entry) is None:
+        return
+    rates, outputs = (eqx.filter_eval_shape(fn, t, y, args) for fn in (entry.rate, entry.fn))
+    if tree_shapes(rates) != tree_shapes(outputs):
+        raise ValueError(
+            f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "
+            f"{tree_shapes(outputs)}. Return the derivative of each element in its place."
         )
 
 

@@ -365,3 +365,10 @@ def test_the_results_of_learning_from_data_are_what_the_documentation_shows():
     lines = list(learning.table(json.loads(learning.OUT.read_text())))
     assert len(lines) > 20
     assert [line for line in lines if line not in page] == []
+
+
+def test_a_smoke_run_of_the_balances():
+    found = benchmark("balance").main(["--smoke"])
+    rows = found["pendulum"]["weak friction"]
+    assert rows["Tsit5 kept"]["energy"] < 0.1 * rows["Tsit5 plain"]["energy"]
+    assert all(row["kept"] <= 1.2 * row["plain"] for row in found["entropy"])

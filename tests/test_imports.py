@@ -21,7 +21,8 @@ _TYPES = {"_custom_types"}
 _PRINTING = {"_printing"}
 _TREE = _TYPES | {"_tree"}
 _MANIFOLD = _TREE | {"_manifold"}
-_PROJECTION = _MANIFOLD | _PRINTING | {"_projection"}
+_BALANCE = _MANIFOLD | {"_balance"}
+_PROJECTION = _BALANCE | _PRINTING | {"_projection"}
 _CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
 _GUESTS = {"_replace_file", "learned", "systems"}
 MAY_IMPORT = {
@@ -30,7 +31,8 @@ MAY_IMPORT = {
     "_replace_file": set(),
     "_tree": _TYPES,
     "_manifold": _TREE,
-    "_projection": _MANIFOLD | _PRINTING,
+    "_balance": _MANIFOLD,
+    "_projection": _BALANCE | _PRINTING,
     "_interpolation": _PROJECTION,
     "_solver": _PROJECTION | {"_interpolation"},
     "_diagnostics": _PROJECTION,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import AbstractConserved, Constraint, check_manifold
+from .._manifold import AbstractConserved, Constraint, check_manifold, rate_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +84,8 @@ def check_invariance(
     shows. For a [`diffrax_conserve.Constraint`][] the same derivative must vanish where the
     constraints hold, so the states must lie on all constraints of the manifold. For a
     [`diffrax_conserve.FirstIntegral`][] next to constraints this makes the weaker, and right,
-    demand that it be conserved where they hold.
+    demand that it be conserved where they hold. Of one with a `rate` that is subtracted from the
+    derivative, and its size added to those of the terms.
 
     **Arguments:**
 
@@ -215,6 +216,11 @@ def _relative_sizes(
     # The sizes of what cancels: of the derivative's terms, and of the value's to first order.
     speeds = [_term_sizes(rows, (jnp.ones_like(t), f)) for rows in jacobian]
     sizes = [_term_sizes(rows, (t, y)) for rows in jacobian]
+    rate = rate_of(entry)
+    if rate is not None:
+        rates = [jnp.ravel(x) for x in jtu.tree_leaves(rate(t, y, args))]
+        along_flow = [a - b for a, b in zip(along_flow, rates, strict=True)]
+        speeds = [a + jnp.abs(b) for a, b in zip(speeds, rates, strict=True)]
     residual = value if isinstance(entry, Constraint) else [jnp.zeros_like(x) for x in value]
     # An integral that is not defined at `y` is not conserved, though its derivative may vanish.
     along_flow = [

@@ -1,12 +1,15 @@
 """How well a solution was conserved."""
 
+from collections.abc import Callable
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._custom_types import Args, Manifold, Values, Y
+from .._balance import has_rates, integrated_rates
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     FirstIntegral,
     check_manifold,
@@ -15,6 +18,7 @@ from .._manifold import (
     named_entries,
 )
 from .._projection import measure, relative
+from .._tree import tree_add
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -26,6 +30,10 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
+
+    Of a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
+    is subtracted from the numerator. It is taken along the dense output of the wrapped solver,
+    or of a solver that is not wrapped, so the solution must have some.
 
     The scale is what roundoff is relative to: a momentum that vanishes as the sum of large terms is
     not divided by zero.
@@ -46,7 +54,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     **Raises:**
 
     `ValueError` if the solution holds no saved states, only one with nothing to compare it with, or
-    is a batch.
+    is a batch; or, of a balance law, no dense output.
 
     !!! example
 
@@ -99,11 +107,53 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     values = conserved_values(manifold, t0, y0, args)
     _, scale = measure(manifold, values, t0, y0, args)
 
+    gained = _gained(sol, manifold, args)
+
     def at(t: Array, y: Y) -> Values:
         padded = ~jnp.isfinite(t)
         y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
         now = evaluate(manifold, jnp.where(padded, t0, t), y, args)
-        residual = jtu.tree_map(lambda x, v: jnp.where(padded, 0, x - v), now, values)
+        then = values if gained is None else tree_add(values, gained(jnp.where(padded, t0, t)))
+        residual = jtu.tree_map(lambda x, v: jnp.where(padded, 0, x - v), now, then)
         return relative(residual, scale)
 
     return jax.vmap(at)(sol.ts, sol.ys)
+
+
+def _gained(
+    sol: dfx.Solution, manifold: Manifold, args: Args
+) -> Callable[[RealScalarLike], Values] | None:
+    """What the rates of the manifold add to its values until a time, if it has any."""
+    if not has_rates(manifold):
+        return None
+    path = sol.interpolation
+    if not isinstance(path, dfx.DenseInterpolation):
+        raise ValueError(
+            "`manifold` has a balance law, a `FirstIntegral` with a `rate`, whose integral is "
+            "taken along the dense output, but `sol` has none. Ask for it, for example with "
+            "`saveat=SaveAt(t0=True, steps=True, dense=True)`."
+        )
+
+    def until(step: RealScalarLike, end: RealScalarLike) -> Values:
+        info = jtu.tree_map(lambda x: x[step], path.infos)
+        local = path.interpolation_cls(t0=path.ts[step], t1=path.ts[step + 1], **info)
+        # Of a projected solver, what its own balance was computed from.
+        local = getattr(local, "inner", local)
+        return integrated_rates(manifold, path.ts[step], end, local.evaluate, args, path.direction)
+
+    steps = jnp.arange(path.ts.size - 1)
+    used = steps < path.ts_size - 1
+    # Those that diffrax padded are computed too, for the first step.
+    each = jax.vmap(lambda i, ok: until(jnp.where(ok, i, 0), path.ts[jnp.where(ok, i, 0) + 1]))
+    sums = jtu.tree_map(
+        lambda x: jnp.cumsum(jnp.where(used.reshape(-1, *[1] * (x.ndim - 1)), x, 0), axis=0),
+        each(steps, used),
+    )
+
+    def gained(t: RealScalarLike) -> Values:
+        t = t * path.direction
+        step = jnp.clip(jnp.searchsorted(path.ts, t) - 1, 0, path.ts_size - 2)
+        before = jtu.tree_map(lambda x: jnp.where(step > 0, x[step - 1], 0), sums)
+        return tree_add(before, until(step, t))
+
+    return gained

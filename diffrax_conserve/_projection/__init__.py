@@ -12,4 +12,6 @@ from .residual import largest as largest
 from .residual import measure as measure
 from .residual import relative as relative
 from .simplified_newton import SimplifiedNewton as SimplifiedNewton
+from .tangent import TangentField as TangentField
+from .tangent import tangent as tangent
 from .target import Target as Target

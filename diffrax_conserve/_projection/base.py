@@ -116,10 +116,16 @@ NEWTON_OPTIONS = r"""**Arguments:**
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.
+- `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
+    PyTrees like the state of scalars or arrays. The result is
+    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest point of the
+    manifold within the bounds, which it never leaves. Where there is none the projection fails.
+    Derivatives hold what is at a bound there. Default: none.
 
 **Raises:**
 
-`ValueError` if a weight is not positive.
+`ValueError` if a weight is not positive, if a lower bound is above its upper one, or, when they are
+used, if the bounds are not shaped like the state.
 """
 
 

@@ -3,8 +3,6 @@
 from typing import Any, final
 
 import equinox as eqx
-import jax
-import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -32,14 +30,13 @@ from .base import (
     positive_weights,
     report,
 )
+from .bounded import box_of, check_bounds, project_into
 from .certainty import certain
 from .elimination import Vector
+from .implicit import SYSTEM_DENSE_MAX, solve_linearised
 from .iteration import Equations, iterate
 from .linearise import Residual, linearise
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
-
-# Above this many unknowns the optimality system is solved iteratively, matrix-free.
-_DENSE_MAX = 256
 
 
 @final
@@ -85,6 +82,11 @@ class Newton(AbstractProjection):
     atol: float | Array | None = option(None)
     max_steps: int = option(50, static=True)
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+    lower: PyTree[ArrayLike] | None = option(None)
+    upper: PyTree[ArrayLike] | None = option(None)
+
+    def __check_init__(self):
+        check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         if jnp.finfo(working_dtype(candidate)).bits < 32:
@@ -105,6 +107,10 @@ class Newton(AbstractProjection):
             problem.magnitude,
             Tolerance(self.rtol, self.atol),
         )
+        box = box_of(self.lower, self.upper, candidate)
+        if box is not None:
+            y, _, info = project_into(equations, box, frozen=False, max_steps=self.max_steps)
+            return y, info
         y, _, info = _project(equations, max_steps=self.max_steps)
         return y, info
 
@@ -163,7 +169,7 @@ def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector,
     # The multipliers of nearly parallel gradients are large and cancel, up to their roundoff.
     atol = tolerance + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
     size = tree_size((candidate, multiplier))
-    if size <= _DENSE_MAX:
+    if size <= SYSTEM_DENSE_MAX:
         # Dependent constraints make the system singular but consistent.
         linear_solver = lx.AutoLinearSolver(well_posed=False)
     else:
@@ -195,38 +201,10 @@ def _project_jvp(primals, tangents, *, max_steps):
     )
     right = tree_tangents(unknowns, right)
     given = parameters(equations)
-    t_y, t_multiplier = _solve(lambda x: _optimality(x, given), unknowns, right)
+    t_y, t_multiplier = solve_linearised(lambda x: _optimality(x, given), unknowns, right)
     _, jacobian = linearise(given[0], y)
     factor = jnp.where(info.ok, certain(equations, y, jacobian), 1)
     t_y = tree_scale(lax.stop_gradient(factor), t_y)
     minus = lambda x: jtu.tree_map(jnp.negative, x)  # noqa: E731
     t_info = jtu.tree_map(lambda _: None, info)
     return (y, multiplier, info), (minus(t_y), minus(t_multiplier), t_info)
-
-
-def _solve(fn, unknowns: PyTree[Array], right: PyTree[Array]) -> PyTree[Array]:
-    """The shortest solution of `F' x = right` for the Jacobian `F'` of `fn` at `unknowns`."""
-    x, unravel = jfu.ravel_pytree(unknowns)
-    b, _ = jfu.ravel_pytree(right)
-    if x.size > _DENSE_MAX:
-        eps = float(jnp.finfo(x.dtype).eps)
-        tolerance = eps ** (2 / 3)
-        operator = lx.JacobianLinearOperator(lambda y, _: fn(y), unknowns)
-        solver = lx.GMRES(rtol=tolerance, atol=tolerance)
-        return lx.linear_solve(operator, right, solver, throw=False).value
-    matrix = jax.jacfwd(lambda x: jfu.ravel_pytree(fn(unravel(x)))[0])(x)
-    # Rows and columns of comparable size, so that the condition is that of the problem.
-    columns = lax.stop_gradient(_sizes(matrix, 0))
-    rows = lax.stop_gradient(_sizes(matrix / columns, 1))
-    scaled = matrix / columns / rows[:, None]
-    finite = jnp.all(jnp.isfinite(scaled))
-    operator = lx.MatrixLinearOperator(jnp.where(finite, scaled, jnp.eye(x.size, dtype=x.dtype)))
-    # Dependent constraints make the system singular but consistent.
-    solver = lx.SVD(rcond=64 * float(jnp.finfo(x.dtype).eps))
-    solution = lx.linear_solve(operator, jnp.where(finite, b / rows, 0), solver, throw=False).value
-    return unravel(jnp.where(finite, 1, jnp.nan) * solution / columns)
-
-
-def _sizes(matrix: Array, axis: int) -> Array:
-    size = jnp.max(jnp.abs(matrix), axis=axis)
-    return jnp.where(size > 0, size, 1)

@@ -142,7 +142,7 @@ def _problem(
     anchor: Y | None = None,
 ) -> Problem:
     residual, magnitude = residual_of(manifold, values, t, candidate, args)
-    weights = _inverse(projection.metric, candidate)
+    weights = inverse_metric(projection.metric, candidate)
     return Problem(residual, magnitude, weights, t, args, values, anchor)
 
 
@@ -175,7 +175,7 @@ def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
             )
 
 
-def _inverse(metric: PyTree[ArrayLike] | None, y: Y) -> Y:
+def inverse_metric(metric: PyTree[ArrayLike] | None, y: Y) -> Y:
     """`M⁻¹`, shaped like `y`; an infinite weight freezes its component."""
     if metric is None:
         return jtu.tree_map(jnp.ones_like, y)

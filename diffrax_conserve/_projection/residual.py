@@ -64,10 +64,10 @@ def measure(
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     largest = tree_max(y)
     sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), y) if uniform else y
-    return _shaped(g, like), _shaped(magnitude + jacobian.scale(sizes), like)
+    return shaped(g, like), shaped(magnitude + jacobian.scale(sizes), like)
 
 
-def _shaped(vector: Real[Array, " m"], like: PyTree) -> Values:
+def shaped(vector: Real[Array, " m"], like: PyTree) -> Values:
     leaves, treedef = jtu.tree_flatten(like)
     ends = [sum(x.size for x in leaves[: i + 1]) for i in range(len(leaves))]
     parts = [vector[end - x.size : end] for x, end in zip(leaves, ends, strict=True)]

@@ -34,6 +34,7 @@ from .base import (
     positive_weights,
     report,
 )
+from .bounded import box_of, check_bounds, project_into
 from .certainty import certain
 from .elimination import Vector
 from .iteration import Equations, iterate
@@ -85,6 +86,11 @@ class SimplifiedNewton(AbstractProjection):
     atol: float | Array | None = option(None)
     max_steps: int = option(20, static=True)
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+    lower: PyTree[ArrayLike] | None = option(None)
+    upper: PyTree[ArrayLike] | None = option(None)
+
+    def __check_init__(self):
+        check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         equations = Equations(
@@ -94,6 +100,10 @@ class SimplifiedNewton(AbstractProjection):
             problem.magnitude,
             Tolerance(self.rtol, self.atol),
         )
+        box = box_of(self.lower, self.upper, candidate)
+        if box is not None:
+            y, _, info = project_into(equations, box, frozen=True, max_steps=self.max_steps)
+            return y, info
         y, _, info = _project(equations, problem.anchor, max_steps=self.max_steps)
         return y, info
 

@@ -1,12 +1,16 @@
 """What a solver projects to, and on which terms: the same at the end of a step and inside it."""
 
+import dataclasses
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Real
 
+from .._balance import integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._tree import tree_all_finite, working_dtype
+from .._tree import tree_add, tree_all_finite, working_dtype
 from .base import AbstractProjection, Outcome, ProjectionInfo
 from .project import apply, relative_residual
 
@@ -20,6 +24,7 @@ class Target(eqx.Module):
     **Attributes:**
 
     - `direction`: -1 where the solver's time is the negative of the manifold's.
+    - `gained`: what the rates of the manifold have added to `values` since the solve began.
     - `limit`: a larger correction is a failure.
     - `threshold`: a candidate whose relative residual is not larger is left as it is.
     - `due`: if not set, any finite candidate is left as it is.
@@ -30,9 +35,24 @@ class Target(eqx.Module):
     values: Values
     args: Args
     direction: Real[Array, ""]
+    gained: Values | None = None
     limit: Real[Array, ""] | None = None
     threshold: RealScalarLike | None = None
     due: Bool[Array, ""] | None = None
+
+    @property
+    def now(self) -> Values:
+        """The conserved values that hold now."""
+        return self.values if self.gained is None else tree_add(self.values, self.gained)
+
+    def advanced(
+        self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
+    ) -> "Target":
+        """The same at the end of a step or inside it, to which `path` leads from its start."""
+        if self.gained is None:
+            return self
+        gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
+        return dataclasses.replace(self, gained=tree_add(self.gained, gained))
 
     def project(
         self, t: RealScalarLike, candidate: Y, anchor: Y | None = None
@@ -40,7 +60,7 @@ class Target(eqx.Module):
         t = t * self.direction
         if self.threshold is None and self.due is None:
             return self._project(t, candidate, anchor)
-        residual = relative_residual(self.manifold, self.values, t, candidate, self.args)
+        residual = relative_residual(self.manifold, self.now, t, candidate, self.args)
         needed = jnp.asarray(True) if self.due is None else self.due
         if self.threshold is not None:
             needed = needed & ~(residual <= self.threshold)
@@ -54,7 +74,7 @@ class Target(eqx.Module):
     def _project(
         self, t: RealScalarLike, candidate: Y, anchor: Y | None
     ) -> tuple[Y, ProjectionInfo]:
-        return _apply(self.projection, self.manifold, self.values, t, candidate, self.args, anchor)
+        return _apply(self.projection, self.manifold, self.now, t, candidate, self.args, anchor)
 
     def too_far(self, info: ProjectionInfo) -> Bool[Array, ""]:
         """Whether a projection that succeeded moved the state further than it may."""

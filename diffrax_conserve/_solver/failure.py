@@ -32,8 +32,8 @@ _CAUSES = (
     "steps, or pass another `max_correction`.",
     _STEP + "{name} is still not satisfied, and the iteration diverged. " + _REMEDY,
     _STEP + "{name} is still not satisfied when the iteration ends. " + _REMEDY + " If it is, the "
-    "constraints may contradict each other, or `fn` is less accurate than roundoff: then pass its "
-    "accuracy, `projection=SimplifiedNewton(rtol=...)`. `diffrax_conserve.statistics` has the "
+    "constraints may contradict each other or the bounds, or `fn` is less accurate than roundoff: "
+    "then pass its accuracy, `projection=SimplifiedNewton(rtol=...)`. `statistics` has the "
     "residual.",
     _START + "{name} is not finite at the initial state. Check `fn`, `y0` and `args`.",
     _START + "the initial state violates {name}. Start on the manifold: "

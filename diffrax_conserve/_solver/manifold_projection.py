@@ -1,5 +1,6 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
+from collections.abc import Callable
 from typing import Any, final
 
 import diffrax as dfx
@@ -11,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._balance import has_rates
 from .._custom_types import (
     VF,
     Args,
@@ -22,7 +24,12 @@ from .._custom_types import (
     Y,
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
-from .._manifold import check_manifold, check_outputs, check_values, conserved_values
+from .._manifold import (
+    check_manifold,
+    check_outputs,
+    check_values,
+    conserved_values,
+)
 from .._projection import (
     AbstractProjection,
     ProjectionInfo,
@@ -135,6 +142,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 f"`every` is {self.every!r}, but it must be a positive integer: every how many "
                 "steps the state is projected."
             )
+        bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
+        if bounds != [None, None] and (self.threshold is not None or self.every > 1):
+            raise ValueError(
+                "`projection` has bounds, which a step that is not projected does not keep. Leave "
+                "out `threshold` and `every`, or `lower` and `upper`."
+            )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
     # off the wrapper. `Any`: `equinox.tree_at` puts placeholders in the place of values.
@@ -201,6 +214,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         return _State(
             self.solver.init(terms, t0, t1, y0, args),
             values,
+            jtu.tree_map(jnp.zeros_like, values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
             ProjectionStatistics.zero(working_dtype(y0), num_constraints),
             judge(self.projection, self.manifold, values, t, y0, args),
@@ -219,7 +233,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
-        target = self._target(terms, t1, y0, candidate, args, solver_state)
+        start = self._target(terms, t1, y0, candidate, args, solver_state)
+        target = start.advanced(t0, t1, self._path(t0, t1, dense_info))
         y1, info = target.project(t1, candidate)
         too_far = target.too_far(info)
         success = info.ok & ~too_far & (solver_state.initial.cause == FINE)
@@ -227,8 +242,14 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         error = _judged(error, success, _is_hopeless(solver_state.initial, y0, candidate))
         failed = failure(info, too_far, solver_state.initial, self.manifold, solver_state.values)
         result = dfx.RESULTS.where(success | (result != dfx.RESULTS.successful), result, failed)
-        dense_info = dict(inner=dense_info, ends=(y0, y1), target=PackedTarget(target))
-        return y1, error, dense_info, solver_state.next(inner, info), result
+        dense_info = dict(inner=dense_info, ends=(y0, y1), target=PackedTarget(start))
+        return y1, error, dense_info, solver_state.next(inner, target.gained, info), result
+
+    def _path(
+        self, t0: RealScalarLike, t1: RealScalarLike, dense_info: DenseInfo
+    ) -> Callable[[RealScalarLike], Y]:
+        """The dense output of the wrapped solver in one step."""
+        return lambda t: self.solver.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
 
     def _target(
         self,
@@ -245,6 +266,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             state.values,
             args,
             time_direction(terms, t1),
+            gained=state.gained,
             limit=self._limit(y0, candidate, state.initial.offset) if is_ode(terms) else None,
             threshold=self.threshold,
             due=None if state.num_steps is None else (state.num_steps + 1) % self.every == 0,
@@ -265,7 +287,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         if error is None or not self.project_error:
             return error
         t1 = t1 * target.direction
-        return tangential(self.projection, self.manifold, target.values, t1, y1, target.args, error)
+        return tangential(self.projection, self.manifold, target.now, t1, y1, target.args, error)
 
 
 def _is_hopeless(initial: Initial, y0: Y, candidate: Y) -> Array:
@@ -289,15 +311,17 @@ class _State(eqx.Module):
 
     inner: Any
     values: Values
+    # What their rates have added to them, by itself: of each step it is little beside the value.
+    gained: Values | None
     num_steps: Array | None  # counted only if not every step is projected
     statistics: ProjectionStatistics
     initial: Initial
 
-    def next(self, inner: Any, info: ProjectionInfo) -> "_State":
+    def next(self, inner: Any, gained: Values | None, info: ProjectionInfo) -> "_State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
         offset = jnp.where(info.num_steps > 0, 0, self.initial.offset)
         initial = Initial(self.initial.cause, self.initial.position, offset)
-        return _State(inner, self.values, num_steps, self.statistics.add(info), initial)
+        return _State(inner, self.values, gained, num_steps, self.statistics.add(info), initial)
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**

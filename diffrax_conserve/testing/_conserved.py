@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     Constraint,
@@ -84,6 +85,7 @@ def assert_conserved(
         ```
     """
     check_manifold(manifold)
+    refuse_rates(manifold, "`assert_conserved`, unlike `diffrax_conserve.drift`,")
     _refuse_unsuccessful(solution)
     kinds = _sampled(solution, num_dense)
     lanes = jnp.shape(solution.t0)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, PyTree
 
+from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection.elimination import Vector
@@ -73,6 +74,7 @@ class ConservativeLayer(eqx.Module):
 
     def __check_init__(self):
         check_manifold(self.manifold)
+        refuse_rates(self.manifold, "a `ConservativeLayer`")
         check_sizes(steps=self.steps)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:

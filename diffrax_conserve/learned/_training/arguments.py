@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 
+from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold
 from ..._manifold import check_manifold, check_outputs
 from ..._projection import check_state
@@ -45,6 +46,7 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold | None) -> None:
     """Raises unless model, sampler and manifold fit each other."""
     if manifold is not None:
         check_manifold(manifold)
+        refuse_rates(manifold, "a training")
         if not (isinstance(model, PINN) and model.windows > 1):
             raise ValueError(
                 "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection import project
@@ -82,6 +83,7 @@ class Pool(eqx.Module):
             )
         if self.manifold is not None:
             check_manifold(self.manifold)
+            refuse_rates(self.manifold, "a `Pool`")
         if not self.mean_steps >= 1:
             raise ValueError(f"`mean_steps` must be at least 1, but is {self.mean_steps}.")
         if not self.max_defect > 0:

@@ -1,0 +1,73 @@
+"""Balance laws: what the rates of first integrals add up to along a solution."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
+
+from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from ._manifold import AbstractConserved, evaluate, is_entry, named_entries, rate_of
+
+# Gauss quadrature of order eight, which is that of the solver of diffrax with the highest.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+
+
+def has_rates(manifold: Manifold) -> bool:
+    """Whether a conserved value of the manifold changes along a solution."""
+    return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
+
+
+def refuse_rates(manifold: Manifold, user: str) -> None:
+    """Raises if an entry has a rate, whose integral `user` does not compute."""
+    for name, entry in named_entries(manifold):
+        if rate_of(entry) is not None:
+            raise ValueError(
+                f"`{name}` is a balance law, a `FirstIntegral` with a `rate`, but {user} keeps "
+                "conserved values that do not change. Leave it out of this manifold; a "
+                "`ManifoldProjection` keeps it."
+            )
+
+
+def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """`manifold` with each entry replaced by its rate, zero where it has none."""
+
+    def rate(entry: AbstractConserved, like: Any) -> Values:
+        fn = rate_of(entry)
+        if fn is None:
+            return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), fn(t, y, args), like)
+
+    values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
+    return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)
+
+
+def integrated_rates(
+    manifold: Manifold,
+    start: RealScalarLike,
+    end: RealScalarLike,
+    path: Callable[[RealScalarLike], Y],
+    args: Args,
+    direction: RealScalarLike,
+) -> Values:
+    """The integral of each rate along `path`, zero for an entry without one.
+
+    All times are the solver's, which are `direction` times those of the manifold.
+    """
+    half = (end - start) / 2
+
+    def at(node: RealScalarLike) -> Values:
+        t = start + (1 + node) * half
+        return rates(manifold, t * direction, path(t), args)
+
+    dtype = jnp.result_type(half)
+    found = jax.vmap(at)(jnp.asarray(_NODES, dtype))
+    weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
+    return jtu.tree_map(lambda x: _weighted_sum(weights.astype(x.dtype), x), found)
+
+
+def _weighted_sum(weights: Array, x: Array) -> Array:
+    return jnp.sum(weights.reshape(-1, *[1] * (x.ndim - 1)) * x, axis=0)

@@ -1,0 +1,288 @@
+"""Projection to a manifold and a box, by a semismooth Newton iteration on the multipliers.
+
+`y = clip(ŷ + M⁻¹ Bᵀ λ)` with `g(y) = 0`, where `B` is the constraint Jacobian at the candidate or,
+for the nearest point, at `y`. For linear constraints that is a quadratic program, whose dual is
+convex, and once differentiable: Newton's method with a search along its steps finds its minimum
+from anywhere (L. Qi and D. Sun, "A nonsmooth version of Newton's method", 1993). For others it is
+repeated with constraints that are linear about the last state.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+
+from .._custom_types import Y
+from .._tree import (
+    tree_add,
+    tree_dot,
+    tree_max,
+    tree_mul,
+    tree_scale,
+    tree_sub,
+    tree_tangents,
+    working_dtype,
+)
+from .base import Outcome, ProjectionInfo, report
+from .certainty import certain
+from .elimination import Vector
+from .implicit import solve_linearised
+from .iteration import Equations
+from .jacobian import AbstractJacobian
+from .linearise import linearise
+from .residual import largest, relative
+
+# Of one quadratic program: how many steps of Newton's method, and halvings in search of the
+# minimum along each.
+_INNER_STEPS, _HALVINGS = 100, 30
+# What a component beyond its bound counts for in the Gram matrix, in turn: without it a constraint
+# all of whose components are at bounds would stay as it is. Either alone gave up one in some
+# thousand random programs whose bounds and balances nearly contradict each other.
+_AT_BOUND = (1e-8, 1e-4)
+
+
+class Box(eqx.Module):
+    """Bounds, shaped like the state."""
+
+    lower: Y
+    upper: Y
+
+    def clip(self, y: Y) -> Y:
+        # At a bound the derivative is that of the inside.
+        return jtu.tree_map(
+            lambda x, a, b: jnp.where(x < a, a, jnp.where(x > b, b, x)), y, self.lower, self.upper
+        )
+
+    def inside(self, y: Y) -> Y:
+        """One where a component is within its bounds, and zero where it is beyond."""
+        return jtu.tree_map(
+            lambda x, a, b: ((x >= a) & (x <= b)).astype(x.dtype), y, self.lower, self.upper
+        )
+
+
+def box_of(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None, y: Y) -> Box | None:
+    """The box of two options of a projection, if one is given."""
+    if lower is None and upper is None:
+        return None
+    return Box(_bound("lower", lower, -np.inf, y), _bound("upper", upper, np.inf, y))
+
+
+def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, y: Y) -> Y:
+    leaves = [default] if bound is None else jtu.tree_leaves(bound)
+    single = bound is None or jtu.treedef_is_leaf(jtu.tree_structure(bound))
+    if single and jnp.ndim(leaves[0]) == 0:
+        return jtu.tree_map(lambda x: jnp.full_like(x, leaves[0]), y)
+    if jtu.tree_structure(bound) != jtu.tree_structure(y):
+        raise ValueError(
+            f"`{name}` has the structure {jtu.tree_structure(bound)}, but the state has "
+            f"{jtu.tree_structure(y)}. Give one number, or one bound (or an array) for each leaf "
+            "of the state."
+        )
+    for a, x in zip(jtu.tree_leaves(bound), jtu.tree_leaves(y), strict=True):
+        if jnp.shape(a) not in ((), jnp.shape(x)):
+            raise ValueError(
+                f"`{name}` has a leaf of shape {jnp.shape(a)} for a leaf of the state of shape "
+                f"{jnp.shape(x)}. Give a scalar or an array of the same shape."
+            )
+    return jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, y)
+
+
+def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
+    """Raises if both are known and a lower bound is above its upper one."""
+    leaves = [jtu.tree_leaves(x) for x in (lower, upper)]
+    if len(leaves[0]) != len(leaves[1]) or any(
+        isinstance(x, jax.core.Tracer) or not eqx.is_array_like(x) for x in [*leaves[0], *leaves[1]]
+    ):
+        return
+    for a, b in zip(*leaves, strict=True):
+        if not np.all(np.asarray(a) <= np.asarray(b)):
+            raise ValueError(
+                f"`lower` is {lower}, but `upper` is {upper}. Each lower bound must be at most its "
+                "upper one."
+            )
+
+
+class _Carry(NamedTuple):
+    unfinished: Bool[Array, ""]
+    last: Array
+    y: Y
+    multiplier: Vector
+    num_steps: Int[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def project_into(
+    equations: Equations, box: Box, *, frozen: bool, max_steps: int
+) -> tuple[Y, Vector, ProjectionInfo]:
+    """The state, its multipliers, and how it went."""
+    candidate = equations.candidate
+    before, at_candidate = linearise(equations.residual, candidate)
+    eps, tiny = (float(getattr(jnp.finfo(working_dtype(candidate)), x)) for x in ("eps", "tiny"))
+
+    def body(carry: _Carry) -> _Carry:
+        _, last, y, multiplier, count = carry
+        g, at_y = linearise(equations.residual, y)
+        base = at_candidate if frozen else at_y
+        multiplier = _quadratic_program(equations, box, base, g, y, multiplier)
+        trial, multiplier = _polished(equations, box, base, multiplier)
+        after, jacobian = linearise(equations.residual, trial)
+        scale = equations.scale(jacobian, trial)
+        satisfied = equations.safely_satisfied(after, scale)
+        if frozen:
+            left = largest(relative(after, scale))
+            unfinished = ~satisfied & (left < last)
+        else:  # until the state no longer moves towards the nearest point
+            left = tree_max(tree_sub(trial, y)) / jnp.maximum(tree_max(trial), tiny)
+            unfinished = (left > 16 * eps) & (~satisfied | (left < 0.5 * last)) & (left < jnp.inf)
+        return _Carry(unfinished & (count + 1 < max_steps), left, trial, multiplier, count + 1)
+
+    zeros = jtu.tree_map(jnp.zeros_like, before)
+    infinite = jnp.asarray(jnp.inf, working_dtype(candidate))
+    start = _Carry(jnp.asarray(True), infinite, box.clip(candidate), zeros, jnp.asarray(0))
+    end = lax.while_loop(lambda carry: carry.unfinished, body, start)
+    y = end.y
+    after, at_y = linearise(equations.residual, y)
+    scale = equations.scale(at_y, y)
+    outcome = Outcome.of(before, after, scale, equations.tolerance)
+    rank = at_candidate.gram_solver(equations.weights).rank
+    info = report(outcome, end.num_steps, candidate, y, before, after, scale, rank)
+    # Only the nearest point has a derivative.
+    moving = jnp.asarray(False) if frozen else end.last > eps**0.5
+    multiplier = jtu.tree_map(lambda x: jnp.where(moving, jnp.nan, x), end.multiplier)
+    return y, multiplier, info
+
+
+def _polished(
+    equations: Equations, box: Box, base: AbstractJacobian, multiplier: Vector
+) -> tuple[Y, Vector]:
+    """The state of these multipliers, corrected by what it still lacks: a component that is small
+    beside its candidate is only as accurate as that."""
+    z = tree_add(equations.candidate, equations.correction(base, multiplier))
+    y, active = box.clip(z), tree_mul(equations.weights, box.inside(z))
+    gram_solver = base.gram_solver(active)
+    for _ in range(2):
+        change = gram_solver.solve(equations.residual(y))
+        y = box.clip(tree_sub(y, tree_mul(base.pullback(change), active)))
+        multiplier = tree_sub(multiplier, change)
+    return y, multiplier
+
+
+class _Inner(NamedTuple):
+    unfinished: Bool[Array, ""]
+    multiplier: Vector
+    num_steps: Int[Array, ""]
+
+
+def _quadratic_program(
+    equations: Equations, box: Box, base: AbstractJacobian, g: Vector, y: Y, multiplier: Vector
+) -> Vector:
+    """The multipliers of the nearest point of the box with `g + B (x - y) = 0`.
+
+    They minimise a convex function whose gradient is that residual. Its value is never computed:
+    it would lose in roundoff what small components of the state have to say.
+    """
+    candidate, weights = equations.candidate, equations.weights
+    dtype = working_dtype(candidate)
+    scale = equations.scale(base, y)
+
+    def body(carry: _Inner) -> _Inner:
+        _, multiplier, count = carry
+        z = tree_add(candidate, equations.correction(base, multiplier))
+        x = box.clip(z)
+        gradient = jtu.tree_map(jnp.add, base.pushforward(tree_sub(x, y)), g)
+        merit = largest(relative(gradient, scale))
+        share = jnp.where(count % 2 == 0, *_AT_BOUND)
+        active = jtu.tree_map(
+            lambda w, i: w * (i + share.astype(w.dtype) * (1 - i)), weights, box.inside(z)
+        )
+        change = jtu.tree_map(jnp.negative, base.gram_solver(active).solve(gradient))
+        pull = base.pullback(change)
+        step = tree_mul(pull, weights)
+        slope = tree_dot(gradient, change, dtype)
+
+        def slope_at(length: Array) -> Array:
+            """Of the function along the step: it grows with the length."""
+            moved = tree_sub(box.clip(tree_add(z, tree_scale(length, step))), x)
+            return slope + tree_dot(pull, moved, dtype)
+
+        length = _least(slope_at, dtype)
+        multiplier = tree_add(multiplier, tree_scale(length, change))
+        unfinished = (merit > float(jnp.finfo(dtype).eps)) & (slope < 0) & (merit < jnp.inf)
+        return _Inner(unfinished & (count + 1 < _INNER_STEPS), multiplier, count + 1)
+
+    start = _Inner(jnp.asarray(True), multiplier, jnp.asarray(0))
+    return lax.while_loop(lambda carry: carry.unfinished, body, start).multiplier
+
+
+def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
+    """Where a slope that grows is zero between 0 and 1, by bisection; 1 if it is negative there."""
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        a, b = ends
+        middle = (a + b) / 2
+        falls = slope_at(middle) < 0
+        return jnp.where(falls, middle, a), jnp.where(falls, b, middle)
+
+    one = jnp.ones((), dtype)
+    # A full step that ends just past the minimum is as good as one to it.
+    good = slope_at(one) <= 1e-3 * jnp.abs(slope_at(jnp.zeros((), dtype)))
+    _, b = lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros((), dtype), one))
+    return jnp.where(good, one, b)
+
+
+@project_into.def_jvp
+def _project_into_jvp(primals, tangents, *, frozen, max_steps):
+    """The implicit function theorem, with the components that are at their bounds held there."""
+    (equations, box), (t_equations, t_box) = primals, tangents
+    y, multiplier, info = project_into(equations, box, frozen=frozen, max_steps=max_steps)
+    _, at_y = linearise(equations.residual, y)
+
+    def pulled(base: Y, parameters: Any) -> tuple[Y, Y]:
+        """The state before and after it is clipped."""
+        residual, candidate, weights, box = parameters
+        _, vjp = eqx.filter_vjp(residual, base)
+        z = tree_add(candidate, tree_mul(vjp(multiplier)[0], weights))
+        return z, box.clip(z)
+
+    def parameters(x: Any, box: Any) -> tuple[Any, Any, Any, Any]:
+        return x.residual, x.candidate, x.weights, box
+
+    given, t_given = parameters(equations, box), parameters(t_equations, t_box)
+    z, _ = pulled(equations.candidate if frozen else y, given)
+    active = tree_mul(equations.weights, box.inside(z))
+    if frozen:
+
+        def displaced(parameters: Any) -> tuple[Y, Vector]:
+            _, x = pulled(parameters[1], parameters)
+            return x, parameters[0](x)
+
+        _, at_candidate = linearise(equations.residual, equations.candidate)
+        t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, (given,), (t_given,)))
+        t_multiplier = at_y.gram_solver(active, at_candidate).solve(jtu.tree_map(jnp.negative, t_g))
+        t_y = tree_add(t_y, tree_mul(at_candidate.pullback(t_multiplier), active))
+    else:
+
+        def optimality(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
+            x, multiplier = unknowns
+            residual, candidate, weights, box = parameters
+            g, vjp = eqx.filter_vjp(residual, x)
+            z = tree_add(candidate, tree_mul(vjp(multiplier)[0], weights))
+            return tree_sub(x, box.clip(z)), g
+
+        unknowns = y, multiplier
+        _, right = eqx.filter_jvp(lambda p: optimality(unknowns, p), (given,), (t_given,))
+        right = jtu.tree_map(jnp.negative, tree_tangents(unknowns, right))
+        t_y, t_multiplier = solve_linearised(lambda x: optimality(x, given), unknowns, right)
+    inside = Equations(
+        equations.residual, equations.candidate, active, equations.magnitude, equations.tolerance
+    )
+    factor = jnp.where(info.ok, certain(inside, y, at_y), 1)
+    t_y = tree_scale(lax.stop_gradient(factor), t_y)
+    return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

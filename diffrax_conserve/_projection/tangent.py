@@ -1,0 +1,184 @@
+"""Vector fields made tangent to a manifold, and with them the forces of constraints."""
+
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, ArrayLike, PyTree
+
+from .._balance import rates
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import (
+    FirstIntegral,
+    check_manifold,
+    check_outputs,
+    check_values,
+    conserved_values,
+    evaluate,
+    named_entries,
+    rate_of,
+    slope_like,
+)
+from .._tree import tree_add, tree_mul
+from .base import positive_weights
+from .linearise import as_array, linearise, written_out
+from .project import check_metric, check_state, inverse_metric
+from .residual import residual_of, shaped
+
+
+def tangent(
+    vector_field: Callable[[RealScalarLike, Any, Args], Any],
+    manifold: Manifold,
+    *,
+    metric: PyTree[ArrayLike] | None = None,
+    gain: float | Array = 0.0,
+) -> "TangentField":
+    r"""The vector field less its component across a manifold.
+
+    For $f$, the residual $g$ of the manifold with $G = \partial g/\partial y$, and the metric $M$,
+
+    $$y' = f + M^{-1} G^\top \lambda, \qquad
+    G M^{-1} G^\top \lambda = -(\partial_t g + G f + \text{gain} \cdot g),$$
+
+    so that along a solution $g' = -\text{gain} \cdot g$: it stays what it is, or with a `gain` it
+    decays (Baumgarte's stabilisation; the stabilised neural equations of White et al.). The field
+    is nearest to $f$ in the metric, and differentiable.
+
+    **Mechanisms.** For positions $q$ and velocities $v$ with masses $m$ and forces $F$ let
+    $f = (v, F/m)$, take the constraint of the velocities that
+    [`diffrax_conserve.Constraint.derivative`][] makes of that of the positions, and the metric
+    $(\infty, m)$: then $m v' = F + G^\top \lambda$, the equations of motion, whose
+    `multipliers` are the forces of the constraints. A projection of the solution of $f$ does not
+    solve them. See "Constrained mechanics" in the guide.
+
+    **Arguments:**
+
+    - `vector_field`: $f$, called as `vector_field(t, y, args)`.
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same
+        arguments. A `FirstIntegral` with a `rate` gets that.
+    - `metric`: a PyTree like the state of positive weights, scalars or arrays shaped like the
+        leaves. An infinite weight leaves its component of the field alone. Default: Euclidean.
+    - `gain`: how fast the residual decays, in units of one over time.
+
+    **Returns:**
+
+    A [`diffrax_conserve.TangentField`][], which is called as `vector_field` is.
+
+    **Raises:**
+
+    `TypeError` or `ValueError` if the manifold or the metric does not fit, or if a `gain` is given
+    for a `FirstIntegral` without a `value`.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        def free_fall(t, y, args):
+            q, v = y
+            return v, jnp.array([0.0, -9.81])
+
+        rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
+        pendulum = dfc.tangent(free_fall, rod.derivative(free_fall), metric=(jnp.inf, 1.0))
+        print(pendulum(0.0, (jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0])), None))
+        ```
+
+    ??? cite "Reference"
+
+        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
+        2006, Sections IV.5 and VII.1; J. Baumgarte, "Stabilization of constraints and integrals of
+        motion in dynamical systems", *Comput. Methods Appl. Mech. Eng.* 1 (1972), 1-16; A. White et
+        al., "Stabilized neural differential equations for learning dynamics with explicit
+        constraints", NeurIPS 2023.
+    """
+    if not callable(vector_field):
+        raise TypeError(
+            f"`vector_field` is {vector_field!r}, which is not callable. Pass the function, not a "
+            "`diffrax.ODETerm` of it: `tangent(vector_field, manifold)`."
+        )
+    check_manifold(manifold)
+    damped = not (isinstance(gain, float | int) and gain == 0)
+    for name, entry in named_entries(manifold):
+        if damped and isinstance(entry, FirstIntegral) and entry.value is None:
+            raise ValueError(
+                f"`gain` is {gain}, but `{name}` has no value that it could return to. Write "
+                "`FirstIntegral(fn, value=...)`, or leave `gain` out."
+            )
+        if damped and rate_of(entry) is not None:
+            raise ValueError(
+                f"`gain` is {gain}, but the value of `{name}` changes at its `rate`, and a vector "
+                "field does not know it. Leave `gain` out."
+            )
+    return TangentField(vector_field, manifold, positive_weights(metric), gain)
+
+
+@final
+class TangentField(eqx.Module):
+    """A vector field less its component across a manifold; see [`diffrax_conserve.tangent`][].
+
+    Call it as any vector field, `field(t, y, args)`.
+    """
+
+    vector_field: Callable[[RealScalarLike, Any, Args], Any]
+    manifold: Manifold
+    metric: PyTree[ArrayLike] | None
+    gain: float | Array
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        slope, correction, _ = self._solve(t, y, args)
+        return tree_add(slope, correction)
+
+    def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Values:
+        r"""The multipliers $\lambda$, in a mechanism the forces of its constraints.
+
+        **Arguments:**
+
+        - `t`, `y`, `args`: as for the vector field; for many states use `jax.vmap`.
+
+        **Returns:**
+
+        A PyTree like the values of the functions of the manifold.
+        """
+        _, _, multiplier = self._solve(t, y, args)
+        return multiplier
+
+    def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
+        """The given field, what is added to it, and the multipliers."""
+        y = jtu.tree_map(jnp.asarray, y)
+        check_state(y, "`tangent`")
+        check_metric(self.metric, y)
+        check_outputs(self.manifold, t, y, args)
+        slope = slope_like(y, self.vector_field(t, y, args))
+        values = conserved_values(self.manifold, t, y, args)
+        check_values(self.manifold, values, t, y, args)
+        wrong = self._wrong_rates(t, y, args, slope, values)
+        residual, magnitude = residual_of(self.manifold, values, t, y, args)
+        inline, _, split, join = written_out(residual, magnitude, y)
+        g, jacobian = linearise(inline, split(y))
+        weights = split(inverse_metric(self.metric, y))
+        wrong = tuple(wrong) if isinstance(g, tuple) else wrong
+        multiplier = jacobian.gram_solver(weights).solve(wrong)
+        correction = join(tree_mul(jacobian.pullback(multiplier), weights))
+        return slope, correction, shaped(as_array(multiplier), values)
+
+    def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
+        """`-(∂g/∂t + G f + gain g)`, less the rates that are meant."""
+        t = jnp.asarray(t, jnp.result_type(float, t))
+
+        def residuals(t: RealScalarLike, y: Y) -> Values:
+            return evaluate(self.manifold, t, y, args)
+
+        now, along = jax.jvp(residuals, (t, y), (jnp.ones_like(t), slope))
+        meant = rates(self.manifold, t, y, args)
+        parts = jtu.tree_map(
+            lambda rate, a, x, v: jnp.ravel(rate - a - self.gain * (x - v)),
+            meant,
+            along,
+            now,
+            values,
+        )
+        return jnp.concatenate(jtu.tree_leaves(parts))

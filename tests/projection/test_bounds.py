@@ -1,0 +1,210 @@
+"""The nearest point of a manifold within bounds."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import diffrax_conserve as dfc
+
+from ..problems import largest
+
+EPS = np.finfo(np.float64).eps
+BOTH = pytest.mark.parametrize(
+    "kind", [dfc.SimplifiedNewton, dfc.Newton], ids=["simplified", "newton"]
+)
+BALANCES = dfc.FirstIntegral(lambda t, y, args: args @ y)
+
+
+def chemistry(rng, count, species=8, balances=3):
+    """Balances of atoms with feasible values, and candidates of which many are negative.
+
+    As in Robertson's problem the amounts differ by orders of magnitude.
+    """
+    atoms = rng.integers(0, 4, size=(count, balances, species)).astype(float)
+    atoms[:, np.arange(balances), np.arange(balances)] += 1
+    sizes = 10 ** rng.uniform(-6, 0, size=(count, species))
+    amounts = sizes * rng.uniform(0, 1, size=sizes.shape)
+    amounts[rng.random(sizes.shape) < 0.2] = 0
+    noise = np.where(rng.random(sizes.shape) < 0.5, sizes, 0.1)
+    candidates = amounts + noise * rng.normal(size=sizes.shape)
+    return tuple(map(jnp.asarray, (atoms, np.einsum("ijk,ik->ij", atoms, amounts), candidates)))
+
+
+@eqx.filter_jit
+def project(kind, atoms, values, candidates, metric):
+    def one(atoms, value, candidate):
+        projection = kind(lower=0.0, metric=metric)
+        y, info = dfc.project(BALANCES, candidate, args=atoms, value=value, projection=projection)
+        return y, info.ok, info.num_steps
+
+    return jax.vmap(one)(atoms, values, candidates)
+
+
+def quadratic_program(atoms, value, candidate, metric):
+    """By another method: SLSQP, whose first step solves one exactly if the Hessian is one."""
+    root = np.sqrt(metric)
+    found = scipy.optimize.minimize(
+        lambda u: np.sum((u - root * candidate) ** 2) / 2,
+        np.maximum(root * candidate, 0),
+        jac=lambda u: u - root * candidate,
+        bounds=[(0, None)] * candidate.size,
+        constraints={
+            "type": "eq",
+            "fun": lambda u: atoms @ (u / root) - value,
+            "jac": lambda u: atoms / root,
+        },
+        method="SLSQP",
+        options={"ftol": 1e-18, "maxiter": 200},
+    )
+    return found.x / root
+
+
+@BOTH
+@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_it_solves_the_quadratic_program(kind, count):
+    rng = np.random.default_rng(1)
+    atoms, values, candidates = chemistry(rng, count)
+    metric = 10 ** rng.uniform(-1, 1, size=8)
+    y, ok, _ = project(kind, atoms, values, candidates, jnp.asarray(metric))
+    assert jnp.all(ok)
+    for a, v, c, got in zip(*map(np.asarray, (atoms, values, candidates, y)), strict=True):
+        expected = quadratic_program(a, v, c, metric)
+        # Not nearer by more than what SLSQP errs.
+        near, best = (np.sum(metric * (x - c) ** 2) for x in (got, expected))
+        assert near <= best * (1 + 1e-9) + 1e-12
+        if np.max(np.abs(a @ expected - v)) < 1e-12 and np.min(expected) > -1e-12:
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1e-8)
+
+
+@BOTH
+@pytest.mark.parametrize("count", [2_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_no_amount_is_negative_and_every_balance_holds(kind, count):
+    atoms, values, candidates = chemistry(np.random.default_rng(2), count)
+    y, ok, _ = project(kind, atoms, values, candidates, jnp.ones(8))
+    # Few of these, whose bounds and balances nearly contradict each other, may fail, and say so.
+    assert jnp.mean(ok) >= 0.9999
+    assert jnp.min(y) >= 0
+    amounts = jnp.einsum("ijk,ik->ij", atoms, y)
+    residual = jnp.abs(amounts - values) / jnp.maximum(amounts + values, 1e-300)
+    assert jnp.max(residual[ok]) <= 17 * EPS
+    assert jnp.quantile(residual, 0.999) <= 4 * EPS
+
+
+def test_a_candidate_within_the_bounds_is_projected_as_without():
+    rng = np.random.default_rng(3)
+    atoms, values, candidates = chemistry(rng, 50)
+    inside = jnp.abs(candidates) + 1
+    moved = values + jnp.einsum("ijk,ik->ij", atoms, inside - candidates) * 0.999
+    y, *_ = project(dfc.SimplifiedNewton, atoms, moved, inside + 1, jnp.ones(8))
+
+    def free(atoms, value, candidate):
+        return dfc.project(
+            BALANCES, candidate, args=atoms, value=value, projection=dfc.SimplifiedNewton()
+        )[0]
+
+    expected = jax.vmap(free)(atoms, moved, inside + 1)
+    untouched = jnp.all(expected > 0, axis=1)
+    assert jnp.sum(untouched) > 10
+    assert largest((y - expected)[untouched]) < 1e-13
+
+
+SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+
+
+def test_the_nearest_point_of_a_sphere_within_an_orthant():
+    """Which is known: what is negative becomes zero, and the rest is divided by its norm."""
+    candidates = jnp.asarray(np.random.default_rng(4).normal(size=(200, 4)))
+    candidates = candidates[jnp.max(candidates, 1) > 0.3]
+    projection = dfc.Newton(lower=0.0, max_steps=200)
+
+    def one(candidate):
+        y, info = dfc.project(SPHERE, candidate, projection=projection)
+        return y, info.ok
+
+    y, ok = jax.jit(jax.vmap(one))(candidates)
+    kept = jnp.maximum(candidates, 0)
+    near = jnp.linalg.norm(kept, axis=1) > 0.7
+    expected = kept / jnp.linalg.norm(kept, axis=1, keepdims=True)
+    assert jnp.sum(near) > 100
+    assert jnp.all(ok[near])
+    assert largest((y - expected)[near]) < 1e-12
+
+
+@BOTH
+def test_derivatives_are_those_of_differences(kind):
+    """With a component at each bound, in a metric, and through both."""
+    projection = kind(lower=(0.0, jnp.array([0.0, -9.0])), upper=(1.0, jnp.array([9.0, 0.25])))
+    manifold = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y[0] ** 2) + y[1][0] + args * y[1][1])
+
+    def fn(x):
+        candidate = (x[:2], x[2:4])
+        out, info = dfc.project(manifold, candidate, args=x[4], value=x[5], projection=projection)
+        return jnp.concatenate(out), info.ok
+
+    @jax.jit
+    def measure(x):
+        steps = 1e-5 * jnp.eye(6)
+        ends = jax.lax.map(lambda x: fn(x)[0], jnp.concatenate([x + steps, x - steps]))
+        difference = (ends[:6] - ends[6:]).T / 2e-5
+        forward, reverse = (jac(lambda x: fn(x)[0])(x) for jac in (jax.jacfwd, jax.jacrev))
+        return *fn(x), difference, forward, reverse
+
+    y, ok, difference, forward, reverse = measure(jnp.array([-0.3, 0.6, 0.5, 0.4, 1.5, 1.4]))
+    assert ok
+    assert y[0] == 0
+    assert y[3] == 0.25
+    assert jnp.allclose(forward, difference, atol=1e-8)
+    assert jnp.allclose(reverse, forward, atol=1e-12)
+
+
+@BOTH
+def test_what_cannot_be_fails(kind):
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
+    y = jnp.array([0.3, -0.2, 0.5])
+    for value, projection in [(-0.1, kind(lower=0.0)), (3.1, kind(lower=0.0, upper=1.0))]:
+        state, info = dfc.project(total, y, value=value, projection=projection)
+        assert not info.ok
+        assert jnp.all(state >= 0)
+    _, info = dfc.project(total, y.at[0].set(jnp.nan), value=1.0, projection=kind(lower=0.0))
+    assert not info.ok
+
+
+def decay(t, y, args):
+    """A chain of reactions so fast that Euler's method overshoots."""
+    return jnp.array([-30 * y[0], 30 * y[0] - 2 * y[1], 2 * y[1]])
+
+
+def test_a_solve_stays_within_the_bounds_between_its_steps_too():
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
+
+    def solve(**bounds):
+        return dfx.diffeqsolve(
+            dfx.ODETerm(decay),
+            dfc.ManifoldProjection(dfx.Euler(), total, projection=dfc.SimplifiedNewton(**bounds)),
+            0.0,
+            1.0,
+            0.05,
+            jnp.array([1.0, 0.0, 0.0]),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0, 1, 101)),
+        ).ys
+
+    kept = solve(lower=0.0)
+    assert jnp.min(solve()) < -0.1
+    assert jnp.min(kept) >= 0
+    assert jnp.max(jnp.abs(jnp.sum(kept, 1) - 1)) < 4e-15
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match="`lower` is 1"):
+        dfc.SimplifiedNewton(lower=1.0, upper=0.0)
+    with pytest.raises(ValueError, match="`lower` has the structure"):
+        dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=(0.0, 0.0)))
+    with pytest.raises(ValueError, match="`upper` has a leaf of shape"):
+        dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(upper=jnp.ones(2)))
+    bounded = dfc.SimplifiedNewton(lower=0.0)
+    with pytest.raises(ValueError, match="`projection` has bounds"):
+        dfc.ManifoldProjection(dfx.Euler(), SPHERE, projection=bounded, every=2)

@@ -1,0 +1,312 @@
+"""Balance laws: integrals whose rate is known are kept as integrals without a rate are."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+from ..problems import largest
+
+EPS = np.finfo(np.float64).eps
+
+
+def pendulum(t, y, args):
+    """With friction, and driven."""
+    (q, v), (friction, drive) = y, args
+    return v, -jnp.sin(q) - friction * v + drive * jnp.cos(2 * t)
+
+
+def energy(t, y, args):
+    q, v = y
+    return v**2 / 2 - jnp.cos(q)
+
+
+def power(t, y, args):
+    (_, v), (friction, drive) = y, args
+    return drive * v * jnp.cos(2 * t) - friction * v**2
+
+
+BALANCE = dfc.FirstIntegral(energy, rate=power)
+Y0, ARGS = (jnp.array(1.2), jnp.array(0.3)), (jnp.array(0.1), jnp.array(0.4))
+
+
+@eqx.filter_jit
+def solve(
+    y0=Y0,
+    args=ARGS,
+    *,
+    t0=0.0,
+    t1=2.0,
+    dt0=0.1,
+    solver=None,
+    field=pendulum,
+    manifold=BALANCE,
+    saveat=None,
+    max_steps=256,
+    **options,
+):
+    solver = dfx.Tsit5() if solver is None else solver
+    solver = solver if manifold is None else dfc.ManifoldProjection(solver, manifold)
+    saveat = dfx.SaveAt(t0=True, steps=True, dense=True) if saveat is None else saveat
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        solver,
+        t0,
+        t1,
+        dt0,
+        y0,
+        args,
+        saveat=saveat,
+        max_steps=max_steps,
+        **options,
+    )
+
+
+def worst(solution, manifold=BALANCE, args=ARGS):
+    return largest(dfc.drift(solution, manifold, args))
+
+
+ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"stepsize_controller": ADAPTIVE},
+        {"t0": 1.0, "t1": -1.0, "dt0": -0.1},
+        {"saveat": dfx.SaveAt(t0=True, ts=jnp.linspace(0.03, 1.97, 50), dense=True)},
+        {"solver": dfc.RK4(), "dt0": 0.3},
+    ],
+    ids=["fixed", "adaptive", "backwards", "between-the-steps", "rk4"],
+)
+def test_the_balance_is_kept_to_roundoff(options):
+    """Between the steps too: what is saved there lies on the balance of that time."""
+    kept, plain = solve(**options), solve(manifold=None, **options)
+    assert worst(kept) <= 16 * EPS
+    assert worst(plain) > 1e3 * EPS
+
+
+def test_dense_output_is_on_the_balance():
+    solution = solve(stepsize_controller=ADAPTIVE)
+    times = jnp.linspace(0.0, 2.0, 201)
+    dense = eqx.tree_at(
+        lambda s: (s.ts, s.ys), solution, (times, jax.vmap(solution.evaluate)(times))
+    )
+    assert worst(dense) <= 16 * EPS
+
+
+def test_the_balance_holds_against_an_independent_integral():
+    """`E(t) - E(0)` is the work, here as a third component of an accurate solve."""
+    kept = solve(dt0=0.05)
+    exact = dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))),
+        dfx.Dopri8(),
+        0.0,
+        2.0,
+        0.01,
+        (Y0, jnp.array(0.0)),
+        ARGS,
+    )
+    final = jax.tree.map(lambda y: y[40], kept.ys)
+    state, work = jax.tree.map(lambda y: y[-1], exact.ys)
+    gained = energy(2.0, final, ARGS) - energy(0.0, Y0, ARGS)
+    assert abs(gained - work) < 1e-9
+    assert largest(jax.tree.map(jnp.subtract, final, state)) < 1e-8
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("solver", "step", "order"),
+    [
+        pytest.param(dfx.Euler(), 0.25, 1, id="euler", marks=SLOW),
+        pytest.param(dfx.Heun(), 0.25, 2, id="heun", marks=SLOW),
+        pytest.param(dfx.Bosh3(), 0.25, 3, id="bosh3"),
+        pytest.param(dfc.RK4(), 0.25, 4, id="rk4", marks=SLOW),
+        pytest.param(dfx.Tsit5(), 0.25, 5, id="tsit5"),
+        # Its dense output, and with it the balance, is of a lower order than the state.
+        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8", marks=SLOW),
+    ],
+)
+def test_the_order_survives(solver, step, order):
+    dct.assert_order(
+        dfc.ManifoldProjection(solver, BALANCE),
+        dfx.ODETerm(pendulum),
+        Y0,
+        t1=2.0,
+        dt0=step,
+        args=ARGS,
+        order=order,
+    )
+
+
+def test_a_continued_solve_is_one_solve():
+    whole = solve(saveat=dfx.SaveAt(t1=True))
+    half = solve(t1=1.0, saveat=dfx.SaveAt(t1=True, solver_state=True))
+    middle = jax.tree.map(lambda y: y[-1], half.ys)
+    end = solve(middle, t0=1.0, saveat=dfx.SaveAt(t1=True), solver_state=half.solver_state)
+    # The same steps, up to the roundoff of their times.
+    assert largest(jax.tree.map(jnp.subtract, end.ys, whole.ys)) < 1e-13
+
+
+def test_a_lane_of_a_batch_is_that_lane_alone():
+    frictions = jnp.array([0.0, 0.1, 1.0])
+
+    def final(friction):
+        return solve(args=(friction, ARGS[1]), saveat=dfx.SaveAt(t1=True)).ys
+
+    batch = jax.vmap(final)(frictions)
+    alone = final(frictions[2])
+    assert largest(jax.tree.map(lambda a, b: a[2] - b, batch, alone)) < 4 * EPS
+
+
+def test_derivatives_forward_and_reverse_are_those_of_differences():
+    def final(x, adjoint=dfx.RecursiveCheckpointAdjoint()):
+        solution = solve(
+            (x[0], x[1]), (x[2], x[3]), saveat=dfx.SaveAt(t1=True), adjoint=adjoint, dt0=0.2
+        )
+        return solution.ys[0][-1] + 2 * solution.ys[1][-1]
+
+    x = jnp.stack([*Y0, *ARGS])
+    reverse = jax.jit(jax.grad(final))(x)
+    forward = jax.jit(jax.jacfwd(lambda x: final(x, dfx.ForwardMode())))(x)
+    steps = 1e-4 * jnp.eye(4)
+    ends = jax.vmap(final)(jnp.concatenate([x + steps, x - steps]))
+    assert jnp.allclose(reverse, (ends[:4] - ends[4:]) / 2e-4, rtol=1e-6, atol=1e-7)
+    assert jnp.allclose(reverse, forward, rtol=1e-12)
+
+
+def test_an_event_is_found_on_the_balance():
+    """At the highest point the speed vanishes."""
+    root_finder = optx.Newton(rtol=1e-12, atol=1e-12)
+    event = dfx.Event(lambda t, y, args, **_: y[1], root_finder)
+    solution = solve(event=event, saveat=dfx.SaveAt(t0=True, t1=True, dense=True))
+    assert abs(solution.ys[1][-1]) < 1e-10
+    assert worst(solution) <= 16 * EPS
+
+
+COUPLING = 0.7
+
+
+def coupled(t, y, args):
+    """Two oscillators, of which the second one is damped."""
+    q, v, *_ = y
+    force = COUPLING * (q[1] - q[0])
+    return v, jnp.stack([-q[0] + force, -4 * q[1] - force - 0.2 * v[1]])
+
+
+def energies(t, y, args):
+    q, v, *_ = y
+    return v**2 / 2 + jnp.array([1.0, 4.0]) * q**2 / 2
+
+
+def powers(t, y, args):
+    q, v, *_ = y
+    force = COUPLING * (q[1] - q[0])
+    return jnp.stack([force * v[0], -force * v[1] - 0.2 * v[1] ** 2])
+
+
+def test_a_manifold_of_balances_and_integrals():
+    """Several balances in an array, next to an integral without a rate."""
+    manifold = {
+        "energies": dfc.FirstIntegral(energies, rate=powers),
+        "constant": dfc.FirstIntegral(lambda t, y, args: y[2]),
+    }
+
+    def field(t, y, args):
+        return *coupled(t, y, args), jnp.zeros(())
+
+    y0 = (jnp.array([1.0, 0.2]), jnp.array([0.1, 0.5]), jnp.array(3.0))
+    solution = solve(y0, None, field=field, manifold=manifold)
+    assert worst(solution, manifold, None) <= 16 * EPS
+    assert dfc.check_invariance(field, manifold, jax.tree.map(lambda x: x[None], y0)).ok
+
+
+def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
+    """A friction that takes less than a unit of roundoff of the energy in each step."""
+    args = jax.tree.map(jnp.float32, (1e-6, 0.0))
+    y0 = jax.tree.map(jnp.float32, Y0)
+    times = jnp.array([0.0, 200.0, 0.01], jnp.float32)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(pendulum),
+        dfc.ManifoldProjection(dfx.Tsit5(), BALANCE),
+        *times,
+        y0,
+        args,
+        saveat=dfx.SaveAt(t1=True, solver_state=True),
+        max_steps=None,
+    )
+    gained = float(solution.solver_state.gained)
+    exact = solve(
+        args=(1e-6, 0.0),
+        t1=200.0,
+        dt0=1.0,
+        manifold=None,
+        max_steps=4096,
+        stepsize_controller=PRECISE,
+    )
+    last = jnp.sum(jnp.isfinite(exact.ts)) - 1
+    final = jax.tree.map(lambda y: y[last], exact.ys)
+    lost = float(energy(0, final, None) - energy(0, Y0, None))
+    assert gained == pytest.approx(lost, rel=1e-2)
+
+
+PRECISE = dfx.PIDController(rtol=1e-9, atol=1e-9)
+
+
+def test_a_wrong_rate_is_not_invariant():
+    states = (jnp.linspace(0.1, 1.0, 9), jnp.linspace(-1.0, 1.1, 9))
+    right = dfc.check_invariance(pendulum, BALANCE, states, args=ARGS, t=jnp.linspace(0, 1, 9))
+    assert right.ok
+
+    def without_drive(t, y, args):
+        return -args[0] * y[1] ** 2
+
+    for rate in (without_drive, None):
+        wrong = dfc.FirstIntegral(energy, rate=rate)
+        assert not dfc.check_invariance(pendulum, wrong, states, args=ARGS).ok
+
+
+def test_mistakes_are_named():
+    with pytest.raises(TypeError, match="rate"):
+        dfc.FirstIntegral(energy, rate=3)
+    wrong = dfc.FirstIntegral(energy, rate=lambda t, y, args: jnp.ones(2))
+    with pytest.raises(ValueError, match="`rate` of `manifold` returns"):
+        solve(manifold=wrong)
+    with pytest.raises(ValueError, match="dense=True"):
+        dfc.drift(solve(saveat=dfx.SaveAt(t0=True, t1=True)), BALANCE, ARGS)
+    with pytest.raises(ValueError, match="a balance law"):
+        dfc.learned.ConservativeLayer(BALANCE)
+    with pytest.raises(ValueError, match="a balance law"):
+        dct.assert_conserved(solve(), BALANCE, ARGS)
+
+
+@pytest.mark.parametrize(
+    ("solver", "step"), [(dfx.Heun(), 0.02), (dfx.Bosh3(), 0.05), (dfx.Tsit5(), 0.1)]
+)
+def test_the_dissipated_entropy_of_arkode(solver, step):
+    """`u' = -e^u` with the entropy `e^u`: no worse than without, by more than a fifth."""
+    balance = dfc.FirstIntegral(lambda t, u, _: jnp.exp(u), rate=lambda t, u, _: -jnp.exp(2 * u))
+    solutions = [
+        solve(
+            jnp.array(1.0),
+            None,
+            solver=solver,
+            dt0=step,
+            field=lambda t, u, _: -jnp.exp(u),
+            manifold=manifold,
+        )
+        for manifold in (None, balance)
+    ]
+    exact = -jnp.log(jnp.exp(-1.0) + 2)
+    plain, kept = (abs(s.ys[round(2 / step)] - exact) for s in solutions)
+    assert kept <= 1.2 * plain
+    assert worst(solutions[1], balance, None) <= 16 * EPS

@@ -1,0 +1,302 @@
+"""Tangent fields: mechanisms from masses, forces and position constraints alone."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from .problems import largest
+
+EPS = np.finfo(np.float64).eps
+KEYS = jr.split(jr.key(0), 20)
+
+
+def mechanism(positions, force, masses):
+    """The field and the manifold of masses at `q` that `positions(q) = 0` holds together."""
+
+    def free(t, y, args):
+        return y[1], force / masses
+
+    position = dfc.Constraint(lambda t, y, args: positions(y[0]))
+    manifold = {"position": position, "velocity": position.derivative(free)}
+    field = dfc.tangent(free, manifold["velocity"], metric=(jnp.inf, masses))
+    return field, manifold, free
+
+
+GRAVITY = 9.81
+PENDULUM = dfc.systems.CartesianPendulum(length=1.3, gravity=GRAVITY)
+ROD, ROD_MANIFOLD, FALLING = mechanism(
+    lambda q: jnp.sum(q**2) - 1.3**2, jnp.array([0.0, -GRAVITY]), jnp.ones(2)
+)
+
+MASSES, LENGTHS = np.array([1.0, 0.7]), np.array([1.0, 0.6])
+DOUBLE, DOUBLE_MANIFOLD, _ = mechanism(
+    lambda q: jnp.sum(jnp.diff(q, axis=0, prepend=0.0) ** 2, 1) - LENGTHS**2,
+    -GRAVITY * MASSES[:, None] * np.array([0.0, 1.0]),
+    MASSES[:, None] * np.ones((1, 2)),
+)
+
+
+def in_angles(t, y, args):
+    """The double pendulum in angles and angular velocities, as textbooks have it."""
+    (a, b), (u, v) = y
+    (m1, m2), (l1, l2), d = MASSES, LENGTHS, a - b
+    mass = jnp.array([[(m1 + m2) * l1, m2 * l2 * jnp.cos(d)], [m2 * l1 * jnp.cos(d), m2 * l2]])
+    force = jnp.array(
+        [
+            -m2 * l2 * v**2 * jnp.sin(d) - (m1 + m2) * GRAVITY * jnp.sin(a),
+            m2 * l1 * u**2 * jnp.sin(d) - m2 * GRAVITY * jnp.sin(b),
+        ]
+    )
+    return y[1], jnp.linalg.solve(mass, force)
+
+
+def cartesian(angles, rates):
+    def positions(angles):
+        return jnp.cumsum(
+            LENGTHS[:, None] * jnp.stack([jnp.sin(angles), -jnp.cos(angles)], 1), axis=0
+        )
+
+    return jax.jvp(positions, (angles,), (rates,))
+
+
+ANGLES = jnp.array([1.2, -0.4]), jnp.array([0.3, 1.0])
+T1 = 2.0
+
+
+@eqx.filter_jit
+def solve(field, solver, y0, dt0, controller, adjoint=None):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        solver,
+        0.0,
+        T1,
+        dt0,
+        y0,
+        stepsize_controller=controller,
+        max_steps=4096,
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+    )
+
+
+def final(field, solver, y0, dt0=None, tolerance=None):
+    adaptive = dfx.PIDController(rtol=tolerance, atol=tolerance) if tolerance else None
+    solution = solve(field, solver, y0, dt0, adaptive or dfx.ConstantStepSize())
+    return jax.tree.map(lambda y: y[-1], solution.ys)
+
+
+def distance(a, b):
+    return largest(jax.tree.map(jnp.subtract, a, b))
+
+
+@pytest.fixture(scope="module")
+def double_end():
+    return cartesian(*final(in_angles, dfx.Dopri8(), ANGLES, tolerance=1e-13))
+
+
+def test_the_field_is_that_of_lagrange():
+    """And the multiplier the force in the rod, here for the gradient `2q`."""
+    states = jax.vmap(PENDULUM.sample)(KEYS)
+    field, known = (jax.vmap(lambda y, f=f: f(0.0, y, None)) for f in (ROD, PENDULUM.vector_field))
+    assert distance(field(states), known(states)) < 100 * EPS
+    forces = jax.vmap(lambda y: ROD.multipliers(0.0, y))(states)
+    q, v = states
+    tension = (jnp.sum(v**2, 1) - GRAVITY * q[:, 1]) / jnp.sum(q**2, 1)
+    assert jnp.allclose(2 * forces, -tension, rtol=1e-13, atol=1e-13)
+
+
+def pendulum_end():
+    return jax.tree.map(lambda y: y[-1], PENDULUM.reference(jnp.array([0.0, T1])))
+
+
+@pytest.mark.parametrize(
+    "which", ["pendulum", pytest.param("double pendulum", marks=pytest.mark.slow)]
+)
+def test_rk4_is_of_order_four(which, double_end):
+    if which == "pendulum":
+        field, manifold, y0, end = ROD, ROD_MANIFOLD, PENDULUM.y0, pendulum_end()
+    else:
+        field, manifold, y0, end = DOUBLE, DOUBLE_MANIFOLD, cartesian(*ANGLES), double_end
+    solver = dfc.ManifoldProjection(dfc.RK4(), manifold)
+    coarse, fine = (distance(final(field, solver, y0, T1 / n), end) for n in (400, 800))
+    assert np.log2(coarse / fine) > 3.8
+    assert fine < 1e-6
+
+
+@pytest.mark.parametrize("which", ["pendulum", "double pendulum"])
+def test_mechanisms_agree_with_angles(which, double_end):
+    if which == "pendulum":
+        field, manifold, y0, end = ROD, ROD_MANIFOLD, PENDULUM.y0, pendulum_end()
+    else:
+        field, manifold, y0, end = DOUBLE, DOUBLE_MANIFOLD, cartesian(*ANGLES), double_end
+    solver = dfc.ManifoldProjection(dfx.Dopri8(), manifold)
+    assert distance(final(field, solver, y0, tolerance=1e-9), end) < 1e-8
+
+
+def test_projecting_the_free_field_is_not_enough():
+    """diffrax issue 328: it succeeds, on the manifold, and is wrong however short the steps."""
+    solver = dfc.ManifoldProjection(dfc.RK4(), ROD_MANIFOLD["position"])
+    errors = [
+        distance(final(FALLING, solver, PENDULUM.y0, T1 / n), pendulum_end()) for n in (200, 400)
+    ]
+    assert min(errors) > 0.1
+
+
+def test_the_velocity_constraint_alone_and_all_constraints_make_the_same_field():
+    both = dfc.tangent(FALLING, ROD_MANIFOLD, metric=(jnp.inf, jnp.ones(2)))
+    states = jax.vmap(PENDULUM.sample)(KEYS)
+    one, two = (jax.vmap(lambda y, f=f: f(0.0, y, None))(states) for f in (ROD, both))
+    assert distance(one, two) < 100 * EPS
+
+
+def test_invariance_is_proved():
+    states = jax.vmap(PENDULUM.sample)(KEYS)
+    assert dfc.check_invariance(ROD, ROD_MANIFOLD, states).ok
+    assert not dfc.check_invariance(FALLING, ROD_MANIFOLD, states).ok
+
+
+def test_derivatives_of_a_solve_are_those_of_differences():
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), ROD_MANIFOLD)
+
+    def height(speed, adjoint=None):
+        y0 = PENDULUM.y0[0], speed * PENDULUM.y0[1]
+        return solve(ROD, solver, y0, T1 / 50, dfx.ConstantStepSize(), adjoint).ys[0][-1, 1]
+
+    x, h = jnp.array(1.0), 1e-4
+    difference = (height(x + h) - height(x - h)) / (2 * h)
+    reverse = jax.grad(height)(x)
+    assert jnp.allclose(reverse, difference, rtol=1e-6)
+    forward = jax.jvp(lambda x: height(x, dfx.ForwardMode()), (x,), (1.0,))[1]
+    assert jnp.allclose(reverse, forward, rtol=1e-10)
+
+
+def test_a_gain_lets_the_residual_decay():
+    """`g' = -gain g`, also for an integral with a value and a constraint that moves with time."""
+    manifold = (
+        dfc.Constraint(lambda t, y, args: jnp.sum(y[:2] ** 2) - (2 + jnp.sin(t))),
+        dfc.FirstIntegral(lambda t, y, args: y[2] + y[0] ** 3, value=0.4),
+    )
+    field = dfc.tangent(lambda t, y, args: jnp.cos(y + t), manifold, gain=3.0)
+    y0 = jnp.array([1.0, 0.5, 0.2])
+    end = final(field, dfx.Dopri8(), y0, tolerance=1e-12)
+    before = jnp.stack([jnp.sum(y0[:2] ** 2) - 2, y0[2] + y0[0] ** 3 - 0.4])
+    after = [jnp.sum(end[:2] ** 2) - (2 + jnp.sin(T1)), end[2] + end[0] ** 3 - 0.4]
+    assert jnp.allclose(jnp.stack(after), before * jnp.exp(-3.0 * T1), rtol=1e-6, atol=1e-11)
+
+
+def test_a_balance_is_met():
+    states = jr.normal(KEYS[0], (20, 3))
+    balance = dfc.FirstIntegral(
+        lambda t, y, args: jnp.sum(y**2), rate=lambda t, y, args: -jnp.sum(y**4)
+    )
+    field = dfc.tangent(lambda t, y, args: jnp.sin(y), balance)
+    assert dfc.check_invariance(field, balance, states).ok
+
+
+def test_the_hidden_constraint_of_a_moving_one():
+    """`d/dt` of `|q - (t², 0)|² - 1`, and once more."""
+
+    def free(t, y, args):
+        return y[1], jnp.array([0.0, -args])
+
+    def shifted(t, y):
+        return y[0] - jnp.array([t**2, 0.0])
+
+    rod = dfc.Constraint(lambda t, y, args: jnp.sum(shifted(t, y) ** 2) - 1)
+    y, t = (jnp.array([0.3, 0.4]), jnp.array([1.0, -2.0])), 1.5
+    d, w = shifted(t, y), y[1] - jnp.array([2 * t, 0.0])
+    first, second = rod.derivative(free), rod.derivative(free).derivative(free)
+    assert jnp.allclose(first.fn(t, y, 9.0), 2 * d @ w, rtol=1e-14)
+    curvature = jnp.array([0.0, -9.0]) - jnp.array([2.0, 0.0])
+    assert jnp.allclose(second.fn(t, y, 9.0), 2 * (w @ w + d @ curvature), rtol=1e-14)
+
+
+# ---- A four-bar linkage: crank, coupler and rocker between two fixed points ----
+
+CRANK, COUPLER, ROCKER, BASE = 1.0, 2.5, 2.2, 2.0
+
+
+def bars(q):
+    sides = jnp.stack([q[0], q[1] - q[0], q[1] - jnp.array([BASE, 0.0])])
+    return jnp.sum(sides**2, 1) - jnp.array([CRANK, COUPLER, ROCKER]) ** 2
+
+
+LINKAGE, LINKAGE_MANIFOLD, _ = mechanism(
+    bars, jnp.zeros((2, 2)), jnp.array([[2.0], [1.0]]) + jnp.zeros((2, 2))
+)
+
+
+def joint(crank):
+    """Where coupler and rocker meet, on the upper branch."""
+    base = jnp.array([BASE, 0.0]) - crank
+    length = jnp.linalg.norm(base)
+    along = (COUPLER**2 - ROCKER**2 + length**2) / (2 * length)
+    normal = jnp.array([-base[1], base[0]]) / length
+    return crank + along * base / length + jnp.sqrt(COUPLER**2 - along**2) * normal
+
+
+def turning(angle, rate):
+    def positions(angle):
+        crank = CRANK * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return jnp.stack([crank, joint(crank)])
+
+    return jax.jvp(positions, (angle,), (rate,))
+
+
+@pytest.mark.parametrize(
+    "turns", [20, pytest.param(10_000, marks=pytest.mark.slow)], ids=lambda n: f"{n}-turns"
+)
+def test_a_four_bar_linkage_closes_and_keeps_its_branch(turns):
+    @eqx.filter_jit
+    def run(y0, steps):
+        def branch_and_gap(t, y, args):
+            q, _ = y
+            off = jnp.linalg.norm(q[1] - joint(q[0]))
+            angle = jnp.arctan2(q[0, 1], q[0, 0])
+            return off, jnp.max(jnp.abs(bars(q))) / (2 * CRANK), angle
+
+        return dfx.diffeqsolve(
+            dfx.ODETerm(LINKAGE),
+            dfc.ManifoldProjection(dfx.Tsit5(), LINKAGE_MANIFOLD),
+            0.0,
+            steps * 0.1,
+            0.1,
+            y0,
+            saveat=dfx.SaveAt(
+                subs=[
+                    dfx.SubSaveAt(
+                        ts=jnp.linspace(0.0, 1.0, 1 + 10 * turns) * steps * 0.1, fn=branch_and_gap
+                    ),
+                    dfx.SubSaveAt(t1=True),
+                ],
+                solver_state=True,
+            ),
+            max_steps=None,
+        )
+
+    y0 = turning(jnp.array(0.3), jnp.array(1.0))
+    # With this energy a turn takes less than 9.
+    solution = run(y0, 90 * turns)
+    off, gap, angle = solution.ys[0]
+    assert jnp.max(off) < 1e-12
+    assert jnp.max(gap) < 1e-14
+    assert dfc.statistics(solution).residual_after < 16 * EPS
+    assert np.sum(np.abs(np.diff(angle)) > np.pi) >= turns
+
+
+def test_mistakes_are_named():
+    constraint = ROD_MANIFOLD["position"]
+    with pytest.raises(TypeError, match="vector_field"):
+        dfc.tangent(dfx.ODETerm(FALLING), constraint)
+    with pytest.raises(ValueError, match="no value that it could return to"):
+        dfc.tangent(FALLING, dfc.FirstIntegral(lambda t, y, args: y[0]), gain=1.0)
+    balance = dfc.FirstIntegral(lambda t, y, args: y, value=0.0, rate=lambda t, y, args: y)
+    with pytest.raises(ValueError, match="changes at its `rate`"):
+        dfc.tangent(FALLING, balance, gain=1.0)
+    with pytest.raises(ValueError, match="`metric` has the structure"):
+        dfc.tangent(FALLING, constraint, metric=1.0)(0.0, PENDULUM.y0, None)
