@@ -35,6 +35,7 @@ from ._solvers import domain_statistics as domain_statistics
 from ._training import SPRING as SPRING
 from ._training import Bounded as Bounded
 from ._training import FitLog as FitLog
+from ._training import FitState as FitState
 from ._training import FromStates as FromStates
 from ._training import LevenbergMarquardt as LevenbergMarquardt
 from ._training import Pool as Pool

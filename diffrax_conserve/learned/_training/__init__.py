@@ -1,5 +1,5 @@
-from .fit import FitLog as FitLog
 from .fit import fit as fit
+from .log import FitLog as FitLog
 from .loss import Bounded as Bounded
 from .loss import mean_square as mean_square
 from .pool import Pool as Pool
@@ -15,5 +15,6 @@ from .schedule import ramped_weight as ramped_weight
 from .schedule import staged_iterations as staged_iterations
 from .second_order import SPRING as SPRING
 from .second_order import LevenbergMarquardt as LevenbergMarquardt
+from .state import FitState as FitState
 from .times import grid_times as grid_times
 from .times import uniform_times as uniform_times

@@ -7,14 +7,20 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
 
-from ..._custom_types import Args, Manifold
+from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_outputs
 from ..._projection import check_state
-from .._networks import PINN, AbstractFlowMap, as_flow_map, has_arrays
+from ..._tree import tree_shapes
+from .._networks import PINN, AbstractFlowMap, AbstractTrainable, Points, as_flow_map, has_arrays
+from .._networks.flat import stacked_vectors
 from .._solvers import check_output
+from .defect import VectorField
 from .pool import Pool
 from .recipe import Recipe
+from .state import FitState
 
 
 def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress: Any) -> None:
@@ -70,6 +76,55 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
             "A flow map is trained on many initial states: pass `sample`, a function from a random "
             "key to one of them, for example `sample=system.sample`."
         )
+
+
+def check_limits(state: Any, target: Any, seconds: Any) -> None:
+    """Raises unless what a training begins and ends with makes sense."""
+    if state is not None and not isinstance(state, FitState):
+        raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
+    for name, value in (("target", target), ("seconds", seconds)):
+        if value is not None and not value > 0:
+            raise ValueError(f"`{name}` must be positive, or `None`, but is {value}.")
+
+
+def check_field(
+    model: AbstractTrainable, vector_field: VectorField, args: Args, points: Points
+) -> None:
+    """Raises unless the vector field fits the states, is finite, and does not ask for the time."""
+    starts = model.starts(points)
+    y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
+    rate = eqx.filter_eval_shape(vector_field, starts.ts[0], y0, args)
+    if tree_shapes(rate) != tree_shapes(y0):
+        raise ValueError(
+            f"`vector_field` returns the structure {tree_shapes(rate)}, but the state has "
+            f"{tree_shapes(y0)}. Both must be the same."
+        )
+    now = _rates(vector_field, starts.ts, starts.y0s, args)
+    wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
+    if wrong.size:
+        y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
+        raise ValueError(
+            f"`vector_field` is not finite at {wrong.size} of {len(now)} initial states, for "
+            f"example at {y0}. Draw states at which it is."
+        )
+    if isinstance(model, AbstractFlowMap):
+        later = _rates(vector_field, starts.ts + 0.618 * model.max_step, starts.y0s, args)
+        change, size = np.max(np.abs(later - now)), np.max(np.abs(now))
+        if not change <= 1e-3 * size:
+            raise ValueError(
+                f"`vector_field` depends on time: from t = 0 to {0.618 * model.max_step:.3g} it "
+                f"changes by {change:.3g}, where its largest component is {size:.3g}. A flow map "
+                "is for autonomous equations. Make time a component of the state, of rate one."
+            )
+
+
+def _rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> np.ndarray:
+    return np.asarray(_stacked_rates(vector_field, ts, y0s, args))
+
+
+@eqx.filter_jit
+def _stacked_rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> Array:
+    return stacked_vectors(jax.vmap(vector_field, in_axes=(0, 0, None))(ts, y0s, args))
 
 
 def check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:
