@@ -113,7 +113,7 @@ def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
     """Writes `state` such that a reader finds the old file or the new one."""
     leaves = jtu.tree_leaves(state)
     header = json.dumps({"format": _FORMAT, "mark": mark, "leaves": len(leaves)})
-    arrays = {f"x{i}": _plain(leaf) for i, leaf in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"x{i}": _plain(leaf) for i, leaf in enumerate(leaves)}
 
     def write(path: Path) -> None:
         with path.open("wb") as file:

@@ -65,7 +65,6 @@ def train_windows(
         window = eqx.combine(state.carry.best_weights, objective.static)
         return trainer.target is not None and _own_error(trainer, state.model, window) <= limit
 
-    assert state.windows is not None
     try:
         while not state.finished:
             state, ended = trainer.rounds(objective, state, close, _worst)
@@ -84,8 +83,11 @@ def train_windows(
     except KeyboardInterrupt:
         if not state.trained:
             raise
-        return state, state.windows, "interrupt"
-    return state, state.windows, "epochs"
+        ended = "interrupt"
+    else:
+        ended = "epochs"
+    assert state.windows is not None
+    return state, state.windows, ended
 
 
 def _present(trainer: Trainer, state: FitState) -> Window:
