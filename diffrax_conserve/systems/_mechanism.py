@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
@@ -62,12 +62,12 @@ class Mechanism(eqx.Module):
     def __init__(
         self,
         reactions: Sequence[str],
-        rates: Float[Array, " reactions"] | Sequence[float],
+        rates: Real[ArrayLike, " reactions"] | Sequence[RealScalarLike],
         *,
         species: Sequence[str] | None = None,
     ):
         self.reactions = tuple(reactions)
-        self.rates = real(rates)
+        self.rates = real(jnp.asarray(rates))
         found = dict.fromkeys(name for r in self.reactions for side in _sides(r) for name in side)
         self.species = tuple(found) if species is None else tuple(species)
         if self.rates.shape != (len(self.reactions),):
@@ -130,7 +130,7 @@ class Mechanism(eqx.Module):
                 "Not every balance of this mechanism is a sum with positive weights, so that "
                 "factors cannot restore them. Project with `SimplifiedNewton()`."
             )
-        return ClosedForm(_Entropic(rows))
+        return ClosedForm(_Entropic(rows, tuple(self.balances)))
 
 
 Mechanism.__init__.__doc__ = """**Arguments:**
@@ -151,24 +151,26 @@ class _Entropic(eqx.Module):
     """The projection by factors, as a formula."""
 
     rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, t: RealScalarLike, y: State, args: Args, values: object) -> State:
         del t, args
         assert isinstance(values, Mapping)
         weights = jnp.asarray(self.rows, y.dtype)
-        target = jnp.stack(list(values.values()))
+        target = jnp.stack([values[name] for name in self.names])
         y = jnp.maximum(y, 0)
 
         def update(y: State, _: None) -> tuple[State, None]:
             missing = target - jnp.sum(weights * y, axis=1)
             gram = (weights * y) @ weights.T
-            return y * jnp.exp(weights.T @ jnp.linalg.solve(gram, missing)), None
+            exponents = weights.T @ jnp.linalg.solve(gram, missing)
+            return y * jnp.exp(jnp.clip(exponents, -_LONGEST, _LONGEST)), None
 
         return lax.scan(update, y, length=_UPDATES)[0]
 
 
-# From errors of ten per cent: 1e-1, 5e-3, 1e-5, 1e-10, roundoff.
-_UPDATES = 6
+# From errors of ten per cent: 1e-1, 5e-3, 1e-5, 1e-10, roundoff. Larger ones need more.
+_UPDATES, _LONGEST = 8, 1.0
 
 
 class _Tables(NamedTuple):
