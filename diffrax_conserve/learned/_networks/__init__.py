@@ -26,3 +26,7 @@ from .trainable import LayerSchedule as LayerSchedule
 from .trainable import Points as Points
 from .trainable import Sampler as Sampler
 from .trainable import Times as Times
+from .transformed import AbstractTransformation as AbstractTransformation
+from .transformed import BoxCox as BoxCox
+from .transformed import Scale as Scale
+from .transformed import Transformed as Transformed

@@ -22,6 +22,7 @@ class Points(NamedTuple):
 
     ts: Float[Array, " points"]
     y0s: Any  # with a leading axis; None for a window
+    pairs: Any = None  # of states in data, as many as there are points
 
 
 class AbstractTrainable(eqx.Module):

@@ -5,6 +5,7 @@ from .loss import mean_square as mean_square
 from .pool import Pool as Pool
 from .reachable import FromStates as FromStates
 from .reachable import reachable_states as reachable_states
+from .reachable import trajectories as trajectories
 from .recipe import Recipe as Recipe
 from .recipe import paper as paper
 from .recipe import second_order as second_order

@@ -23,9 +23,15 @@ from .recipe import Recipe
 from .state import FitState
 
 
-def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress: Any) -> None:
+def check_types(
+    vector_field: Any, key: Any, sample: Any, data: Any, recipe: Any, progress: Any
+) -> None:
     """Raises unless the arguments of `fit` besides the model have the right types."""
-    if not callable(vector_field):
+    if vector_field is None and (data is None or sample is not None):
+        raise TypeError(
+            "`fit` needs a `vector_field`, or `data` without `sample`, which is about the field."
+        )
+    if vector_field is not None and not callable(vector_field):
         raise TypeError(f"`vector_field` is {vector_field!r}, not a function `(t, y, args)`.")
     if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
         raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
@@ -47,7 +53,7 @@ def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress:
         )
 
 
-def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
+def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold) -> None:
     """Raises unless model, sampler and manifold fit each other."""
     if manifold is not None:
         check_manifold(manifold)
@@ -58,8 +64,11 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
                 "wrap its solver in `ManifoldProjection`."
             )
     if isinstance(model, PINN):
-        if sample is not None:
-            raise ValueError("A `PINN` has one initial state, its own: leave `sample` out.")
+        if sample is not None or data is not None:
+            raise ValueError(
+                "A `PINN` has one initial state, its own: leave `sample` out, and `data`, from "
+                "which only a flow map is trained."
+            )
         return
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
@@ -71,7 +80,7 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold) -> None:
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. If it "
             "repeats another flow map: Train its inner `flow_map`, and repeat that."
         )
-    if sample is None:
+    if sample is None and data is None:
         raise ValueError(
             "A flow map is trained on many initial states: pass `sample`, a function from a random "
             "key to one of them, for example `sample=system.sample`."

@@ -17,10 +17,11 @@ from jaxtyping import PRNGKeyArray
 from ..._custom_types import Args, Manifold
 from .._networks import PINN, Sampler, as_flow_map, restored
 from .arguments import check_arguments, check_field, check_limits, check_pool, check_types
+from .data import as_data
 from .defect import VectorField
 from .log import FitLog
 from .objective import Objective
-from .path_error import step_error
+from .path_error import data_error, step_error
 from .pool import Pool, with_domain
 from .progress import Progress
 from .recipe import Recipe, second_order
@@ -33,10 +34,11 @@ _Model = TypeVar("_Model", bound=eqx.Module)
 
 def fit(
     model: _Model,
-    vector_field: VectorField,
+    vector_field: VectorField | None = None,
     *,
     key: PRNGKeyArray,
     sample: Sampler | None = None,
+    data: tuple[Any, Any] | None = None,
     args: Args = None,
     recipe: Recipe | None = None,
     manifold: Manifold = None,
@@ -46,12 +48,17 @@ def fit(
     checkpoint: str | os.PathLike[str] | None = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
-    r"""Trains a network from the vector field alone: no solution is needed.
+    r"""Trains a network from the vector field alone, or a flow map from data, or from both.
 
     Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output
     of the network, the time derivative by forward-mode automatic differentiation. For a network
     with a conservative layer $u$ is the output after as many iterations as the recipe's schedule
     says.
+
+    From `data` a flow map learns what becomes of states. Pairs of them, one step of any length
+    apart, are drawn along the trajectories. The loss is that of the differences, each component
+    relative to the root mean square of what steps change. Together with a vector field the squared
+    defect is added, relative to the median of $|f|^2$.
 
     An update that is not finite is not made. The model that is returned is the best that was seen,
     not the last. `log.error` estimates the error of its solution.
@@ -73,10 +80,15 @@ def fit(
     - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.DeepONet`][], any other
         [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module `(y0, h) -> y` with an attribute
         `max_step`, all of whose arrays are then trained.
-    - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time.
+    - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time, and with `data` it
+        may be left out.
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, a function from a random key to an initial state, or a
         [`diffrax_conserve.learned.Pool`][], which follows the solutions from there.
+    - `data`: for a flow map, trajectories `(ts, ys)`: times of shape `(n, k)`, increasing along
+        each trajectory and perhaps unequal, and states with leading axes `(n, k)`.
+        [`diffrax_conserve.learned.trajectories`][] makes some. With a vector field and without
+        `sample` its states are those of the collocation points too.
     - `args`: passed to `vector_field`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
         [`diffrax_conserve.learned.second_order`][]`(model)`.
@@ -120,13 +132,17 @@ def fit(
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
-    check_types(vector_field, key, sample, recipe, progress)
-    check_arguments(model, sample, manifold)
+    check_types(vector_field, key, sample, data, recipe, progress)
+    check_arguments(model, sample, data, manifold)
     check_limits(state, target, seconds)
     recipe = second_order(model) if recipe is None else recipe
+    found = None if data is None else as_data(data, as_flow_map(model))
+    if found is not None and vector_field is not None and sample is None:
+        sample = found.sample
     trainer = Trainer(
         vector_field,
         sample,
+        found,
         args,
         recipe,
         key,
@@ -172,9 +188,12 @@ def _fit_flow_map(trainer: Trainer, flow_map: Any, given: FitState | None) -> tu
         return with_domain(best, state.carry.best_domain)
 
     def error(objective: Objective, state: FitState) -> float:
+        network, field = trained(objective, state), trainer.vector_field
+        if field is None:
+            assert trainer.data is not None
+            return data_error(network, trainer.data, trainer.key)
         assert trainer.sample is not None
-        field, args = trainer.vector_field, trainer.args
-        return step_error(trained(objective, state), field, args, trainer.sample, trainer.key)
+        return step_error(network, field, trainer.args, trainer.sample, trainer.key)
 
     ended = "epochs"
     if not state.finished:
@@ -188,8 +207,9 @@ def _first(trainer: Trainer, model: Any, given: FitState | None) -> FitState:
     """The state that a training begins with: a given one, that of a checkpoint, or a new one."""
     network = model.window(0) if isinstance(model, PINN) else model
     recipe, (points_key, _) = trainer.recipe, jr.split(trainer.key)
-    points = network.draw(recipe.times, trainer.sample, recipe.points, points_key)
-    check_field(network, trainer.vector_field, trainer.args, points)
+    if trainer.vector_field is not None:
+        points = network.draw(recipe.times, trainer.sample, recipe.points, points_key)
+        check_field(network, trainer.vector_field, trainer.args, points)
     _, carry = trainer.start(network, None)
     carry = jtu.tree_map(lambda x: jnp.astype(x, x.dtype), carry)
     windows = windows_of(model) if isinstance(model, PINN) else None

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..._custom_types import Args, Y
 from .._networks import AbstractFlowMap, AbstractTrainable, Points, Sampler, Window
 from .._networks.flat import flatten, stacked_vectors, unflatten
+from .data import Data
 from .defect import VectorField
 
 
@@ -124,6 +125,16 @@ def step_error(
     example = jtu.tree_map(lambda x: x[0], y0s)
     squares = jnp.mean(jnp.square(found.end), axis=0)
     return relative(np.sqrt(squares), np.max(np.asarray(found.size), axis=0), example)
+
+
+def data_error(flow_map: AbstractFlowMap, data: Data, key: PRNGKeyArray) -> float:
+    """The root mean square of the error at pairs of the data, relative as in `relative`."""
+    pairs = data.draw(16 * _STATES, key)
+    found = eqx.filter_jit(jax.vmap(flow_map))(pairs.y0s, pairs.hs)
+    difference = stacked_vectors(found) - stacked_vectors(pairs.y1s)
+    example = jtu.tree_map(lambda x: x[0], pairs.y0s)
+    squares = jnp.mean(jnp.square(difference), axis=0)
+    return relative(np.sqrt(squares), np.max(np.abs(stacked_vectors(pairs.y1s)), axis=0), example)
 
 
 # Of a flow map: initial states, and steps of RK4 for the error of each.

@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args
 from .._networks import AbstractTrainable, Sampler
+from .data import Data
 from .defect import VectorField
 from .epochs import advance
 from .objective import Carry, Objective, start
@@ -27,8 +28,9 @@ from .state import FitState, write_checkpoint
 class Trainer:
     """Trains one network after the other, all of the same shape, with one compilation."""
 
-    vector_field: VectorField
+    vector_field: VectorField | None
     sample: Sampler | None
+    data: Data | None
     args: Args
     recipe: Recipe
     key: PRNGKeyArray
@@ -50,7 +52,8 @@ class Trainer:
     def start(self, model: AbstractTrainable, state: FitState | None) -> tuple[Objective, Carry]:
         """What is constant in the training of the present network, and its first carry."""
         key = self.key if state is None else self.network_key(state)
-        return start(model, self.vector_field, key, self.sample, self.args, self.recipe)
+        field, data = self.vector_field, self.data
+        return start(model, field, key, self.sample, self.args, self.recipe, data)
 
     @property
     def substeps(self) -> int:

@@ -190,6 +190,7 @@ _GROWTH = 4
 def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
     """The largest error of a window, relative to the solution in it and in the beginning."""
     none = jnp.zeros_like(pinn.scale)
+    assert trainer.vector_field is not None
     found = window_errors(window, trainer.vector_field, trainer.args, none, trainer.substeps)
     size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(pinn.y0))))
     return relative(found.largest[0], size, pinn.y0)
@@ -198,6 +199,7 @@ def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
 def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray) -> float:
     """The largest error in the whole interval; warns where it is not small."""
     error, largest, sizes = jnp.zeros_like(pinn.scale), [], []
+    assert trainer.vector_field is not None
     for k in range(pinn.windows):
         window = pinn.window(k)
         found = window_errors(window, trainer.vector_field, trainer.args, error, trainer.substeps)
