@@ -9,7 +9,9 @@ from ._networks import PINN as PINN
 from ._networks import AbstractCore as AbstractCore
 from ._networks import AbstractDomain as AbstractDomain
 from ._networks import AbstractFlowMap as AbstractFlowMap
+from ._networks import AbstractTransformation as AbstractTransformation
 from ._networks import Box as Box
+from ._networks import BoxCox as BoxCox
 from ._networks import Concatenated as Concatenated
 from ._networks import ConservativeLayer as ConservativeLayer
 from ._networks import DeepONet as DeepONet
@@ -18,7 +20,9 @@ from ._networks import Frame as Frame
 from ._networks import Gated as Gated
 from ._networks import Product as Product
 from ._networks import Repeated as Repeated
+from ._networks import Scale as Scale
 from ._networks import Taylor as Taylor
+from ._networks import Transformed as Transformed
 from ._solvers import AbstractPolicy as AbstractPolicy
 from ._solvers import AbstractSweep as AbstractSweep
 from ._solvers import DeepONetSolver as DeepONetSolver
@@ -35,6 +39,7 @@ from ._solvers import domain_statistics as domain_statistics
 from ._training import SPRING as SPRING
 from ._training import Bounded as Bounded
 from ._training import FitLog as FitLog
+from ._training import FitState as FitState
 from ._training import FromStates as FromStates
 from ._training import LevenbergMarquardt as LevenbergMarquardt
 from ._training import Pool as Pool
@@ -50,4 +55,5 @@ from ._training import ramped_weight as ramped_weight
 from ._training import reachable_states as reachable_states
 from ._training import second_order as second_order
 from ._training import staged_iterations as staged_iterations
+from ._training import trajectories as trajectories
 from ._training import uniform_times as uniform_times

@@ -1,6 +1,9 @@
 from ._attitude import RigidBodyAttitude as RigidBodyAttitude
 from ._base import AbstractSystem as AbstractSystem
 from ._cartesian_pendulum import CartesianPendulum as CartesianPendulum
+from ._chemistry import AbstractChemistry as AbstractChemistry
+from ._chemistry import Pollu as Pollu
+from ._chemistry import Robertson as Robertson
 from ._construct import hamiltonian_vector_field as hamiltonian_vector_field
 from ._construct import nambu_vector_field as nambu_vector_field
 from ._double_pendulum import DoublePendulum as DoublePendulum
@@ -9,6 +12,8 @@ from ._kepler import Kepler as Kepler
 from ._korteweg_de_vries import KortewegDeVries as KortewegDeVries
 from ._lorenz import ConservativeLorenz as ConservativeLorenz
 from ._lotka_volterra import LotkaVolterra as LotkaVolterra
+from ._mechanism import Balance as Balance
+from ._mechanism import Mechanism as Mechanism
 from ._oscillator import HarmonicOscillator as HarmonicOscillator
 from ._reference import AbstractIntegratedSystem as AbstractIntegratedSystem
 from ._registry import get as get

@@ -5,6 +5,7 @@ import difflib
 from ._attitude import RigidBodyAttitude
 from ._base import AbstractSystem
 from ._cartesian_pendulum import CartesianPendulum
+from ._chemistry import Pollu, Robertson
 from ._double_pendulum import DoublePendulum
 from ._henon_heiles import HenonHeiles
 from ._kepler import Kepler
@@ -36,11 +37,14 @@ _SYSTEMS: dict[str, type[AbstractSystem]] = {
         RigidBodyAttitude,
     )
 }
+# Explicit methods cannot solve these.
+_STIFF: dict[str, type[AbstractSystem]] = {system.name: system for system in (Robertson, Pollu)}
+_ALL = _SYSTEMS | _STIFF
 
 
-def names() -> tuple[str, ...]:
-    """The names of all systems of the catalogue."""
-    return tuple(_SYSTEMS)
+def names(*, stiff: bool = False) -> tuple[str, ...]:
+    """The names of the systems of the catalogue: of those that are not stiff, or of the stiff."""
+    return tuple(_STIFF if stiff else _SYSTEMS)
 
 
 def get(name: str) -> AbstractSystem:
@@ -48,7 +52,7 @@ def get(name: str) -> AbstractSystem:
 
     **Arguments:**
 
-    - `name`: one of `names()`, such as `"kepler"`.
+    - `name`: one of `names()` or of `names(stiff=True)`, such as `"kepler"`.
 
     **Returns:**
 
@@ -67,10 +71,10 @@ def get(name: str) -> AbstractSystem:
         system = dfc.systems.get("rigid-body")
         ```
     """
-    if name not in _SYSTEMS:
-        close = difflib.get_close_matches(str(name).lower().replace("_", "-"), _SYSTEMS, cutoff=0.4)
+    if name not in _ALL:
+        close = difflib.get_close_matches(str(name).lower().replace("_", "-"), _ALL, cutoff=0.4)
         hint = f"Did you mean {' or '.join(map(repr, close))}? " if close else ""
         raise ValueError(
-            f"There is no system called {name!r}. {hint}The catalogue holds: {', '.join(_SYSTEMS)}."
+            f"There is no system called {name!r}. {hint}The catalogue holds: {', '.join(_ALL)}."
         )
-    return _SYSTEMS[name]()
+    return _ALL[name]()

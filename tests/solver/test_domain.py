@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, oscillator, states
+from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, oscillator, states, unchecked
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
@@ -95,38 +95,36 @@ def test_wrong_boxes_are_refused():
 @pytest.mark.slow
 def test_by_default_nothing_is_said():
     np.testing.assert_array_equal(
-        solve(dfc.DeepONetSolver(KNOWS), saveat=STATE).ys,
-        solve(dfc.DeepONetSolver(BARE), saveat=STATE).ys,
+        solve(unchecked(KNOWS), saveat=STATE).ys,
+        solve(unchecked(BARE), saveat=STATE).ys,
     )
     with pytest.raises(ValueError, match="outside="):
-        dfc.learned.domain_statistics(solve(dfc.DeepONetSolver(KNOWS), saveat=STATE))
+        dfc.learned.domain_statistics(solve(unchecked(KNOWS), saveat=STATE))
 
 
 @pytest.mark.parametrize("t0", [0.0, pytest.param(-3.0, marks=pytest.mark.slow)])
 def test_the_report_counts_steps_and_knows_the_first_time(t0):
-    sol = solve(
-        dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Report()), t0=t0, t1=t0 + 5.0, saveat=STATE
-    )
+    sol = solve(unchecked(KNOWS, outside=dfc.learned.Report()), t0=t0, t1=t0 + 5.0, saveat=STATE)
     starts = jnp.concatenate([EAST[None], sol.ys[:9]])
     outside = ~jax.vmap(EASTERN.contains)(starts)
     found = dfc.learned.domain_statistics(sol)
     assert 0 < found.num_outside == outside.sum() < found.num_steps == 10
     np.testing.assert_allclose(found.fraction_outside, outside.sum() / 10)
     np.testing.assert_allclose(found.first_outside, t0 + 0.5 * jnp.argmax(outside))
-    bare = solve(dfc.DeepONetSolver(BARE), saveat=STATE).ys
+    bare = solve(unchecked(BARE), saveat=STATE).ys
     np.testing.assert_allclose(sol.ys, bare, rtol=0, atol=1e-14)
 
 
 def test_a_solve_that_stays_inside_has_no_first_time():
     found = dfc.learned.domain_statistics(
-        solve(dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Report()), t1=1.0, saveat=STATE)
+        solve(unchecked(KNOWS, outside=dfc.learned.Report()), t1=1.0, saveat=STATE)
     )
     assert found.fraction_outside == 0
     assert found.first_outside == jnp.inf
 
 
 def test_the_report_is_seen_through_projection_and_in_a_batch():
-    solver = dfc.ManifoldProjection(dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Report()), RADIUS)
+    solver = dfc.ManifoldProjection(unchecked(KNOWS, outside=dfc.learned.Report()), RADIUS)
 
     def lane(y0):
         return solve(solver, y0, saveat=STATE)
@@ -141,7 +139,7 @@ def test_the_report_is_seen_through_projection_and_in_a_batch():
 
 @pytest.mark.slow
 def test_a_continued_solve_goes_on_counting():
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Report())
+    solver = unchecked(KNOWS, outside=dfc.learned.Report())
     whole = solve(solver, saveat=STATE)
     half = solve(solver, t1=2.5, saveat=STATE)
     rest = solve(solver, half.ys[4], t0=2.5, saveat=STATE, solver_state=half.solver_state)
@@ -153,7 +151,7 @@ def test_a_continued_solve_goes_on_counting():
 
 def limited(max_error, error=1e-3):
     network = Rotation(jnp.array(error))
-    return dfc.DeepONetSolver(network, outside=dfc.learned.Report(), max_error=jnp.array(max_error))
+    return unchecked(network, outside=dfc.learned.Report(), max_error=jnp.array(max_error))
 
 
 def test_a_large_error_counts_as_outside():
@@ -173,7 +171,7 @@ def test_a_large_error_counts_as_outside():
 
 
 def test_rejected_steps_do_not_count():
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Report(), corrections=1)
+    solver = unchecked(KNOWS, outside=dfc.learned.Report(), corrections=1)
     controller = dfx.PIDController(rtol=1e-4, atol=1e-4)
     sol = solve(solver, stepsize_controller=controller, saveat=STATE)
     assert sol.stats["num_rejected_steps"] > 0
@@ -188,7 +186,7 @@ def test_rejected_steps_do_not_count():
     [(EAST, -20.0, -18.0), pytest.param(-EAST, 0.0, 0.0, marks=pytest.mark.slow)],
 )
 def test_leaving_the_domain_fails_at_a_time(y0, t0, time):
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Refuse())
+    solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
     sol = solve(solver, y0, t0=t0, t1=t0 + 5.0, throw=False, saveat=STATE)
     assert "a step starts outside the domain" in message(sol)
     assert dfc.learned.domain_statistics(sol).first_outside == time
@@ -198,7 +196,7 @@ def test_leaving_the_domain_fails_at_a_time(y0, t0, time):
 
 
 def test_one_lane_may_fail():
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Refuse())
+    solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
     sols = jax.vmap(lambda y0: solve(solver, y0, t1=1.5, throw=False))(jnp.stack([EAST, -EAST]))
     okay = sols.result == dfx.RESULTS.successful
     np.testing.assert_array_equal(okay, [True, False])
@@ -206,12 +204,12 @@ def test_one_lane_may_fail():
 
 @pytest.mark.slow
 def test_through_projection_the_message_is_that_of_the_flow_map():
-    solver = dfc.ManifoldProjection(dfc.DeepONetSolver(KNOWS, outside=dfc.learned.Refuse()), RADIUS)
+    solver = dfc.ManifoldProjection(unchecked(KNOWS, outside=dfc.learned.Refuse()), RADIUS)
     assert "starts outside the domain" in message(solve(solver, throw=False))
 
 
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
-    solver = dfc.DeepONetSolver(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
+    solver = unchecked(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
     loose = dfx.PIDController(rtol=1.0, atol=1.0)
     sol = solve(solver, stepsize_controller=loose, saveat=STATE)
@@ -234,7 +232,7 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
     ],
 )
 def test_another_solver_takes_all_steps_outside_and_none_inside(solver):
-    sol = solve(dfc.DeepONetSolver(KNOWS, outside=solver), saveat=STATE)
+    sol = solve(unchecked(KNOWS, outside=solver), saveat=STATE)
     y, taken = EAST, 0
     for i in range(10):
         if EASTERN.contains(y):
@@ -249,13 +247,13 @@ def test_another_solver_takes_all_steps_outside_and_none_inside(solver):
 def test_dense_output_is_that_of_the_solver_outside():
     nowhere = Within(BARE, dfc.learned.Box(jnp.ones(2), jnp.zeros(2)))
     ts = jnp.linspace(0, 5, 23)
-    found = solve(dfc.DeepONetSolver(nowhere, outside=dfx.Tsit5()), saveat=dfx.SaveAt(ts=ts))
+    found = solve(unchecked(nowhere, outside=dfx.Tsit5()), saveat=dfx.SaveAt(ts=ts))
     expected = solve(dfx.Tsit5(), saveat=dfx.SaveAt(ts=ts))
     np.testing.assert_allclose(found.ys, expected.ys, rtol=0, atol=1e-14)
 
 
 def test_a_batch_is_its_lanes():
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfx.Tsit5(), corrections=1)
+    solver = unchecked(KNOWS, outside=dfx.Tsit5(), corrections=1)
     y0s = jnp.stack([EAST, -EAST, 0.1 * EAST])
     batch = jax.vmap(lambda y0: solve(solver, y0, saveat=STATE).ys)(y0s)
     for y0, ys in zip(y0s, batch, strict=True):
@@ -265,7 +263,7 @@ def test_a_batch_is_its_lanes():
 @pytest.mark.slow
 def test_adaptive_steps_are_accurate_where_the_flow_map_is_not():
     """It is a hundred times worse than tolerated; a step of it is never trusted."""
-    solver = dfc.DeepONetSolver(Rotation(0.1), outside=dfx.Dopri5(), max_error=1e-5)
+    solver = unchecked(Rotation(0.1), outside=dfx.Dopri5(), max_error=1e-5)
     controller = dfx.PIDController(rtol=1e-7, atol=1e-7, dtmax=0.5)
     sol = solve(solver, stepsize_controller=controller, saveat=STATE)
     assert dfc.learned.domain_statistics(sol).fraction_outside == 1
@@ -274,7 +272,7 @@ def test_adaptive_steps_are_accurate_where_the_flow_map_is_not():
 
 
 def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
-    solver = dfc.DeepONetSolver(KNOWS, outside=dfc.RK4())
+    solver = unchecked(KNOWS, outside=dfc.RK4())
     controller = dfx.PIDController(rtol=1e-2, atol=1e-2)
     sol = solve(solver, -EAST, stepsize_controller=controller, throw=False)
     assert sol.result == dfx.RESULTS.max_steps_reached
@@ -285,7 +283,7 @@ def test_an_implicit_solver_outside():
     root_finder = dfx.VeryChord(rtol=1e-10, atol=1e-10, norm=optx.max_norm)
     implicit = dfx.Kvaerno3(root_finder=root_finder)
     nowhere = Within(BARE, dfc.learned.Box(jnp.ones(2), jnp.zeros(2)))
-    found = solve(dfc.DeepONetSolver(nowhere, outside=implicit), t1=1.0).ys
+    found = solve(unchecked(nowhere, outside=implicit), t1=1.0).ys
     np.testing.assert_allclose(found, solve(implicit, t1=1.0).ys, rtol=0, atol=1e-9)
 
 
@@ -295,7 +293,7 @@ def test_derivatives(whole):
     the boundary."""
 
     def f(error, y0):
-        solver = dfc.DeepONetSolver(Within(Rotation(error), EASTERN), outside=dfx.Bosh3())
+        solver = unchecked(Within(Rotation(error), EASTERN), outside=dfx.Bosh3())
         if whole:
             return solve(solver, y0, t1=2.5, max_steps=8).ys
         times = jnp.array(0.0), jnp.array(0.5)
@@ -314,11 +312,11 @@ def test_float32():
     def single(tree):
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
 
-    solver = dfc.DeepONetSolver(single(KNOWS), outside=dfx.Tsit5())
+    solver = unchecked(single(KNOWS), outside=dfx.Tsit5())
     sol = solve(solver, single(EAST), t0=np.float32(0), t1=np.float32(5), saveat=STATE)
     assert sol.ys.dtype == jnp.float32
     np.testing.assert_allclose(
-        sol.ys, solve(dfc.DeepONetSolver(KNOWS, outside=dfx.Tsit5()), saveat=STATE).ys, atol=1e-5
+        sol.ys, solve(unchecked(KNOWS, outside=dfx.Tsit5()), saveat=STATE).ys, atol=1e-5
     )
 
 
@@ -331,8 +329,8 @@ def test_float32():
 )
 def test_a_policy_needs_a_domain_or_an_error(outside):
     with pytest.raises(ValueError, match=r"it has no `domain`.*Box.around.*or pass `max_error`"):
-        dfc.DeepONetSolver(Still(), outside=outside)
-    dfc.DeepONetSolver(Still(), outside=outside, max_error=1e-3)
+        unchecked(Still(), outside=outside)
+    unchecked(Still(), outside=outside, max_error=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -349,7 +347,7 @@ def test_a_policy_needs_a_domain_or_an_error(outside):
 )
 def test_wrong_options(options, text):
     with pytest.raises(ValueError, match=text):
-        dfc.DeepONetSolver(KNOWS, **options)
+        unchecked(KNOWS, **options)
 
 
 def test_what_is_no_policy():
@@ -357,9 +355,9 @@ def test_what_is_no_policy():
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         with pytest.raises(TypeError, match="`outside` is 'report', but it must be"):
-            dfc.DeepONetSolver(KNOWS, outside="report")
+            unchecked(KNOWS, outside="report")
         with pytest.raises(TypeError, match="`sweep` is 'newton', but it must be"):
-            dfc.DeepONetSolver(KNOWS, sweep="newton")
+            unchecked(KNOWS, sweep="newton")
         with pytest.raises(TypeError, match="`core` is 'gated', but it must be"):
             dfc.DeepONet(states(), 0.25, core="gated", key=jax.random.key(0))
         with pytest.raises(TypeError, match="not a diffrax solver"):
@@ -370,4 +368,4 @@ def test_what_is_no_policy():
 
 def test_a_domain_without_contains():
     with pytest.raises(TypeError, match="no method `contains"):
-        dfc.DeepONetSolver(Within(Still(), (0.0, 1.0)), outside=dfc.learned.Report())
+        unchecked(Within(Still(), (0.0, 1.0)), outside=dfc.learned.Report())

@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import DRIVEN0, LORENZ, SWEEPS, Still, driven, flow_map, states
+from ..learned import DRIVEN0, LORENZ, SWEEPS, Still, driven, flow_map, states, unchecked
 
 TERM = dfx.ODETerm(LORENZ.vector_field)
 DRIVEN = dfx.ODETerm(driven)
@@ -46,7 +46,7 @@ def ratios(name, kind, factor, count):
     term = dfx.ODETerm(system.vector_field)
     y0s = factor * states(count, system)
     h = network.max_step
-    y1s, estimates = jax.vmap(lambda y0: step(dfc.DeepONetSolver(network), y0, h, term=term))(y0s)
+    y1s, estimates = jax.vmap(lambda y0: step(unchecked(network), y0, h, term=term))(y0s)
     errors = jax.vmap(lambda y0: final(exact(term, y0, h)))(y0s) - y1s
     return jnp.linalg.norm(estimates, axis=1) / jnp.linalg.norm(errors, axis=1)
 
@@ -94,7 +94,7 @@ def test_the_estimate_knows_how_the_vector_field_passes_an_error_on(rate):
     network, y0 = Wrong(rate, 0.0), jnp.array(1.0)
 
     def run(corrections):
-        solver = dfc.DeepONetSolver(network, nodes=16, corrections=corrections)
+        solver = unchecked(network, nodes=16, corrections=corrections)
         return step(solver, y0, 1.0, term=logistic(rate, 0.0))
 
     y1, estimate = run(0)
@@ -105,7 +105,7 @@ def test_the_estimate_knows_how_the_vector_field_passes_an_error_on(rate):
 
 
 def test_the_estimate_has_a_sign_and_sees_time_and_args():
-    solver = dfc.DeepONetSolver(Still())
+    solver = unchecked(Still())
     y1, estimate = step(solver, DRIVEN0, 0.3, term=DRIVEN, t0=1.3, args=2.0)
     error = jax.tree.map(
         lambda a, b: a[-1] - b, exact(DRIVEN, DRIVEN0, 0.3, jnp.array(1.3), 2.0), y1
@@ -121,16 +121,16 @@ def test_the_estimate_is_never_small_where_something_is_not_finite():
         def __call__(self, y0, h):
             return jnp.where(h > 0.1, jnp.nan, y0)
 
-    _, estimate = step(dfc.DeepONetSolver(Broken()), LORENZ.y0, 0.2)
+    _, estimate = step(unchecked(Broken()), LORENZ.y0, 0.2)
     assert jnp.all(jnp.isnan(estimate))
     term = dfx.ODETerm(lambda t, y, args: jnp.where(t > 0.1, jnp.nan, y))
-    _, estimate = step(dfc.DeepONetSolver(Still()), LORENZ.y0, 0.2, term=term)
+    _, estimate = step(unchecked(Still()), LORENZ.y0, 0.2, term=term)
     assert jnp.all(jnp.isnan(estimate))
 
 
 @pytest.mark.slow
 def test_a_batch_is_its_lanes():
-    solver, y0s = dfc.DeepONetSolver(flow_map()), states(3)
+    solver, y0s = unchecked(flow_map()), states(3)
     batch = jax.vmap(lambda y0: step(solver, y0, 0.25)[1])(y0s)
     for y0, estimate in zip(y0s, batch, strict=True):
         np.testing.assert_allclose(step(solver, y0, 0.25)[1], estimate, rtol=1e-11)
@@ -138,9 +138,9 @@ def test_a_batch_is_its_lanes():
 
 def test_float32():
     network, y0 = jax.tree.map(lambda x: x.astype(jnp.float32), (flow_map(), LORENZ.y0))
-    _, single = step(dfc.DeepONetSolver(network), y0, jnp.float32(0.25), t0=jnp.float32(0))
+    _, single = step(unchecked(network), y0, jnp.float32(0.25), t0=jnp.float32(0))
     assert single.dtype == jnp.float32
-    _, double = step(dfc.DeepONetSolver(flow_map()), LORENZ.y0, 0.25)
+    _, double = step(unchecked(flow_map()), LORENZ.y0, 0.25)
     np.testing.assert_allclose(single, double, rtol=0, atol=1e-5)
 
 
@@ -150,7 +150,7 @@ def test_float32():
 )
 def test_the_estimate_falls_with_the_step_as_claimed(order, sweep, corrections):
     network, term = Wrong(order=order, size=0.5), logistic(-1.0, 0.3)
-    solver = dfc.DeepONetSolver(network, corrections=corrections, sweep=SWEEPS[sweep], nodes=8)
+    solver = unchecked(network, corrections=corrections, sweep=SWEEPS[sweep], nodes=8)
     steps = jnp.array([0.02, 0.04])
     small, large = jax.vmap(lambda h: step(solver, jnp.array(1.0), h, term=term)[1])(steps)
     slope = jnp.log2(jnp.abs(large / small))
@@ -176,7 +176,7 @@ def test_fixed_steps_do_not_compute_it():
         return jax.jit(run).lower(LORENZ.y0).compile().cost_analysis()["flops"]
 
     one = 1e9
-    solver = dfc.DeepONetSolver(flow_map())
+    solver = unchecked(flow_map())
     assert flops(solver) < 1e-3 * one
     assert flops(dfc.ManifoldProjection(solver, LORENZ.manifold)) < 1e-3 * one
     assert flops(solver, stepsize_controller=dfx.PIDController(rtol=1e-3, atol=1e-3)) > one
@@ -212,7 +212,7 @@ SHIPPED = dfc.load_pretrained("conservative-lorenz-standard")
 
 
 def test_tighter_tolerances_take_more_steps_and_err_less():
-    solver = dfc.DeepONetSolver(SHIPPED, corrections=2)
+    solver = unchecked(SHIPPED, corrections=2)
     expected = final(exact(TERM, LORENZ.y0, 2.0))
     found = [solve(solver, tol=tol) for tol in (1e-3, 1e-6, 1e-8)]
     counts = [int(sol.stats["num_accepted_steps"]) for sol in found]
@@ -225,7 +225,7 @@ def test_tighter_tolerances_take_more_steps_and_err_less():
 @pytest.mark.parametrize("dt0", [None, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_steps_longer_than_the_longest_are_rejected(dt0):
     """Not an error: the controller tries a smaller one."""
-    sol = solve(dfc.DeepONetSolver(SHIPPED), tol=1e-1, dt0=dt0, saveat=dfx.SaveAt(steps=True))
+    sol = solve(unchecked(SHIPPED), tol=1e-1, dt0=dt0, saveat=dfx.SaveAt(steps=True))
     assert sol.stats["num_rejected_steps"] > 0
     lengths = jnp.diff(jnp.where(jnp.isfinite(sol.ts), sol.ts, jnp.nan), prepend=0.0)
     assert jnp.nanmax(lengths) <= 0.25 + 1e-6
@@ -234,23 +234,19 @@ def test_steps_longer_than_the_longest_are_rejected(dt0):
 
 @pytest.mark.slow
 def test_a_controller_that_knows_the_longest_step_rejects_nothing():
-    sol = solve(dfc.DeepONetSolver(SHIPPED), tol=1e-1, dtmax=SHIPPED.max_step)
+    sol = solve(unchecked(SHIPPED), tol=1e-1, dtmax=SHIPPED.max_step)
     assert sol.stats["num_rejected_steps"] == 0
     assert sol.stats["num_accepted_steps"] <= 10
 
 
 def test_fixed_steps_that_are_too_long_fail_without_an_exception():
-    sol = dfx.diffeqsolve(
-        TERM, dfc.DeepONetSolver(flow_map()), 0.0, 2.0, 0.375, LORENZ.y0, throw=False
-    )
+    sol = dfx.diffeqsolve(TERM, unchecked(flow_map()), 0.0, 2.0, 0.375, LORENZ.y0, throw=False)
     assert "a step is longer than the flow map was trained for" in dfx.RESULTS[sol.result]
 
 
 def test_a_flow_map_for_steps_of_any_length():
     assert (
-        dfx.diffeqsolve(
-            TERM, dfc.DeepONetSolver(Still(max_step=jnp.inf)), 0.0, 20.0, 10.0, LORENZ.y0
-        ).result
+        dfx.diffeqsolve(TERM, unchecked(Still(max_step=jnp.inf)), 0.0, 20.0, 10.0, LORENZ.y0).result
         == dfx.RESULTS.successful
     )
 
@@ -258,7 +254,7 @@ def test_a_flow_map_for_steps_of_any_length():
 def test_a_solver_adds_no_message_to_the_list_of_diffrax():
     before = len(dfx.RESULTS._index_to_message)
     for max_step in (0.5, 0.25, 0.125):
-        solver = dfc.DeepONetSolver(Still(max_step), outside=dfc.learned.Refuse(), max_error=1.0)
+        solver = unchecked(Still(max_step), outside=dfc.learned.Refuse(), max_error=1.0)
         sol = dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 1.0, LORENZ.y0, throw=False)
         assert sol.result != dfx.RESULTS.successful
     assert len(dfx.RESULTS._index_to_message) == before
@@ -266,7 +262,7 @@ def test_a_solver_adds_no_message_to_the_list_of_diffrax():
 
 def test_a_flow_map_that_small_steps_do_not_help_says_so():
     """An untrained network: its error is in proportion to the step, however small that is."""
-    solver = dfc.DeepONetSolver(flow_map())
+    solver = unchecked(flow_map())
     sol = solve(solver, tol=1e-6, dtmin=1e-3, force_dtmin=False, throw=False)
     assert sol.result == dfx.RESULTS.dt_min_reached
     sol = solve(solver, tol=1e-6, max_steps=50, throw=False)
@@ -275,7 +271,7 @@ def test_a_flow_map_that_small_steps_do_not_help_says_so():
 
 @pytest.mark.slow
 def test_adaptive_steps_on_the_manifold():
-    solver = dfc.DeepONetSolver(SHIPPED, corrections=1)
+    solver = unchecked(SHIPPED, corrections=1)
     projected = dfc.ManifoldProjection(solver, LORENZ.manifold, projection=dfc.Newton())
     sol = solve(projected, tol=1e-3, saveat=dfx.SaveAt(steps=True))
     assert sol.stats["num_rejected_steps"] > 0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import DRIVEN0, LORENZ, SWEEPS, Still, driven, flow_map, states
+from ..learned import DRIVEN0, LORENZ, SWEEPS, Still, driven, flow_map, states, unchecked
 
 TERM = dfx.ODETerm(LORENZ.vector_field)
 DRIVEN = dfx.ODETerm(driven)
@@ -61,14 +61,14 @@ def errors(solver, exact):
 
 
 def test_each_picard_sweep_gains_a_digit(exact):
-    found = [errors(dfc.DeepONetSolver(SHIPPED, corrections=k), exact) for k in (0, 1, 4, 8)]
+    found = [errors(unchecked(SHIPPED, corrections=k), exact) for k in (0, 1, 4, 8)]
     assert found[0] > 5 * found[1] > 5e3 * found[2] > 5e7 * found[3]
     assert found[3] < 1e-12
 
 
 def test_newton_squares_the_error(exact):
     found = [
-        errors(dfc.DeepONetSolver(SHIPPED, corrections=k, sweep=dfc.learned.NewtonSweep()), exact)
+        errors(unchecked(SHIPPED, corrections=k, sweep=dfc.learned.NewtonSweep()), exact)
         for k in (0, 1, 2)
     ]
     assert found[0] > 1e-4
@@ -85,7 +85,7 @@ def test_newton_squares_the_error(exact):
     ],
 )
 def test_sweeps_of_a_flow_map_that_knows_nothing_have_their_order(sweep, corrections, order):
-    solver = dfc.DeepONetSolver(Still(), corrections=corrections, sweep=SWEEPS[sweep])
+    solver = unchecked(Still(), corrections=corrections, sweep=SWEEPS[sweep])
     assert solver.order(DRIVEN) == order
     dct.assert_order(solver, DRIVEN, DRIVEN0, t0=0.2, t1=1.8, dt0=0.2, args=2.0)
     if (sweep, corrections) == ("newton", 2):
@@ -100,20 +100,17 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     class Fourth(Still):
         order: int = 4
 
-    assert dfc.DeepONetSolver(Still()).order(TERM) is None
-    assert dfc.DeepONetSolver(Fourth()).order(TERM) == 4
-    assert dfc.DeepONetSolver(Fourth(), corrections=3).order(TERM) == 7
-    assert dfc.DeepONetSolver(Fourth(), corrections=9, nodes=6).order(TERM) == 6
-    assert (
-        dfc.DeepONetSolver(Fourth(), corrections=1, sweep=dfc.learned.NewtonSweep()).order(TERM)
-        == 10
-    )
+    assert unchecked(Still()).order(TERM) is None
+    assert unchecked(Fourth()).order(TERM) == 4
+    assert unchecked(Fourth(), corrections=3).order(TERM) == 7
+    assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
+    assert unchecked(Fourth(), corrections=1, sweep=dfc.learned.NewtonSweep()).order(TERM) == 10
 
 
 @pytest.mark.slow
 def test_few_nodes_limit_what_sweeps_reach():
     """With 4 nodes the collocation itself is of fourth order."""
-    solver = dfc.DeepONetSolver(Still(), nodes=4, corrections=9)
+    solver = unchecked(Still(), nodes=4, corrections=9)
     assert solver.order(DRIVEN) == 4
     dct.assert_order(solver, DRIVEN, DRIVEN0, t1=1.6, dt0=0.4, args=2.0)
 
@@ -122,7 +119,7 @@ def test_both_sweeps_solve_the_same_equations():
     """Whatever the flow map."""
 
     def end(flow_map, corrections, sweep):
-        solver = dfc.DeepONetSolver(flow_map, nodes=6, corrections=corrections, sweep=SWEEPS[sweep])
+        solver = unchecked(flow_map, nodes=6, corrections=corrections, sweep=SWEEPS[sweep])
         return step(solver, LORENZ.y0, 0.1)[0]
 
     many = end(flow_map(), 13, "picard")
@@ -133,8 +130,7 @@ def test_both_sweeps_solve_the_same_equations():
 @BOTH
 def test_the_error_estimate_is_the_change_by_the_last_sweep(sweep):
     found = [
-        step(dfc.DeepONetSolver(SHIPPED, corrections=k, sweep=SWEEPS[sweep]), LORENZ.y0)
-        for k in (1, 2)
+        step(unchecked(SHIPPED, corrections=k, sweep=SWEEPS[sweep]), LORENZ.y0) for k in (1, 2)
     ]
     np.testing.assert_allclose(found[1][1], found[1][0] - found[0][0], rtol=0, atol=1e-15)
     np.testing.assert_allclose(
@@ -154,7 +150,7 @@ class Linear(eqx.Module):
 def newton_on_a_linear_system(f, wrong, y0):
     term = dfx.ODETerm(lambda t, y, args: f @ y + jnp.cos(t))
     one, two = (
-        dfc.DeepONetSolver(Linear(wrong), corrections=k, sweep=dfc.learned.NewtonSweep(), nodes=10)
+        unchecked(Linear(wrong), corrections=k, sweep=dfc.learned.NewtonSweep(), nodes=10)
         for k in (1, 2)
     )
     return step(one, y0, 0.5, term=term)[0], step(two, y0, 0.5, term=term)[0]
@@ -176,7 +172,7 @@ def test_one_newton_sweep_solves_a_linear_system(seed, size):
 def test_dense_output_goes_through_the_corrected_path():
     ts = jnp.array([0.07, 0.4, 0.93])
     reference = LORENZ.reference(ts)
-    solver = dfc.DeepONetSolver(SHIPPED, corrections=2, sweep=dfc.learned.NewtonSweep())
+    solver = unchecked(SHIPPED, corrections=2, sweep=dfc.learned.NewtonSweep())
     sol = solve(solver, saveat=dfx.SaveAt(ts=ts, dense=True))
     np.testing.assert_allclose(sol.ys, reference, rtol=0, atol=1e-9)
     np.testing.assert_allclose(sol.evaluate(ts[1]), sol.ys[1], rtol=0, atol=1e-14)
@@ -185,9 +181,7 @@ def test_dense_output_goes_through_the_corrected_path():
 
 def test_the_vector_field_sees_time_and_args():
     term = dfx.ODETerm(lambda t, y, args: args * jnp.cos(t))
-    sol = solve(
-        dfc.DeepONetSolver(Still(), corrections=1), 0.5, term=term, t0=2.0, t1=5.0, args=1.5
-    )
+    sol = solve(unchecked(Still(), corrections=1), 0.5, term=term, t0=2.0, t1=5.0, args=1.5)
     np.testing.assert_allclose(sol.ys[-1], 0.5 + 1.5 * (np.sin(5) - np.sin(2)), rtol=1e-14)
 
 
@@ -209,7 +203,7 @@ def test_derivatives(sweep, whole):
     term = dfx.ODETerm(lambda t, y, args: args * LORENZ.vector_field(t, y, None))
 
     def f(weights, y0, args):
-        solver = dfc.DeepONetSolver(Wrong(weights), nodes=4, corrections=1, sweep=SWEEPS[sweep])
+        solver = unchecked(Wrong(weights), nodes=4, corrections=1, sweep=SWEEPS[sweep])
         if not whole:
             return step(solver, y0, term=term, args=args)[0]
         saveat = dfx.SaveAt(ts=jnp.array([0.1, 0.5]))
@@ -222,7 +216,7 @@ def test_derivatives(sweep, whole):
 
 @pytest.mark.parametrize("sweep", ["newton", pytest.param("picard", marks=pytest.mark.slow)])
 def test_a_batch_is_its_lanes(sweep):
-    solver = dfc.DeepONetSolver(SHIPPED, corrections=2, sweep=SWEEPS[sweep])
+    solver = unchecked(SHIPPED, corrections=2, sweep=SWEEPS[sweep])
     y0s = states(3)
     batch = jax.vmap(lambda y0: solve(solver, y0).ys[-1])(y0s)
     for y0, y1 in zip(y0s, batch, strict=True):
@@ -233,16 +227,14 @@ def test_a_batch_is_its_lanes(sweep):
 def test_float32(sweep, exact):
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (SHIPPED, *exact))
     network, y0s, y1s = single
-    solver = dfc.DeepONetSolver(
-        network, corrections=6 if sweep == "picard" else 2, sweep=SWEEPS[sweep]
-    )
+    solver = unchecked(network, corrections=6 if sweep == "picard" else 2, sweep=SWEEPS[sweep])
     ys, error = jax.vmap(lambda y0: step(solver, y0, jnp.float32(0.25), t0=jnp.float32(0)))(y0s)
     assert ys.dtype == error.dtype == jnp.float32
     np.testing.assert_allclose(ys, y1s, rtol=0, atol=2e-6)
 
 
 def test_on_the_manifold():
-    solver = dfc.DeepONetSolver(SHIPPED, corrections=1)
+    solver = unchecked(SHIPPED, corrections=1)
     projected = dfc.ManifoldProjection(solver, LORENZ.manifold)
     ts = jnp.linspace(0, 5, 41)
     sol = solve(projected, t1=5.0, max_steps=20, saveat=dfx.SaveAt(ts=ts))
@@ -252,11 +244,11 @@ def test_on_the_manifold():
 def test_a_complex_state():
     term = dfx.ODETerm(lambda t, y, args: 1j * y)
     y0 = jnp.array([1.0 + 0.5j])
-    y1, _ = step(dfc.DeepONetSolver(Still(), corrections=14), y0, 0.5, term=term)
+    y1, _ = step(unchecked(Still(), corrections=14), y0, 0.5, term=term)
     np.testing.assert_allclose(y1, y0 * np.exp(0.5j), rtol=1e-14)
     with pytest.raises(TypeError, match="`NewtonSweep` needs a real state"):
         step(
-            dfc.DeepONetSolver(Still(), corrections=1, sweep=dfc.learned.NewtonSweep()),
+            unchecked(Still(), corrections=1, sweep=dfc.learned.NewtonSweep()),
             y0,
             0.5,
             term=term,
@@ -268,9 +260,9 @@ def test_a_complex_state():
 
 def test_a_negative_number_of_sweeps():
     with pytest.raises(ValueError, match="`corrections` is -1, but it must be"):
-        dfc.DeepONetSolver(Still(), corrections=-1)
+        unchecked(Still(), corrections=-1)
 
 
 def test_an_unknown_sweep():
     with pytest.raises(TypeError):
-        dfc.DeepONetSolver(Still(), corrections=1, sweep="gauss")
+        unchecked(Still(), corrections=1, sweep="gauss")

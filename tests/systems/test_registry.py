@@ -6,7 +6,7 @@ from diffrax_conserve import systems
 
 
 def test_every_system_is_found_by_its_own_name():
-    for name in systems.names():
+    for name in (*systems.names(), *systems.names(stiff=True)):
         assert systems.get(name).name == name
 
 
@@ -18,8 +18,8 @@ def test_every_exported_system_is_listed():
         and issubclass(x, systems.AbstractSystem)
         and not x.__name__.startswith("Abstract")
     }
-    assert exported == set(systems.names())
-    assert len(exported) == 13
+    assert exported == {*systems.names(), *systems.names(stiff=True)}
+    assert len(exported) == 15
 
 
 def test_the_systems_of_the_paper_come_first():

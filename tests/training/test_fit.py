@@ -16,6 +16,8 @@ import diffrax_conserve as dfc
 from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator
 from ..problems import Counted
 
+# Most of these trainings are too short, and say so.
+pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
 LAYER = dfc.learned.ConservativeLayer(RADIUS, steps=2)
 KEY = jr.key(5)
 
@@ -168,14 +170,6 @@ def test_a_planted_nan_is_survived():
     assert np.isfinite(log.best)
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(model.nets))
     assert log.best <= log.criteria[0]
-
-
-def test_a_problem_that_is_nan_everywhere_returns_the_model_as_it_came():
-    before = circle()
-    after, log = train(before, lambda t, y, args: jnp.nan * y, epochs=5)
-    assert eqx.tree_equal(before, after)
-    assert log.skipped == 5
-    assert np.isinf(log.best)
 
 
 def test_long_gradients_are_shortened():

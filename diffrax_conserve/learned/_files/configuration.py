@@ -51,7 +51,7 @@ def describe(model: Any) -> dict[str, Any]:
     config = {"width": width, "depth": depth, "activation": activation}
     config |= {"normalise": model.normalise}
     if isinstance(model, PINN):
-        config |= {"t0": model.t0, "t1": model.t1, "windows": model.windows}
+        config |= {"t0": model.t0, "t1": model.t1, "windows": _describe_windows(model)}
         config |= {"state": _describe_state(model.y0)}
     else:
         core = type(model.core)
@@ -60,6 +60,12 @@ def describe(model: Any) -> dict[str, Any]:
         config |= {"latent": latent, "core": core.__name__, "max_step": model.max_step}
         config |= {"state": _describe_state(model.state)}
     return {"kind": type(model).__name__, "config": config, **_describe_parts(model)}
+
+
+def _describe_windows(pinn: PINN) -> int | list[float]:
+    """Their number, or where they meet if they are not of equal length."""
+    same = PINN(pinn.y0, pinn.t0, pinn.t1, windows=pinn.windows, width=1, depth=1, key=jr.key(0))
+    return pinn.windows if same.edges == pinn.edges else list(pinn.edges[1:-1])
 
 
 def _describe_parts(model: PINN | DeepONet) -> dict[str, Any]:
@@ -204,6 +210,12 @@ def _is_number(x: Any) -> bool:
     return type(x) in (int, float) and abs(x) < 1e300
 
 
+def _is_windows(x: Any) -> bool:
+    if isinstance(x, list):
+        return 1 <= len(x) < _COUNT_MAX and all(map(_is_number, x))
+    return _is_count(x)
+
+
 def _is_shape(x: Any) -> bool:
     return isinstance(x, list) and len(x) <= 8 and all(type(n) is int and 0 <= n < 2**31 for n in x)
 
@@ -230,7 +242,7 @@ _NETWORK = {
     "state": object,  # see `_state_leaves`
 }
 _CONFIG = {
-    "PINN": _NETWORK | {"t0": _is_number, "t1": _is_number, "windows": _is_count},
+    "PINN": _NETWORK | {"t0": _is_number, "t1": _is_number, "windows": _is_windows},
     "DeepONet": _NETWORK
     | {
         "latent": _is_count,

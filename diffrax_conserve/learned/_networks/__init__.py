@@ -15,6 +15,8 @@ from .frame import MakeFrame as MakeFrame
 from .layer import ConservativeLayer as ConservativeLayer
 from .mlp import activation_name as activation_name
 from .mlp import check_sizes as check_sizes
+from .mlp import fresh as fresh
+from .mlp import initial_slope as initial_slope
 from .pinn import PINN as PINN
 from .pinn import Window as Window
 from .repeated import Repeated as Repeated
@@ -24,3 +26,7 @@ from .trainable import LayerSchedule as LayerSchedule
 from .trainable import Points as Points
 from .trainable import Sampler as Sampler
 from .trainable import Times as Times
+from .transformed import AbstractTransformation as AbstractTransformation
+from .transformed import BoxCox as BoxCox
+from .transformed import Scale as Scale
+from .transformed import Transformed as Transformed

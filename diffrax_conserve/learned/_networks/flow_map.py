@@ -49,6 +49,10 @@ class AbstractFlowMap(AbstractTrainable):
         """A rate of change of the solution through `y0`, in the units that the loss is measured
         in."""
 
+    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
+        """The differences of states, in the units that those from data are measured in."""
+        return stacked_vectors(jtu.tree_map(lambda a, b: a - b, ys, others))
+
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
         times_key, states_key = jr.split(key)
         assert sample is not None

@@ -86,6 +86,21 @@ class MLP(eqx.Module):
         return x @ weight + bias
 
 
+def initial_slope(net: MLP) -> float | None:
+    """The `slope` that a network was made with, as far as its weights tell."""
+    if not any(bool(jnp.any(bias != 0)) for bias in net.biases):
+        return None
+    return float(jnp.sqrt(jnp.mean(jnp.square(net.weights[0]))))
+
+
+@eqx.filter_jit
+def fresh(net: MLP, slope: float | None, key: PRNGKeyArray) -> MLP:
+    """A network of the shape of `net`, with other random weights."""
+    first, last = net.weights[0], net.weights[-1]
+    (in_size, width), out_size, depth = first.shape, last.shape[1], len(net.weights) - 1
+    return MLP(in_size, out_size, width, depth, net.activation, first.dtype, key=key, slope=slope)
+
+
 def _spread(
     slope: float, in_size: int, width: int, dtype: jnp.dtype, key: PRNGKeyArray
 ) -> tuple[Float[Array, "in width"], Float[Array, " width"]]:

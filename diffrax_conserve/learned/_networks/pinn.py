@@ -1,5 +1,7 @@
 """A physics-informed network: one solution, as a function of time."""
 
+import itertools
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -29,7 +31,7 @@ class Window(AbstractTrainable):
     layer: ConservativeLayer | None
     y0: Y
     start: Float[Array, ""]
-    length: float = eqx.field(static=True)
+    length: Float[Array, ""]
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
 
@@ -88,9 +90,9 @@ class PINN(eqx.Module):
     with a fully connected network $N$, so that $u(t_0) = u_0$ whatever the weights. With a `layer`,
     the output is moved to the manifold of the values at $(t_0, u_0)$.
 
-    A long interval is cut into `windows` of equal length, each with a network of its own that
-    starts where the last one ends: small networks on short intervals are far easier to train than a
-    large one on a long interval.
+    A long interval is cut into `windows`, each with a network of its own that starts where the last
+    one ends: small networks on short intervals are far easier to train than a large one on a long
+    interval.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.PINNSolver`][].
 
@@ -115,8 +117,7 @@ class PINN(eqx.Module):
     nets: MLP  # every array has a leading axis of the windows, here and in `y0s`
     layer: ConservativeLayer | None
     y0s: Y
-    t0: float = eqx.field(static=True)
-    t1: float = eqx.field(static=True)
+    edges: tuple[float, ...] = eqx.field(static=True)  # where windows start, and the end
     sizes: Sizes = eqx.field(static=True)
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
@@ -128,7 +129,7 @@ class PINN(eqx.Module):
         t1: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        windows: int = 1,
+        windows: int | Sequence[float] = 1,
         width: int = 40,
         depth: int = 4,
         activation: str | Activation = "tanh",
@@ -136,22 +137,23 @@ class PINN(eqx.Module):
         normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):
-        check_sizes(width=width, depth=depth, windows=windows)
+        check_sizes(width=width, depth=depth)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
+        self.edges = _edges(float(t0), float(t1), windows)
+        count = self.windows
         if slope is not None and not slope > 0:
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
         y0 = as_state(y0)
         dtype = working_dtype(y0)
-        self.t0, self.t1 = float(t0), float(t1)
         self.sizes = Sizes(width, depth, 0, find_activation(activation))
         n = flatten(y0).size
 
         def net(key: PRNGKeyArray) -> MLP:
             return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
 
-        self.nets = eqx.filter_vmap(net)(key[None] if windows == 1 else jr.split(key, windows))
-        self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (windows, *x.shape)), y0)
+        self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
+        self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
         self.layer = layer
         self.normalise = normalise
         self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
@@ -168,28 +170,66 @@ class PINN(eqx.Module):
     @property
     def windows(self) -> int:
         """The number of windows."""
-        return jtu.tree_leaves(self.y0s)[0].shape[0]
+        return len(self.edges) - 1
+
+    @property
+    def t0(self) -> float:
+        """The initial time."""
+        return self.edges[0]
+
+    @property
+    def t1(self) -> float:
+        """The end of the interval."""
+        return self.edges[-1]
 
     def window(self, index: IntScalarLike) -> Window:
         """The network on the interval of this number."""
         net, y0 = jtu.tree_map(lambda x: x[index], (self.nets, self.y0s))
-        length = (self.t1 - self.t0) / self.windows
-        start = jnp.asarray(self.t0 + length * index, self.scale.dtype)
+        edges = jnp.asarray(self.edges, self.scale.dtype)
+        return self.window_of(net, y0, edges[index], edges[index + 1])
+
+    def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
+        """A window like those of this network."""
+        dtype = self.scale.dtype
         return Window(
             net=net,
             layer=self.layer,
             y0=y0,
-            start=start,
-            length=length,
+            start=jnp.asarray(start, dtype),
+            length=jnp.asarray(end - start, dtype),
             scale=self.scale,
             normalise=self.normalise,
         )
 
+    def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
+        """A network of the same kind with these windows."""
+        width, depth, _, activation = self.sizes
+        found = jtu.tree_map(jnp.asarray, (nets, y0s, self.scale))
+
+        def build() -> PINN:
+            return PINN(
+                self.y0,
+                edges[0],
+                edges[-1],
+                windows=tuple(edges[1:-1]),
+                width=width,
+                depth=depth,
+                activation=activation,
+                normalise=self.normalise,
+                key=jr.key(0),
+            )
+
+        # Only its structure is needed.
+        other = eqx.filter_eval_shape(build)
+        other = eqx.tree_at(lambda m: (m.nets, m.y0s, m.scale), other, found)
+        return eqx.tree_at(lambda m: m.layer, other, self.layer, is_leaf=lambda x: x is None)
+
     def _index(self, t: RealScalarLike) -> IntScalarLike:
         if self.windows == 1:
             return 0
-        position = (jnp.asarray(t) - self.t0) / (self.t1 - self.t0) * self.windows
-        return jnp.clip(jnp.floor(position).astype(int), 0, self.windows - 1)
+        t = jnp.asarray(t)
+        inner = jnp.asarray(self.edges[1:-1], jnp.result_type(t, self.scale.dtype))
+        return jnp.searchsorted(inner, t, side="right")
 
 
 PINN.__init__.__doc__ = r"""**Arguments:**
@@ -197,7 +237,8 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `y0`: the initial state $u_0$, any PyTree of real arrays.
 - `t0`, `t1`: the interval of time.
 - `key`: a random key, for the initial weights.
-- `windows`: into how many equal intervals it is cut, each with a network of its own.
+- `windows`: into how many equal intervals it is cut, each with a network of its own; or the times
+    between `t0` and `t1` at which it is cut.
 - `width`, `depth`: units in each hidden layer, and hidden layers.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
@@ -212,6 +253,20 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 
 `ValueError` or `TypeError` if a size or the interval has a wrong value.
 """
+
+
+def _edges(t0: float, t1: float, windows: int | Sequence[float]) -> tuple[float, ...]:
+    """The times at which windows start, and the end of the last one."""
+    if not isinstance(windows, Sequence):
+        check_sizes(windows=windows)
+        return (*(t0 + (t1 - t0) / windows * k for k in range(windows)), t1)
+    edges = (t0, *map(float, windows), t1)
+    if not all(a < b for a, b in itertools.pairwise(edges)):
+        raise ValueError(
+            f"`windows` is {windows!r}, but the times at which the interval is cut must increase "
+            f"and lie between {t0} and {t1}."
+        )
+    return edges
 
 
 def _magnitude(leaf: Array) -> Array:

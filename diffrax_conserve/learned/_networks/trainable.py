@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 from ..._custom_types import Y
 
 # `(key, count, first, last)` to times.
-Times = Callable[[PRNGKeyArray, int, float, float], Float[Array, " points"]]
+Times = Callable[[PRNGKeyArray, int, Any, Any], Float[Array, " points"]]
 # A random key to an initial state.
 Sampler = Callable[[PRNGKeyArray], Any]
 # The iterations of a conservative layer and the weight of the last one, `(p, s)`.
@@ -22,6 +22,7 @@ class Points(NamedTuple):
 
     ts: Float[Array, " points"]
     y0s: Any  # with a leading axis; None for a window
+    pairs: Any = None  # of states in data, as many as there are points
 
 
 class AbstractTrainable(eqx.Module):

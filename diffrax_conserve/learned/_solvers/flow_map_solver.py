@@ -27,6 +27,7 @@ from .policies import (
 )
 from .step_length import refuse_backwards, reject_too_long
 from .sweeps import AbstractSweep, Increment, Path, Picard, correct, increment
+from .trained_for import refuse_another_field
 
 
 @final
@@ -105,6 +106,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     sweep: AbstractSweep
     nodes: int = eqx.field(static=True)
     corrections: int = eqx.field(static=True)
+    check_field: bool = eqx.field(static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
@@ -118,6 +120,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         sweep: AbstractSweep = Picard(),
         outside: AbstractPolicy | dfx.AbstractSolver | None = None,
         max_error: RealScalarLike | None = None,
+        check_field: bool = True,
     ):
         self.flow_map = as_flow_map(flow_map)
         self.nodes = nodes
@@ -125,6 +128,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         self.sweep = sweep
         self.outside = as_policy(outside)
         self.max_error = max_error
+        self.check_field = check_field
 
     def __check_init__(self):
         check_nodes(self.nodes)
@@ -166,9 +170,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         y0: Y,
         args: Args,
     ) -> DomainStatistics | None:
-        del args
         check_learned_terms(terms, "FlowMapSolver")
         check_output(self.flow_map, (y0, t1 - t0), y0, "flow_map")
+        if self.check_field:
+            refuse_another_field(self.flow_map, terms, t0, t1, y0, args)
         return None if self.outside is None else DomainStatistics.zero(t0)
 
     def step(
@@ -241,13 +246,17 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 - `outside`: the policy for steps outside the domain.
 - `max_error`: the largest error of a component, in its own units, that makes a step count as
     inside. Default: only the domain decides.
+- `check_field`: whether a solve is refused whose vector field at the initial state is not the slope
+    of the flow map for $h \to 0$, in the Euclidean norm: by more than 0.1 %, where that slope is
+    exact (`order` at least 1), else by more than 75 %. An error in a parameter, or another system,
+    is found at once if the flow map has a Taylor polynomial.
 
 **Raises:**
 
 `TypeError` or `ValueError` if the flow map cannot be called so or returns another structure than
 the state's, if a number has a wrong value, or if `outside` asks about a domain that the flow
-map does not have. At run time an error in a solve backwards in time, and a failed result for a step
-that is too long.
+map does not have. At run time an error in a solve backwards in time or of an equation that the flow
+map was not trained for, and a failed result for a step that is too long.
 """
 
 # The name of the solver for its usual flow map.

@@ -1,10 +1,11 @@
-from .fit import FitLog as FitLog
 from .fit import fit as fit
+from .log import FitLog as FitLog
 from .loss import Bounded as Bounded
 from .loss import mean_square as mean_square
 from .pool import Pool as Pool
 from .reachable import FromStates as FromStates
 from .reachable import reachable_states as reachable_states
+from .reachable import trajectories as trajectories
 from .recipe import Recipe as Recipe
 from .recipe import paper as paper
 from .recipe import second_order as second_order
@@ -15,5 +16,6 @@ from .schedule import ramped_weight as ramped_weight
 from .schedule import staged_iterations as staged_iterations
 from .second_order import SPRING as SPRING
 from .second_order import LevenbergMarquardt as LevenbergMarquardt
+from .state import FitState as FitState
 from .times import grid_times as grid_times
 from .times import uniform_times as uniform_times

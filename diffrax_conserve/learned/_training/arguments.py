@@ -7,20 +7,32 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
 
 from ..._balance import refuse_rates
-from ..._custom_types import Args, Manifold
+from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_outputs
 from ..._projection import check_state
-from .._networks import PINN, AbstractFlowMap, as_flow_map, has_arrays
+from ..._tree import tree_shapes
+from .._networks import PINN, AbstractFlowMap, AbstractTrainable, Points, as_flow_map, has_arrays
+from .._networks.flat import stacked_vectors
 from .._solvers import check_output
+from .defect import VectorField
 from .pool import Pool
 from .recipe import Recipe
+from .state import FitState
 
 
-def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress: Any) -> None:
+def check_types(
+    vector_field: Any, key: Any, sample: Any, data: Any, recipe: Any, progress: Any
+) -> None:
     """Raises unless the arguments of `fit` besides the model have the right types."""
-    if not callable(vector_field):
+    if vector_field is None and (data is None or sample is not None):
+        raise TypeError(
+            "`fit` needs a `vector_field`, or `data` without `sample`, which is about the field."
+        )
+    if vector_field is not None and not callable(vector_field):
         raise TypeError(f"`vector_field` is {vector_field!r}, not a function `(t, y, args)`.")
     if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
         raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
@@ -42,7 +54,7 @@ def check_types(vector_field: Any, key: Any, sample: Any, recipe: Any, progress:
         )
 
 
-def check_arguments(model: Any, sample: Any, manifold: Manifold | None) -> None:
+def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | None) -> None:
     """Raises unless model, sampler and manifold fit each other."""
     if manifold is not None:
         check_manifold(manifold)
@@ -54,8 +66,11 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold | None) -> None:
                 "wrap its solver in `ManifoldProjection`."
             )
     if isinstance(model, PINN):
-        if sample is not None:
-            raise ValueError("A `PINN` has one initial state, its own: leave `sample` out.")
+        if sample is not None or data is not None:
+            raise ValueError(
+                "A `PINN` has one initial state, its own: leave `sample` out, and `data`, from "
+                "which only a flow map is trained."
+            )
         return
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
@@ -67,11 +82,60 @@ def check_arguments(model: Any, sample: Any, manifold: Manifold | None) -> None:
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. If it "
             "repeats another flow map: Train its inner `flow_map`, and repeat that."
         )
-    if sample is None:
+    if sample is None and data is None:
         raise ValueError(
             "A flow map is trained on many initial states: pass `sample`, a function from a random "
             "key to one of them, for example `sample=system.sample`."
         )
+
+
+def check_limits(state: Any, target: Any, seconds: Any) -> None:
+    """Raises unless what a training begins and ends with makes sense."""
+    if state is not None and not isinstance(state, FitState):
+        raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
+    for name, value in (("target", target), ("seconds", seconds)):
+        if value is not None and not value > 0:
+            raise ValueError(f"`{name}` must be positive, or `None`, but is {value}.")
+
+
+def check_field(
+    model: AbstractTrainable, vector_field: VectorField, args: Args, points: Points
+) -> None:
+    """Raises unless the vector field fits the states, is finite, and does not ask for the time."""
+    starts = model.starts(points)
+    y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
+    rate = eqx.filter_eval_shape(vector_field, starts.ts[0], y0, args)
+    if tree_shapes(rate) != tree_shapes(y0):
+        raise ValueError(
+            f"`vector_field` returns the structure {tree_shapes(rate)}, but the state has "
+            f"{tree_shapes(y0)}. Both must be the same."
+        )
+    now = _rates(vector_field, starts.ts, starts.y0s, args)
+    wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
+    if wrong.size:
+        y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
+        raise ValueError(
+            f"`vector_field` is not finite at {wrong.size} of {len(now)} initial states, for "
+            f"example at {y0}. Draw states at which it is."
+        )
+    if isinstance(model, AbstractFlowMap):
+        later = _rates(vector_field, starts.ts + 0.618 * model.max_step, starts.y0s, args)
+        change, size = np.max(np.abs(later - now)), np.max(np.abs(now))
+        if not change <= 1e-3 * size:
+            raise ValueError(
+                f"`vector_field` depends on time: from t = 0 to {0.618 * model.max_step:.3g} it "
+                f"changes by {change:.3g}, where its largest component is {size:.3g}. A flow map "
+                "is for autonomous equations. Make time a component of the state, of rate one."
+            )
+
+
+def _rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> np.ndarray:
+    return np.asarray(_stacked_rates(vector_field, ts, y0s, args))
+
+
+@eqx.filter_jit
+def _stacked_rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> Array:
+    return stacked_vectors(jax.vmap(vector_field, in_axes=(0, 0, None))(ts, y0s, args))
 
 
 def check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:

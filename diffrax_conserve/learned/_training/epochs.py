@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._tree import tree_all_finite
 from .._networks import LayerSchedule, Points
+from .data import draw_points
 from .defect import squared_norms
 from .objective import Carry, Objective
 from .pool import Pool, moved
@@ -117,7 +118,8 @@ def _anew(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
     """Other points; the states of a pool go where the network takes them."""
     recipe, sample = objective.recipe, objective.sample
     key = jr.fold_in(objective.key, epoch)
-    points = objective.static.draw(recipe.times, sample, recipe.points, key)
+    static, data = objective.static, objective.data
+    points = draw_points(static, recipe.times, sample, data, recipe.points, key)
     if not isinstance(sample, Pool):
         return points
 

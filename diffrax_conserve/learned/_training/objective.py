@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args
 from .._networks import AbstractTrainable, LayerSchedule, Points, Sampler
+from .data import Data, draw_points, mismatch
 from .defect import (
     VectorField,
     defects,
@@ -43,9 +44,10 @@ class Objective(eqx.Module):
     """All that is constant in a training: the loss of some weights, and how it is minimised."""
 
     static: Any  # the model without its weights
-    vector_field: VectorField
+    vector_field: VectorField | None
     args: Args
     sample: Sampler | None
+    data: Data | None
     recipe: Recipe
     optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
@@ -57,7 +59,14 @@ class Objective(eqx.Module):
         self, weights: Any, points: Points, schedule: LayerSchedule
     ) -> Float[Array, "points n"]:
         model = eqx.combine(weights, self.static)
-        return defects(model, self.vector_field, self.args, points, schedule)
+        rows = []
+        if self.vector_field is not None:
+            rows.append(defects(model, self.vector_field, self.args, points, schedule))
+        if self.data is not None:
+            # Both relative, so that neither outweighs the other by its units.
+            rows = [row / jnp.sqrt(self.typical) for row in rows]
+            rows.append(mismatch(model, points.pairs, self.data.deviation, schedule))
+        return rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=1)
 
     def loss(self, weights: Any, points: Points, schedule: LayerSchedule) -> Float[Array, ""]:
         vectors = self.defects(weights, points, schedule)
@@ -88,25 +97,28 @@ class Objective(eqx.Module):
 
 def start(
     model: AbstractTrainable,
-    vector_field: VectorField,
+    vector_field: VectorField | None,
     key: PRNGKeyArray,
     sample: Sampler | None,
     args: Args,
     recipe: Recipe,
+    data: Data | None = None,
 ) -> tuple[Objective, Carry]:
     points_key, key = jr.split(key)
     trained = trainable(model)
     weights, static = eqx.partition(model, trained)
-    points = model.draw(recipe.times, sample, recipe.points, points_key)
+    points = draw_points(model, recipe.times, sample, data, recipe.points, points_key)
     optimiser = recipe.optimiser
     if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
         clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
         optimiser = optax.chain(clip, optimiser)
-    typical = typical_square(model, vector_field, args, points)
+    typical = jnp.ones(())
+    if vector_field is not None:
+        typical = typical_square(model, vector_field, args, points)
     last = eqx.filter(linear_weights(model), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     objective = Objective(
-        static, vector_field, args, sample, recipe, optimiser, points, typical, linear, key
+        static, vector_field, args, sample, data, recipe, optimiser, points, typical, linear, key
     )
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     domain = domain_of(model) if isinstance(sample, Pool) else None

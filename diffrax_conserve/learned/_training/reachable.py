@@ -1,6 +1,6 @@
 """Initial states for a flow map where the solutions go."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import diffrax as dfx
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_all_finite
@@ -70,35 +70,104 @@ def reachable_states(
         ```
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
-    times = jr.uniform(key, (count,), minval=0.0, maxval=duration)
-    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
-    controller = adaptive if dt0 is None else dfx.ConstantStepSize()
+    times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
+    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0)
+    ys = jtu.tree_map(lambda x: x[:, 0], ys)
+    if keep is not None:
+        good = good & eqx.filter_jit(jax.vmap(keep))(ys)
+    return _the_good(ys, good)
+
+
+def trajectories(
+    vector_field: Callable[[RealScalarLike, Any, Args], Any],
+    y0s: PyTree[ArrayLike],
+    ts: Real[ArrayLike, "..."] | Sequence[RealScalarLike],
+    *,
+    args: Args = None,
+    solver: dfx.AbstractSolver | None = None,
+    dt0: RealScalarLike | None = None,
+    rtol: float = 1e-8,
+    atol: float | None = None,
+) -> tuple[Array, PyTree[Array]]:
+    r"""The solutions through `y0s` at the times `ts`, as `data` for [`diffrax_conserve.fit`][].
+
+    **Arguments:**
+
+    - `vector_field`, `args`: as of [`diffrax_conserve.learned.reachable_states`][].
+    - `y0s`: states at time 0, stacked along a leading axis.
+    - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
+    - `solver`, `dt0`: any diffrax solver; for stiff equations [`diffrax.Kvaerno5`][]. Default:
+        [`diffrax.Dopri8`][]. With `dt0` its steps are fixed.
+    - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
+        component of all `y0s`. Where small components count, give one that is small for them.
+
+    **Returns:**
+
+    Times of shape `(m, k)` and states with leading axes `(m, k)`, without solves that failed.
+
+    **Raises:**
+
+    `ValueError` if all failed.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+        import jax.numpy as jnp
+
+        system = dfc.systems.get("conservative-lorenz")
+        y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 50))
+        data = dfc.learned.trajectories(system.vector_field, y0s, jnp.linspace(0.0, 2.0, 21))
+        ```
+    """
+    count = jtu.tree_leaves(y0s)[0].shape[0]
+    times = jnp.asarray(ts, float)
+    ts = jnp.broadcast_to(times, (count, times.shape[-1]))
+    size = max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
+    ys, good = _solutions(vector_field, y0s, ts, args, solver, dt0, rtol, atol or rtol * size)
+    return _the_good((ts, ys), good)
+
+
+def _solutions(
+    vector_field: Any,
+    y0s: Any,
+    ts: Array,
+    args: Args,
+    solver: dfx.AbstractSolver | None,
+    dt0: RealScalarLike | None,
+    rtol: float = 1e-6,
+    atol: float = 1e-6,
+) -> tuple[Any, Array]:
+    """The states at `ts`, and which solves did not fail."""
     method = dfx.Dopri8() if solver is None else solver
 
-    @eqx.filter_jit
-    def state(y0: Y, t: Array) -> tuple[Y, Array]:
-        solution = dfx.diffeqsolve(
-            dfx.ODETerm(vector_field),  # pyright: ignore[reportArgumentType]
+    def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
+        adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
+        found = dfx.diffeqsolve(
+            dfx.ODETerm(vector_field),
             method,
             0.0,
-            t,
+            ts[-1],
             dt0,
             y0,
             args,
-            stepsize_controller=controller,
+            saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=adaptive if dt0 is None else dfx.ConstantStepSize(),
             max_steps=_MAX_STEPS,
             adjoint=dfx.ForwardMode(),
             throw=False,
         )
-        y = jtu.tree_map(lambda x: x[-1], solution.ys)
-        good = (solution.result == dfx.RESULTS.successful) & tree_all_finite(y)
-        return y, good if keep is None else good & keep(y)
+        return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    ys, good = eqx.filter_jit(jax.vmap(state))(y0s, times)
+    return eqx.filter_jit(jax.vmap(solution))(y0s, ts)
+
+
+def _the_good(ys: Any, good: Array) -> Any:
     if not bool(jnp.any(good)):
         raise ValueError(
-            "No state is left: every solve failed, or `keep` is false everywhere. Shorten "
-            "`duration`, or give another `solver`."
+            "No state is left: every solve failed, or `keep` is false everywhere. Shorten the "
+            "time, or give another `solver`."
         )
     return jtu.tree_map(lambda x: x[good], ys)
 

@@ -43,6 +43,7 @@ class Recipe(eqx.Module):
     refresh: int | None = None
     max_gradient_norm: float | None = 1.0
     check_every: int = 50
+    retries: int = 0
 
     def __check_init__(self):
         for name in ("epochs", "points", "check_every"):
@@ -57,6 +58,8 @@ class Recipe(eqx.Module):
         for name in ("iterations", "weight", "loss", "times"):
             if not callable(getattr(self, name)):
                 raise TypeError(f"`{name}` is {getattr(self, name)!r}, not a function.")
+        if self.retries < 0:
+            raise ValueError(f"`retries` must not be negative, but is {self.retries}.")
         if self.refresh is not None and self.refresh < 1:
             raise ValueError(f"`refresh` must be at least 1, or `None`, but is {self.refresh}.")
 
@@ -78,6 +81,8 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `max_gradient_norm`: longer gradients are scaled to this norm. `None` for no limit. Second-order
     methods have their damping instead.
 - `check_every`: after how many epochs the model is compared with the best one so far.
+- `retries`: how often a window of a `PINN` that failed is cut in halves. Before each time it is
+    trained again from other weights. With 0 it is only judged.
 """
 
 
@@ -103,6 +108,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
             iterations=every_iteration,
             times=grid_times,
             check_every=5,
+            retries=4,
         )
     return Recipe(
         epochs=epochs or 2000,

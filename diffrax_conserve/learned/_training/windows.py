@@ -1,16 +1,26 @@
-"""The windows of a PINN: each starts where the one before it ends."""
+"""The windows of a PINN: each starts where the one before it ends, and is judged by its error."""
 
+import dataclasses
+import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
 from ..._manifold import conserved_values
 from ..._projection import project
-from .._networks import PINN, Window
+from .._networks import PINN, Window, fresh, initial_slope
+from .._networks.flat import flatten
+from .objective import Objective
+from .path_error import relative, window_errors
+from .state import FitState, Windows
+from .trainer import Trainer
 
 _project = eqx.filter_jit(project)
 
@@ -36,16 +46,192 @@ class WindowEnds(NamedTuple):
         return found if bool(info.result == optx.RESULTS.successful) else y
 
 
-def with_window(pinn: PINN, index: int, window: Window, ends: WindowEnds | None) -> PINN:
-    """`pinn` with this window trained and the next one starting at its end."""
+def windows_of(pinn: PINN) -> Windows:
+    """The windows of a network before the first is trained."""
+    nets, y0s = jtu.tree_map(np.asarray, (pinn.nets, pinn.y0s))
+    count, slope = pinn.windows, initial_slope(pinn.window(0).net)
+    errors, halvings = np.full(count, np.inf), np.zeros(count, int)
+    return Windows(nets, y0s, np.array(pinn.edges), errors, halvings, slope or 0.0)
 
-    def put(i: int, stacked: Any, new: Any) -> Any:
-        return jtu.tree_map(lambda x, y: x.at[i].set(y), stacked, new)
 
-    pinn = eqx.tree_at(lambda m: m.nets, pinn, put(index, pinn.nets, window.net))
-    if index + 1 == pinn.windows:
-        return pinn
-    t = window.start + window.length
-    end = window(t)
-    end = end if ends is None else ends(t, end)
-    return eqx.tree_at(lambda m: m.y0s, pinn, put(index + 1, pinn.y0s, end))
+def train_windows(
+    trainer: Trainer, state: FitState, ends: WindowEnds | None
+) -> tuple[FitState, Windows, str]:
+    """Trains the windows one after the other; those that fail again, then in halves."""
+    limit = _limit(trainer, state.model)
+    objective, _ = trainer.start(_present(trainer, state), state)
+
+    def close(objective: Objective, state: FitState) -> bool:
+        window = eqx.combine(state.carry.best_weights, objective.static)
+        return trainer.target is not None and _own_error(trainer, state.model, window) <= limit
+
+    try:
+        while not state.finished:
+            state, ended = trainer.rounds(objective, state, close, _worst)
+            window = eqx.combine(state.carry.best_weights, objective.static)
+            judged = _judged(trainer, state, window, ends)
+            if ended in ("seconds", "interrupt"):
+                # What is judged so far is not kept: a training that goes on judges it at its end.
+                return state, judged, ended
+            following = _next(trainer, state, judged, limit)
+            if not following.finished:
+                objective, carry = trainer.start(_present(trainer, following), following)
+                following = dataclasses.replace(following, carry=carry)
+            # At once, so that an interrupt finds one or the other.
+            state = following
+            trainer.save(state)
+    except KeyboardInterrupt:
+        if not state.trained:
+            raise
+        ended = "interrupt"
+    else:
+        ended = "epochs"
+    assert state.windows is not None
+    return state, state.windows, ended
+
+
+def _present(trainer: Trainer, state: FitState) -> Window:
+    """The window that is to be trained now, with other weights the second time."""
+    found = state.windows
+    assert found is not None
+    k = found.present
+    net, y0 = jtu.tree_map(lambda x: jnp.asarray(x[k]), (found.nets, found.y0s))
+    if found.attempt:
+        net = fresh(net, found.slope or None, jr.fold_in(trainer.network_key(state), 1))
+    return state.model.window_of(net, y0, found.edges[k], found.edges[k + 1])
+
+
+def _judged(trainer: Trainer, state: FitState, window: Window, ends: WindowEnds | None) -> Windows:
+    """All windows with the present one, if it is the best for its interval."""
+    found = state.windows
+    assert found is not None
+    k, error = found.present, _own_error(trainer, state.model, window)
+    if found.errors[k] <= error:
+        return found
+    nets, y0s = jtu.tree_map(lambda x, new: _put(x, k, new), found.nets, window.net), found.y0s
+    if k + 1 < found.errors.size:
+        t = window.start + window.length
+        end = window(t)
+        end = end if ends is None else ends(t, end)
+        y0s = jtu.tree_map(lambda x, new: _put(x, k + 1, new), y0s, end)
+    return dataclasses.replace(found, nets=nets, y0s=y0s, errors=_put(found.errors, k, error))
+
+
+def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> FitState:
+    """What is to be trained after a window: the same one again, its first half, or the next."""
+    k, retries = found.present, trainer.recipe.retries
+    failed = not found.errors[k] <= limit and not found.given_up and retries
+    if failed and found.attempt == 0:
+        found = dataclasses.replace(found, attempt=1)
+    elif failed and found.halvings[k] < retries:
+        found = _halved(found, trainer.network_key(state))
+    else:
+        # After a window that has failed for good the others start at a wrong state.
+        found = dataclasses.replace(found, given_up=int(bool(found.given_up or failed)))
+        if k + 1 == found.errors.size:
+            return dataclasses.replace(state, windows=found, finished=1)
+        found = dataclasses.replace(found, present=k + 1, attempt=0)
+    return dataclasses.replace(
+        state,
+        windows=found,
+        past=state.past.and_then(state.carry, state.checked, state.criteria),
+        trained=state.trained + 1,
+        checked=np.zeros(0, int),
+        criteria=np.zeros(0),
+    )
+
+
+def _halved(found: Windows, key: PRNGKeyArray) -> Windows:
+    """The windows with the present one cut in halves."""
+    k, edges = found.present, found.edges
+    net = jtu.tree_map(lambda x: jnp.asarray(x[k]), found.nets)
+    halves = [fresh(net, found.slope or None, key) for key in jr.split(jr.fold_in(key, 2))]
+
+    def cut(x: np.ndarray, first: Any, second: Any) -> np.ndarray:
+        return np.concatenate([x[:k], np.stack([first, second]), x[k + 1 :]])
+
+    depth = found.halvings[k] + 1
+    return dataclasses.replace(
+        found,
+        nets=jtu.tree_map(cut, found.nets, *halves),
+        y0s=jtu.tree_map(lambda x: np.insert(x, k, x[k], axis=0), found.y0s),
+        edges=np.insert(edges, k + 1, (edges[k] + edges[k + 1]) / 2),
+        errors=cut(found.errors, np.inf, np.inf),
+        halvings=cut(found.halvings, depth, depth),
+        attempt=0,
+    )
+
+
+def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
+    values = values.copy()
+    values[index] = value
+    return values
+
+
+def _worst(objective: Objective, state: FitState) -> float:
+    """The largest error of a window that is trained."""
+    del objective
+    assert state.windows is not None
+    errors = state.windows.errors
+    return float(np.max(errors, where=np.isfinite(errors), initial=0))
+
+
+def _limit(trainer: Trainer, pinn: PINN) -> float:
+    """The error by itself above which a window has failed."""
+    return _WRONG if trainer.target is None else trainer.target / (_GROWTH * pinn.windows)
+
+
+# A solution with a larger error than this, relative to its largest component, is not one.
+_WRONG = 1e-4
+# Errors of windows add up, and later windows may amplify them.
+_GROWTH = 4
+
+
+def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
+    """The largest error of a window, relative to the solution in it and in the beginning."""
+    none = jnp.zeros_like(pinn.scale)
+    assert trainer.vector_field is not None
+    found = window_errors(window, trainer.vector_field, trainer.args, none, trainer.substeps)
+    size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(pinn.y0))))
+    return relative(found.largest[0], size, pinn.y0)
+
+
+def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray) -> float:
+    """The largest error in the whole interval; warns where it is not small."""
+    error, largest, sizes = jnp.zeros_like(pinn.scale), [], []
+    assert trainer.vector_field is not None
+    for k in range(pinn.windows):
+        window = pinn.window(k)
+        found = window_errors(window, trainer.vector_field, trainer.args, error, trainer.substeps)
+        largest.append(np.asarray(found.largest[1]))
+        sizes.append(np.asarray(found.size[1]))
+        if k + 1 < pinn.windows:
+            # The exact solution goes on, wherever the next window starts.
+            end = flatten(window(window.start + window.length))
+            error = found.end[1] + end - flatten(pinn.window(k + 1).y0)
+    size = np.max(sizes, axis=0)
+    along = [relative(e, size, pinn.y0) for e in largest]
+    wrong = trainer.target if trainer.target is not None else _WRONG
+    if not max(along) <= wrong:
+        _warn(pinn, errors, along, _limit(trainer, given), wrong)
+    return max(along)
+
+
+def _warn(pinn: PINN, errors: np.ndarray, along: list[float], limit: float, wrong: float) -> None:
+    """Says which window is wrong, and by how much."""
+    failed = np.flatnonzero(~(errors <= limit))
+    k = int(failed[0]) if failed.size else int(np.argmax(along))
+    first, last = pinn.edges[k], pinn.edges[k + 1]
+    if np.isinf(errors[k]):
+        fault = "was not trained, or its error cannot be estimated"
+    elif failed.size:
+        fault = f"has an estimated error of {errors[k]:.2g} by itself"
+    else:
+        fault = "is where errors of earlier windows have grown largest"
+    warnings.warn(
+        f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of the "
+        f"largest component, above {wrong:.2g}. Window {k} of {pinn.windows}, from {first:.6g} to "
+        f"{last:.6g}, {fault}. Use more windows, more `width` or more `epochs`, or a recipe with "
+        "`retries`.",
+        stacklevel=4,
+    )

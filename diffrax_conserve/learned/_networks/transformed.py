@@ -1,0 +1,183 @@
+"""A flow map in other coordinates: logarithms, powers, units."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float
+
+from ..._custom_types import RealScalarLike, Y
+from .flat import flatten, stacked_vectors, unflatten
+from .flow_map import AbstractFlowMap, as_flow_map
+from .trainable import LayerSchedule
+
+
+class AbstractTransformation(eqx.Module):
+    """Other coordinates for a state."""
+
+    @abc.abstractmethod
+    def __call__(self, y: Y) -> Y:
+        """The coordinates of the state `y`."""
+
+    @abc.abstractmethod
+    def inverse(self, z: Y) -> Y:
+        """The state of the coordinates `z`."""
+
+
+@final
+class BoxCox(AbstractTransformation):
+    r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
+
+    Its inverse is never negative. Small exponents spread magnitudes like a logarithm, and zero
+    is a number. With an exponent of 0 it is the logarithm, for positive states.
+    """
+
+    exponent: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        if not 0 <= self.exponent <= 1:
+            raise ValueError(f"`exponent` must be from 0 to 1, but is {self.exponent}.")
+
+    def __call__(self, y: Y) -> Y:
+        p = self.exponent
+        return jtu.tree_map(lambda x: (x**p - 1) / p if p else jnp.log(x), y)
+
+    def inverse(self, z: Y) -> Y:
+        p = self.exponent
+        return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** (1 / p) if p else jnp.exp(x), z)
+
+
+BoxCox.__init__.__doc__ = r"""**Arguments:**
+
+- `exponent`: $\lambda$, from 0 to 1.
+
+**Raises:**
+
+`ValueError` if it is not.
+"""
+
+
+@final
+class Scale(AbstractTransformation):
+    """$z = y / s$, with a scale for each component or leaf."""
+
+    scale: Y
+
+    def __call__(self, y: Y) -> Y:
+        return jtu.tree_map(lambda x, s: x / s, y, self.scale)
+
+    def inverse(self, z: Y) -> Y:
+        return jtu.tree_map(lambda x, s: x * s, z, self.scale)
+
+
+Scale.__init__.__doc__ = """**Arguments:**
+
+- `scale`: positive numbers, a PyTree like the state.
+"""
+
+
+@final
+class Transformed(AbstractFlowMap):
+    r"""A flow map that steps in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
+
+    Chemical species over ten orders of magnitude are learned as powers or logarithms, so that the
+    small ones count; then they are never negative. The initial state is exact. Losses from data
+    are measured in the coordinates, defects too.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("pollu")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        boxcox = dfc.learned.BoxCox(0.1)
+        inner = dfc.DeepONet(boxcox(states), 2.0, width=8, depth=1, key=jax.random.key(1))
+        flow_map = dfc.learned.Transformed(inner, boxcox)
+        assert (flow_map(states[0], 1.0) >= 0).all()
+        ```
+    """
+
+    flow_map: AbstractFlowMap
+    transformation: AbstractTransformation
+
+    def __init__(
+        self,
+        flow_map: AbstractFlowMap | Callable[..., Any],
+        transformation: AbstractTransformation,
+    ):
+        self.flow_map = as_flow_map(flow_map)
+        self.transformation = transformation
+
+    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`."""
+        y0 = jtu.tree_map(jnp.asarray, y0)
+        z0 = self.transformation(y0)
+        z1 = self.flow_map(z0, h, schedule)
+        there = self.transformation.inverse(z1)
+
+        def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
+            # Roundoff of there and back is not a step. The derivatives are those of `y`.
+            exact = lax.stop_gradient(y0) + (y - lax.stop_gradient(y))
+            return jnp.where(z0 == z1, exact, y).astype(y0.dtype)
+
+        return jtu.tree_map(component, y0, there, z0, z1)
+
+    @property
+    def max_step(self) -> RealScalarLike:
+        """The longest step."""
+        return self.flow_map.max_step
+
+    @property
+    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the inner flow map."""
+        return self.flow_map.order
+
+    @property
+    def domain(self) -> Any:
+        """The states whose coordinates are in the domain of the inner flow map, or `None`."""
+        inner = self.flow_map.domain
+        return None if inner is None else TransformedDomain(inner, self.transformation)
+
+    @property
+    def layer(self) -> None:
+        """None: what the inner flow map has is not a manifold of states."""
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
+        return flatten(jax.jvp(self.transformation, (y0,), (unflatten(rate, y0),))[1])
+
+    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
+        z, other = (jax.vmap(self.transformation)(y) for y in (ys, others))
+        return stacked_vectors(jtu.tree_map(lambda a, b: a - b, z, other))
+
+    def weights(self) -> Any:
+        return self.flow_map.weights()
+
+    def linear_weights(self) -> tuple[()]:
+        return ()
+
+
+Transformed.__init__.__doc__ = """**Arguments:**
+
+- `flow_map`: the flow map of the coordinates.
+- `transformation`: [`diffrax_conserve.learned.BoxCox`][], [`diffrax_conserve.learned.Scale`][], or
+    a Module of your own.
+"""
+
+
+@final
+class TransformedDomain(eqx.Module):
+    """The states whose coordinates are in a domain."""
+
+    inner: Any
+    transformation: AbstractTransformation
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is such a state."""
+        return self.inner.contains(self.transformation(y))

@@ -1,0 +1,163 @@
+"""Where a training stands: what another call of `fit`, or another process, needs to go on."""
+
+import dataclasses
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+
+from ..._replace_file import replace_file
+from .objective import Carry
+
+
+@final
+class FitState(eqx.Module):
+    """Where a training stands, `log.state` of [`diffrax_conserve.learned.FitLog`][].
+
+    Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are no part of the interface.
+    """
+
+    model: Any  # as it was given
+    carry: Carry  # of the network that is trained now
+    checked: np.ndarray  # of that network
+    criteria: np.ndarray
+    past: "Past"
+    trained: int = 0  # how many trainings have ended
+    finished: int = 0
+    windows: "Windows | None" = None  # of a PINN
+
+    @property
+    def done(self) -> int:
+        """The epochs that the present network has had."""
+        return int(self.checked[-1]) if self.checked.size else 0
+
+
+@final
+class Windows(eqx.Module):
+    """The windows of a PINN in training, stacked in arrays of numpy: their number may change."""
+
+    nets: Any
+    y0s: Any
+    edges: np.ndarray
+    errors: np.ndarray  # of each by itself; infinity if it is not trained
+    halvings: np.ndarray  # how often the window that it is a part of was cut
+    slope: float  # of the first weights; 0 for none
+    present: int = 0  # the one that is trained now
+    attempt: int = 0  # how often it was trained before
+    given_up: int = 0  # whether a window has failed for good
+
+
+@final
+class Past(eqx.Module):
+    """The records of the networks before the present one, and the worst of them."""
+
+    losses: np.ndarray
+    checked: np.ndarray
+    criteria: np.ndarray
+    best_epoch: int = 0
+    best: float = -1.0
+    skipped: int = 0
+
+    @classmethod
+    def empty(cls) -> "Past":
+        return cls(np.zeros(0), np.zeros(0, int), np.zeros(0))
+
+    def and_then(self, carry: Carry, checked: np.ndarray, criteria: np.ndarray) -> "Past":
+        """With the record of the network after these."""
+        before = self.losses.size
+        worse = float(carry.best) > self.best
+        return Past(
+            np.concatenate([self.losses, np.asarray(carry.losses)]),
+            np.concatenate([self.checked, before + checked]),
+            np.concatenate([self.criteria, criteria]),
+            before + int(carry.best_epoch) if worse else self.best_epoch,
+            max(float(carry.best), self.best),
+            self.skipped + int(carry.skipped),
+        )
+
+
+def continued(state: FitState, epochs: int, first: FitState) -> FitState:
+    """A state that was given, to go on with; `first` is that of a new training."""
+    if jtu.tree_structure(state.carry.weights) != jtu.tree_structure(first.carry.weights):
+        raise ValueError("`state` is that of a training of another kind of network.")
+    if state.done < epochs and (state.windows is None or state.windows.errors.size == 1):
+        return dataclasses.replace(state, finished=0)
+    if state.finished or state.done >= epochs:
+        raise ValueError(
+            f"The training whose `state` was given has made all its {state.done} epochs, and the "
+            f"recipe has {epochs}. Give one with more, such as "
+            "`dataclasses.replace(recipe, epochs=...)`; a `PINN` of several windows cannot go on."
+        )
+    return state
+
+
+def fingerprint(model: Any, key: Any, recipe: Any) -> str:
+    """A number that two trainings have in common only if they start alike."""
+    digest = hashlib.sha256()
+    for leaf in jtu.tree_leaves(eqx.filter((model, key), eqx.is_array)):
+        digest.update(_plain(leaf).tobytes())
+    numbers = (recipe.points, recipe.refresh, recipe.check_every, type(recipe.optimiser).__name__)
+    digest.update(repr(numbers).encode())
+    return digest.hexdigest()
+
+
+def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
+    """Writes `state` such that a reader finds the old file or the new one."""
+    leaves = jtu.tree_leaves(state)
+    header = json.dumps({"format": _FORMAT, "mark": mark, "leaves": len(leaves)})
+    arrays: dict[str, Any] = {f"x{i}": _plain(leaf) for i, leaf in enumerate(leaves)}
+
+    def write(path: Path) -> None:
+        with path.open("wb") as file:
+            np.savez(file, header=np.array(header), **arrays)
+
+    replace_file(path, write)
+
+
+def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
+    """The state in a file. `like` is the first one of the same training."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            found = [file[f"x{i}"] for i in range(header["leaves"])]
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"The file {path} holds no checkpoint of a training: {error}.") from error
+    if header.get("format") != _FORMAT or header.get("mark") != mark:
+        raise ValueError(
+            f"The checkpoint {path} is of another training: its network, its key or its recipe "
+            "differs. Give the same arguments, or another file."
+        )
+    leaves, treedef = jtu.tree_flatten(like)
+    return treedef.unflatten([_as(x, y) for x, y in zip(found, leaves, strict=True)])
+
+
+_FORMAT = 1
+
+
+def _is_key(x: Any) -> bool:
+    return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _plain(leaf: Any) -> np.ndarray:
+    return np.asarray(jr.key_data(leaf) if _is_key(leaf) else leaf)
+
+
+def _as(found: np.ndarray, like: Any) -> Any:
+    """A leaf of a file as one of the kind of `like`."""
+    if isinstance(like, int | float):
+        return type(like)(found)
+    if isinstance(like, np.ndarray):
+        return found
+    if _is_key(like):
+        return jr.wrap_key_data(jnp.asarray(found))
+    if found.dtype.kind == "V":  # numpy does not know bfloat16
+        found = found.view(like.dtype)
+    return jnp.asarray(found)

@@ -1,0 +1,143 @@
+"""The rounds of a training: epochs, a look at the clock, a line of progress, a checkpoint."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from ..._custom_types import Args
+from .._networks import AbstractTrainable, Sampler
+from .data import Data
+from .defect import VectorField
+from .epochs import advance
+from .objective import Carry, Objective, start
+from .progress import Progress, report
+from .recipe import Recipe
+from .state import FitState, write_checkpoint
+
+
+@final
+@dataclasses.dataclass
+class Trainer:
+    """Trains one network after the other, all of the same shape, with one compilation."""
+
+    vector_field: VectorField | None
+    sample: Sampler | None
+    data: Data | None
+    args: Args
+    recipe: Recipe
+    key: PRNGKeyArray
+    target: float | None
+    seconds: float
+    progress: bool | Progress
+    checkpoint: Path | None
+    mark: str
+    begun: float = dataclasses.field(default_factory=time.perf_counter)
+    compiled: Any = None
+    compile_seconds: float = 0.0
+    first: int | None = None  # the epoch that this call of `fit` began with
+    saved: float = -np.inf  # when, and how long it took
+    saving: float = 0.0
+
+    def network_key(self, state: FitState) -> PRNGKeyArray:
+        return self.key if state.trained == 0 else jr.fold_in(self.key, state.trained)
+
+    def start(self, model: AbstractTrainable, state: FitState | None) -> tuple[Objective, Carry]:
+        """What is constant in the training of the present network, and its first carry."""
+        key = self.key if state is None else self.network_key(state)
+        field, data = self.vector_field, self.data
+        return start(model, field, key, self.sample, self.args, self.recipe, data)
+
+    @property
+    def substeps(self) -> int:
+        """Steps in which the error of a window is followed."""
+        return 2 * self.recipe.points
+
+    def rounds(
+        self,
+        objective: Objective,
+        state: FitState,
+        close_enough: Callable[[Objective, FitState], bool],
+        estimate: Callable[[Objective, FitState], float],
+    ) -> tuple[FitState, str]:
+        """Trains one network to its last epoch, or to what ends the training before."""
+        epochs, ended = self.recipe.epochs, ""
+        state = _resized(state, epochs)
+        try:
+            self._compile(objective, state)
+            while not ended:
+                # Without an epoch between them, the first round only judges the model as it came.
+                stop = min(state.done + self.recipe.check_every, epochs)
+                stop = stop if state.checked.size else 0
+                carry, criterion = self.compiled(
+                    objective, state.carry, jnp.asarray(state.done), jnp.asarray(stop)
+                )
+                state = dataclasses.replace(
+                    state,
+                    carry=carry,
+                    checked=np.append(state.checked, stop),
+                    criteria=np.append(state.criteria, float(criterion)),
+                )
+                self._report(state, lambda s=state: estimate(objective, s))
+                if close_enough(objective, state):
+                    ended = "target"
+                elif state.done >= epochs:
+                    ended = "epochs"
+                elif time.perf_counter() - self.begun > self.seconds:
+                    ended = "seconds"
+                else:
+                    self.save(state)
+        except KeyboardInterrupt:
+            if not state.checked.size and not state.trained:
+                raise
+            ended = "interrupt"
+        _refuse_nothing(state)
+        return state, ended
+
+    def save(self, state: FitState, always: bool = False) -> None:
+        """Writes a checkpoint, unless the last one took long compared with the time since."""
+        begun = time.perf_counter()
+        if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
+            return
+        write_checkpoint(self.checkpoint, state, self.mark)
+        self.saved = time.perf_counter()
+        self.saving = self.saved - begun
+
+    def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
+        epochs = self.recipe.epochs
+        self.first = state.trained * epochs + state.done if self.first is None else self.first
+        report(self.progress, state, epochs, self.first, time.perf_counter() - self.begun, estimate)
+
+    def _compile(self, objective: Objective, state: FitState) -> None:
+        if self.compiled is None:
+            begun = time.perf_counter()
+            arguments = (objective, state.carry, jnp.asarray(0), jnp.asarray(0))
+            compilable = eqx.filter_jit(advance)
+            lowered = compilable.lower(*arguments)  # pyright: ignore[reportFunctionMemberAccess]
+            self.compiled = lowered.compile()
+            self.compile_seconds = time.perf_counter() - begun
+
+
+def _resized(state: FitState, epochs: int) -> FitState:
+    """`state` with room for the losses of so many epochs."""
+    losses = state.carry.losses[:epochs]
+    losses = jnp.concatenate([losses, jnp.full(epochs - losses.size, jnp.nan, losses.dtype)])
+    return dataclasses.replace(state, carry=state.carry._replace(losses=losses))
+
+
+def _refuse_nothing(state: FitState) -> None:
+    """Raises if every update was skipped."""
+    skipped = int(state.carry.skipped)
+    if skipped and skipped == state.done:
+        raise FloatingPointError(
+            f"None of the {skipped} updates was finite, so nothing was learned, although the "
+            "vector field is finite at the initial states. It may not be finite where the network "
+            "leads, or the updates are too long: lower the learning rate."
+        )

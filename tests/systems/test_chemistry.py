@@ -1,0 +1,187 @@
+"""Reactions as differential equations, what they conserve, and the two stiff problems."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy.linalg
+
+import diffrax_conserve as dfc
+from diffrax_conserve.systems import Mechanism
+
+STIFF = {name: dfc.systems.get(name) for name in dfc.systems.names(stiff=True)}
+both = pytest.mark.parametrize("system", STIFF.values(), ids=STIFF)
+
+# F. Mazzia and C. Magherini, Test Set for Initial Value Problem Solvers.
+POLLU_60 = [
+    0.5646255480022769e-01, 0.1342484130422339e00, 0.4139734331099427e-08, 0.5523140207484359e-02,
+    0.2018977262302196e-06, 0.1464541863493966e-06, 0.7784249118997964e-01, 0.3245075353396018e00,
+    0.7494013383880406e-02, 0.1622293157301561e-07, 0.1135863833257075e-07, 0.2230505975721359e-02,
+    0.2087162882798630e-03, 0.1396921016840158e-04, 0.8964884856898295e-02, 0.4352846369330103e-17,
+    0.6899219696263405e-02, 0.1007803037365946e-03, 0.1772146513969984e-05, 0.5682943292316392e-04,
+]  # fmt: skip
+ROBERTSON = {40.0: [0.7158270688, 9.185534765e-6, 0.2841637457]}
+
+
+def test_pollu_is_that_of_the_test_set():
+    found = STIFF["pollu"].reference([60.0])[0]
+    np.testing.assert_allclose(found, POLLU_60, rtol=1e-9)
+
+
+def test_robertson_is_that_of_the_books():
+    system = STIFF["robertson"]
+    ts = list(ROBERTSON)
+    np.testing.assert_allclose(system.reference(ts), list(ROBERTSON.values()), rtol=1e-7)
+    rates = system.vector_field(0.0, jnp.array([1.0, 2e-5, 0.5]), None)
+    a, b = -0.04 + 1e4 * 2e-5 * 0.5, 3e7 * 2e-5**2
+    np.testing.assert_allclose(rates, [a, -a - b, b], rtol=1e-13)
+
+
+@both
+def test_the_balances_are_conserved(system):
+    ys = jax.vmap(system.sample)(jr.split(jr.key(0), 20)) + 1e-6
+    report = dfc.check_invariance(system.vector_field, system.manifold, ys)
+    assert report.ok, str(report)
+    ys = system.reference(np.linspace(0, system.t1, 4))
+    for entry in system.manifold.values():
+        kept = jax.vmap(lambda y, fn=entry.fn: fn(0.0, y, None))(ys)
+        np.testing.assert_allclose(kept, kept[0], rtol=1e-9)
+
+
+@both
+def test_a_stiff_system_is_one_of_the_catalogue(system):
+    assert isinstance(system, dfc.systems.AbstractSystem)
+    assert system.sample(jr.key(0)).shape == system.y0.shape
+    assert system.trajectories(system.reference([0.0, 1.0]))["concentrations"].shape == (2, 2)
+    assert eqx.filter_eval_shape(system.vector_field, 0.0, system.y0.astype(jnp.float32), None)
+    assert system.name not in dfc.systems.names()
+
+
+# ---- Any mechanism ----
+
+
+def test_the_balances_of_pollu_are_its_elements():
+    assert list(STIFF["pollu"].manifold) == [
+        "HCHO + CO + 2 ALD + MEO2 + 2 C2O3 + CO2 + 2 PAN + CH3O",
+        "SO2 + SO4",
+        "NO2 + NO + PAN + HNO3 + NO3 + 2 N2O5",
+    ]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_balances_are_the_left_null_space(seed):
+    """Of random reactions, against a singular value decomposition."""
+    rng = np.random.default_rng(seed)
+    names = [f"X{i}" for i in range(rng.integers(2, 9))]
+
+    def side():
+        chosen = rng.choice(names, rng.integers(1, 4))
+        return " + ".join(f"{rng.integers(1, 4)} {name}" for name in chosen)
+
+    reactions = [f"{side()} -> {side()}" for _ in range(rng.integers(1, 7))]
+    mechanism = Mechanism(reactions, np.ones(len(reactions)), species=names)
+    found = np.array([b.weights for b in mechanism.balances.values()]).reshape(-1, len(names))
+    expected = scipy.linalg.null_space(mechanism.stoichiometry.T)
+    assert not np.any(found @ mechanism.stoichiometry)
+    assert np.linalg.matrix_rank(found) == len(found) == expected.shape[1]
+
+
+def test_the_law_of_mass_action():
+    mechanism = Mechanism(["2 A + B -> 3 C", "C -> ", "-> A"], [2.0, 3.0, 5.0])
+    a, b, c = y = np.array([0.3, 0.7, 1.1])
+    first, second = 2 * a**2 * b, 3 * c
+    expected = [-2 * first + 5, -first, 3 * first - second]
+    np.testing.assert_allclose(mechanism.vector_field(0.0, jnp.array(y), None), expected)
+    assert mechanism.manifold == {}
+    np.testing.assert_array_equal(mechanism.state({"C": 2.0}), [0, 0, 2])
+
+
+@pytest.mark.parametrize(
+    ("reactions", "rates", "species", "match"),
+    [
+        (["A = B"], [1.0], None, "cannot be read"),
+        (["A -> B -> C"], [1.0], None, "cannot be read"),
+        (["1.5 A -> B"], [1.0], None, "cannot be read"),
+        (["A -> B"], [1.0, 2.0], None, "1 `reactions`"),
+        (["A -> B"], [1.0], ["A"], "must name each species once"),
+        (["A -> B"], [1.0], ["A", "B", "A"], "must name each species once"),
+    ],
+)
+def test_what_is_no_mechanism(reactions, rates, species, match):
+    with pytest.raises(ValueError, match=match):
+        Mechanism(reactions, rates, species=species)
+    with pytest.raises(ValueError, match="no species X"):
+        Mechanism(["A -> B"], [1.0]).state({"X": 1.0})
+
+
+# ---- A projection without negative concentrations ----
+
+PROJECTION = STIFF["pollu"].mechanism.positive_projection()
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def moved_back(y, noise):
+    system = STIFF["pollu"]
+    value = jax.tree.map(lambda entry: entry.fn(0.0, y, None), system.manifold,
+                         is_leaf=lambda x: isinstance(x, dfc.FirstIntegral))  # fmt: skip
+    return dfc.project(system.manifold, y * noise, value=value, projection=PROJECTION)
+
+
+@pytest.mark.parametrize("count", [10**4, pytest.param(10**6, marks=pytest.mark.slow)])
+def test_no_concentration_is_negative_and_the_balances_hold(count):
+    """Many states, up to a factor of two off, with species that are negative.
+
+    Where the negative one holds nearly all of an element, the projection may fail, and says so.
+    """
+    keys = jr.split(jr.key(0), 4)
+    y = jnp.array(POLLU_60) * jnp.exp(jr.normal(keys[0], (count, 20)))
+    noise = jnp.exp(jr.uniform(keys[1], (count, 20), minval=-0.7, maxval=0.7))
+    noise = jnp.where(jr.uniform(keys[2], (count, 20)) < 0.02, -0.1, noise)
+    found, info = moved_back(y, noise)
+    assert float(jnp.min(found)) >= 0
+    good = info.result == optx.RESULTS.successful
+    assert float(jnp.mean(good)) > 0.95
+    assert bool(jnp.all(good | jnp.any(noise < 0, axis=1)))
+    weights = np.array([b.weights for b in STIFF["pollu"].mechanism.balances.values()])
+    expected = y @ weights.T
+    off = jnp.max(jnp.abs(found @ weights.T / expected - 1), axis=1)
+    positive = jnp.all(noise > 0, axis=1)
+    assert float(jnp.max(jnp.where(positive, off, 0))) < 4e-15
+    assert float(jnp.max(jnp.where(good, off, 0))) < 2e-14
+
+
+def test_it_is_the_nearest_state_in_relative_entropy():
+    """Its gradient is in the space of the balances, so no other state on them is nearer."""
+    y = jnp.array(POLLU_60)
+    noise = jnp.exp(0.2 * jr.normal(jr.key(5), (1, 20)))
+    found, _ = moved_back(y[None], noise)
+    gradient = jnp.log(found[0] / (y * noise[0]))
+    weights = np.array([b.weights for b in STIFF["pollu"].mechanism.balances.values()], float)
+    coefficients, *_ = np.linalg.lstsq(weights.T, gradient)
+    np.testing.assert_allclose(weights.T @ coefficients, gradient, atol=1e-12)
+
+
+def test_a_stiff_solve_keeps_signs_and_balances():
+    system = STIFF["pollu"]
+    solver = dfc.ManifoldProjection(dfx.Kvaerno3(), system.manifold, projection=PROJECTION)
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field), solver, 0.0, 10.0, None, system.y0,
+        stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-8),
+        saveat=dfx.SaveAt(steps=True), max_steps=512,
+    )  # fmt: skip
+    ys = sol.ys[: int(sol.stats["num_accepted_steps"])]
+    assert float(jnp.min(ys)) >= 0
+    weights = np.array([b.weights for b in system.mechanism.balances.values()])
+    np.testing.assert_allclose(ys @ weights.T, (ys @ weights.T)[:1].repeat(len(ys), 0), rtol=4e-15)
+
+
+def test_a_mechanism_whose_balances_have_signs_has_none():
+    mechanism = Mechanism(["A + B -> ", "2 A + 2 B -> "], [1.0, 1.0])
+    assert list(mechanism.balances) == ["-A + B"] or list(mechanism.balances) == ["- A + B"]
+    with pytest.raises(ValueError, match="SimplifiedNewton"):
+        mechanism.positive_projection()

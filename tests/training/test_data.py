@@ -1,0 +1,188 @@
+"""Flow maps from trajectories, and in other coordinates."""
+
+import dataclasses
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import diffrax_conserve as dfc
+from diffrax_conserve.learned._training.data import as_data
+
+from ..learned import EAST, oscillator
+
+KEY = jr.key(5)
+Y0S = 2 * jr.normal(jr.key(1), (40, 2))
+TS = jnp.sort(jr.uniform(jr.key(2), (40, 12)), axis=1) * 3  # unequal steps
+
+
+def rotated(y0, t):
+    c, s = jnp.cos(t), jnp.sin(t)
+    return jnp.stack([c * y0[0] + s * y0[1], c * y0[1] - s * y0[0]])
+
+
+EXACT = jax.vmap(lambda y0, ts: jax.vmap(lambda t: rotated(y0, t))(ts))(Y0S, TS)
+
+
+def network(max_step=0.5, **options):
+    return dfc.DeepONet(
+        Y0S, max_step, width=16, depth=1, core=dfc.learned.Concatenated, key=jr.key(0), **options
+    )
+
+
+def recipe(model, epochs=150, points=60):
+    found = dfc.learned.second_order(model, epochs=epochs)
+    return dataclasses.replace(found, points=points, check_every=10)
+
+
+def error(flow_map, h):
+    y0s = jr.normal(jr.key(9), (50, 2))
+    difference = jax.vmap(flow_map, (0, None))(y0s, h) - jax.vmap(rotated, (0, None))(y0s, h)
+    return float(jnp.max(jnp.abs(difference)))
+
+
+@pytest.mark.parametrize("field", [None, oscillator], ids=["data", "data and defect"])
+def test_a_flow_map_learns_from_trajectories(field):
+    before = network()
+    chosen = recipe(before)
+    after, log = dfc.fit(before, field, data=(TS, EXACT), key=KEY, recipe=chosen)
+    for h in (0.1, 0.5):
+        assert error(after, h) < 5e-3 < error(before, h)
+    assert log.error < 1e-3
+    again, _ = dfc.fit(before, field, data=(TS, EXACT), key=KEY, recipe=chosen)
+    assert eqx.tree_equal(after, again)
+
+
+def test_pairs_are_one_step_apart():
+    """Of all lengths up to the longest, and from the same trajectory."""
+    data = as_data((TS, EXACT), network())
+    pairs = data.draw(3000, KEY)
+    assert float(jnp.min(pairs.hs)) > 0
+    assert 0.45 < float(jnp.max(pairs.hs)) <= 0.5
+    np.testing.assert_allclose(jax.vmap(rotated)(pairs.y0s, pairs.hs), pairs.y1s, atol=1e-13)
+    changes = pairs.y1s - pairs.y0s
+    np.testing.assert_allclose(data.deviation, jnp.sqrt(jnp.mean(changes**2, axis=0)), rtol=0.1)
+
+
+def test_trajectories_are_solutions():
+    ts, ys = dfc.learned.trajectories(oscillator, Y0S[:4], TS[:4], rtol=1e-10)
+    np.testing.assert_array_equal(ts, TS[:4])
+    np.testing.assert_allclose(ys, EXACT[:4], atol=1e-8)
+    ts, ys = dfc.learned.trajectories(
+        lambda t, y, args: y**2, jnp.array([0.5, 2.0]), [0.0, 0.5, 1.0], solver=dfx.Tsit5()
+    )
+    # The other one ends in finite time.
+    np.testing.assert_allclose(ys, [1 / (1 / 0.5 - np.array([0.0, 0.5, 1.0]))], rtol=1e-6)
+    with pytest.raises(ValueError, match="every solve failed"):
+        dfc.learned.trajectories(lambda t, y, args: y**2, jnp.array([2.0]), [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        ((TS[0], EXACT[0]), "leading axes"),
+        ((TS, EXACT[:, :-1]), "leading axes"),
+        ((TS[:, ::-1], EXACT), "must increase"),
+        ((TS, EXACT.at[0, 0].set(jnp.nan)), "be finite"),
+        ((100 * TS[:, ::4], EXACT[:, ::4]), "No two times"),
+    ],
+)
+def test_data_that_make_no_sense(data, match):
+    with pytest.raises(ValueError, match=match):
+        dfc.fit(network(), data=data, key=KEY)
+
+
+def test_what_goes_with_data_and_what_does_not():
+    with pytest.raises(TypeError, match="needs a `vector_field`"):
+        dfc.fit(network(), key=KEY)
+    with pytest.raises(TypeError, match="without `sample`"):
+        dfc.fit(network(), data=(TS, EXACT), sample=lambda key: EAST, key=KEY)
+    pinn = dfc.PINN(EAST, 0.0, 1.0, key=KEY)
+    with pytest.raises(ValueError, match="and `data`"):
+        dfc.fit(pinn, oscillator, data=(TS, EXACT), key=KEY)
+
+
+# ---- Other coordinates ----
+
+TRANSFORMATIONS = {
+    "log": dfc.learned.BoxCox(0.0),
+    "box-cox": dfc.learned.BoxCox(0.1),
+    "scale": dfc.learned.Scale(jnp.array([2.0, 1e-8, 30.0])),
+}
+
+
+def decays(transformation):
+    states = jnp.exp(jr.normal(jr.key(3), (50, 3)) * 3) * jnp.array([1.0, 1e-8, 1.0])
+    inner = dfc.DeepONet(jax.vmap(transformation)(states), 1.0, width=6, depth=1, key=jr.key(0))
+    return dfc.learned.Transformed(inner, transformation), states
+
+
+NETWORKS = {name: decays(t) for name, t in TRANSFORMATIONS.items()}
+
+
+@eqx.filter_jit
+def step(flow_map, y0, h):
+    return flow_map(y0, h)
+
+
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+@given(seed=st.integers(0, 2**31), h=st.floats(0, 1))
+def test_the_initial_state_is_exact_and_nothing_is_negative(name, seed, h):
+    flow_map, _ = NETWORKS[name]
+    y0 = jnp.exp(10 * jr.normal(jr.key(seed), (3,)))
+    np.testing.assert_array_equal(step(flow_map, y0, jnp.zeros(())), y0)
+    if name != "scale":
+        assert bool(jnp.all(step(flow_map, y0, jnp.asarray(h)) >= 0))
+
+
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+def test_a_measured_rate_is_that_of_the_coordinates(name):
+    flow_map, states = NETWORKS[name]
+    rate, y0, eps = jnp.array([0.3, -2e-9, 0.1]), states[0], 1e-5
+    t = TRANSFORMATIONS[name]
+    ahead = (t(y0 + eps * y0 * rate) - t(y0 - eps * y0 * rate)) / (2 * eps)
+    np.testing.assert_allclose(flow_map.measure(y0, y0 * rate), ahead, rtol=1e-5, atol=1e-9)
+    z = t(states[0])
+    np.testing.assert_allclose(t.inverse(z), states[0], rtol=1e-12)
+    assert bool(flow_map.domain.contains(states[0]))
+    assert not bool(flow_map.domain.contains(1e6 * states[0] + 1e6))
+
+
+def test_species_of_all_sizes_are_learned():
+    """A chain of decays over eight orders of magnitude, from data, in Box-Cox coordinates."""
+    mechanism = dfc.systems.Mechanism(["A -> B", "B -> C"], [1.0, 30.0])
+    y0s = jnp.exp(jr.normal(jr.key(0), (60, 3))) * jnp.array([1.0, 1e-8, 1e-4])
+    data = dfc.learned.trajectories(
+        mechanism.vector_field,
+        y0s,
+        jnp.linspace(0, 2, 21),
+        rtol=1e-8,
+        atol=1e-18,
+        solver=dfx.Kvaerno5(),
+    )
+    boxcox = dfc.learned.BoxCox(0.1)
+    inner = dfc.DeepONet(
+        boxcox(data[1].reshape(-1, 3)), 0.2, width=16, depth=1,
+        core=dfc.learned.Concatenated, key=jr.key(1),
+    )  # fmt: skip
+    before = dfc.learned.Transformed(inner, boxcox)
+    after, log = dfc.fit(before, data=data, key=KEY, recipe=recipe(before))
+    y0, y1 = data[1][:, 5], data[1][:, 7]
+    relative = jnp.abs(jax.vmap(after, (0, None))(y0, 0.2) / y1 - 1)
+    assert float(jnp.median(relative)) < 5e-3
+    assert log.best < log.criteria[0] / 100
+    solver = dfc.DeepONetSolver(after, check_field=False)
+    projection = mechanism.positive_projection()
+    projected = dfc.ManifoldProjection(solver, mechanism.manifold, projection=projection)
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(mechanism.vector_field), projected, 0.0, 1.0, 0.2, y0[0],
+        saveat=dfx.SaveAt(steps=True), max_steps=5,
+    )  # fmt: skip
+    assert float(jnp.min(sol.ys)) >= 0
+    np.testing.assert_allclose(jnp.sum(sol.ys, axis=1), jnp.sum(y0[0]), rtol=4e-15)

@@ -1,0 +1,168 @@
+"""A training tells the truth: its error estimate, its warnings, and what it refuses."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import EAST, LORENZ, flow_map, oscillator
+
+KEY = jr.key(5)
+WRONG = "The trained `PINN` is not the solution"
+
+
+def pair_oscillator(t, y, args):
+    """The rotation as two leaves of different units."""
+    return {"q": 1e-3 * y["p"], "p": -1e3 * y["q"]}
+
+
+def pinn(t1=3.0, windows=1, seed=0, **options):
+    sizes = dict(width=12, depth=1, slope=2.0)
+    return dfc.PINN(EAST, 0.0, t1, windows=windows, key=jr.key(seed), **(sizes | options))
+
+
+def recipe(network, epochs=5, **options):
+    found = dfc.learned.second_order(network, epochs=epochs)
+    return dataclasses.replace(found, **(dict(points=40, check_every=5) | options))
+
+
+def true_error(network):
+    ts = jnp.linspace(network.t0, network.t1, 400)
+    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
+    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network))(ts) - exact)))
+
+
+# ---- The estimate is the error ----
+
+
+@pytest.mark.filterwarnings(f"ignore:{WRONG}")
+@pytest.mark.parametrize(("windows", "epochs"), [(1, 3), (1, 12), (3, 3), ([0.3, 2.0], 12)])
+def test_the_estimate_is_the_error(windows, epochs):
+    """From hopeless trainings to good ones, with jumps of the state between windows."""
+    network = pinn(windows=windows)
+    trained, log = dfc.fit(
+        network,
+        oscillator,
+        key=KEY,
+        recipe=recipe(network, epochs, retries=0),
+        manifold=dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)) if windows != 1 else None,
+    )
+    assert trained.edges == network.edges
+    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.02)
+    assert log.errors.shape == (network.windows,)
+
+
+@pytest.mark.filterwarnings(f"ignore:{WRONG}")
+def test_each_leaf_counts_in_its_own_units():
+    y0 = {"q": jnp.array(1e-3), "p": jnp.array(0.0)}
+    network = dfc.PINN(y0, 0.0, 2.0, width=8, depth=1, slope=2.0, key=KEY)
+    chosen = recipe(network, 8, retries=0, loss=lambda q, typical: jnp.mean(q) / typical)
+    trained, log = dfc.fit(network, pair_oscillator, key=KEY, recipe=chosen)
+    ts = jnp.linspace(0, 2, 300)
+    found = jax.vmap(trained)(ts)
+    errors = [
+        jnp.max(jnp.abs(found["q"] - 1e-3 * jnp.cos(ts))) / jnp.max(jnp.abs(found["q"])),
+        jnp.max(jnp.abs(found["p"] + jnp.sin(ts))) / jnp.max(jnp.abs(found["p"])),
+    ]
+    np.testing.assert_allclose(log.error, max(errors), rtol=0.02)
+
+
+def test_the_estimate_of_a_flow_map_is_its_error():
+    network = flow_map(core=dfc.learned.Concatenated)
+    chosen = dataclasses.replace(dfc.learned.second_order(network, epochs=20), points=30)
+    trained, log = dfc.fit(
+        network, LORENZ.vector_field, key=KEY, sample=LORENZ.sample, recipe=chosen
+    )
+    y0s = jax.vmap(LORENZ.sample)(jr.split(KEY, 64))  # those of the estimate
+    exact = jax.vmap(lambda y0: LORENZ.reference(jnp.array([0.25]), y0)[0])(y0s)
+    errors = jax.vmap(trained, (0, None))(y0s, 0.25) - exact
+    expected = jnp.max(jnp.sqrt(jnp.mean(errors**2, axis=0))) / jnp.max(jnp.abs(exact))
+    np.testing.assert_allclose(log.error, expected, rtol=0.3)
+
+
+# ---- Windows that fail ----
+
+
+def test_a_window_that_failed_is_trained_until_it_is_right():
+    """Three turns in one window are too many for so few units."""
+    network = pinn(t1=18.0, width=20)
+    with pytest.warns(UserWarning, match=r"Window 0 of 1, from 0 to 18, has an estimated error"):
+        _, log = dfc.fit(network, oscillator, key=KEY, recipe=recipe(network, 40, retries=0))
+    assert log.error > 1e-2
+    trained, log = dfc.fit(
+        network, oscillator, key=KEY, recipe=recipe(network, 40, points=80), target=1e-5
+    )
+    assert log.ended == "target"
+    assert trained.windows == log.errors.size > 1
+    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.05, atol=1e-12)
+    assert log.error < 1e-5
+
+
+def test_a_cut_network_is_saved_with_its_windows(tmp_path):
+    network = pinn(windows=[0.3, 2.0])
+    dfc.save(tmp_path / "cut.network", network)
+    again = dfc.load(tmp_path / "cut.network")
+    assert again.edges == (0.0, 0.3, 2.0, 3.0)
+    assert eqx.tree_equal(again, network)
+    with pytest.raises(ValueError, match="must increase"):
+        pinn(windows=[2.0, 1.0])
+
+
+def test_a_warning_names_the_window_and_the_error():
+    """The field is steep where no network of this size can follow."""
+
+    def kick(t, y, args):
+        return oscillator(t, y, args) + jnp.exp(-1e6 * (t - 1.7) ** 2) * 500
+
+    network = pinn(windows=3)
+    with pytest.warns(UserWarning, match=rf"{WRONG}: .* Window 1 of 3, from 1 to 2") as caught:
+        _, log = dfc.fit(network, kick, key=KEY, recipe=recipe(network, 20, retries=0))
+    assert f"{log.error:.2g}" in str(caught[0].message)
+
+
+# ---- What is refused ----
+
+
+def nan_somewhere(t, y, args):
+    return jnp.where(y[0] > 1.2, jnp.nan, 1.0) * y
+
+
+@pytest.mark.parametrize(
+    ("network", "field", "match"),
+    [
+        (pinn(), lambda t, y, args: jnp.nan * y, "not finite at 1 of 1 initial states"),
+        (flow_map(), nan_somewhere, r"not finite at \d+ of 30 initial states, for example at"),
+        (flow_map(), lambda t, y, args: jnp.cos(t) * y, "depends on time.*autonomous"),
+        (pinn(), lambda t, y, args: jnp.ones(3), r"returns the structure \(3,\).*has \(2,\)"),
+        (flow_map(), lambda t, y, args: (y, y), "returns the structure"),
+    ],
+)
+def test_a_field_that_cannot_be_learned_is_refused(network, field, match):
+    sample = None if isinstance(network, dfc.PINN) else LORENZ.sample
+    with pytest.raises(ValueError, match=match):
+        dfc.fit(network, field, key=KEY, sample=sample, recipe=recipe(network, points=30))
+
+
+def test_a_training_without_an_update_is_an_error():
+    """The field is finite where it starts, and nowhere else."""
+
+    def trap(t, y, args):
+        return jnp.where(jnp.all(y == EAST), 1.0, jnp.nan) * oscillator(t, y, args)
+
+    network = pinn()
+    chosen = dfc.learned.Recipe(epochs=4, points=10, optimiser=optax.adam(1e-3))
+    with pytest.raises(FloatingPointError, match="None of the 4 updates was finite"):
+        dfc.fit(network, trap, key=KEY, recipe=chosen)
+
+
+@pytest.mark.parametrize("wrong", [dict(target=0.0), dict(seconds=-1.0)])
+def test_limits_that_make_no_sense(wrong):
+    with pytest.raises(ValueError, match="must be positive"):
+        dfc.fit(pinn(), oscillator, key=KEY, **wrong)
