@@ -166,7 +166,7 @@ def fit(
 
 
 def _fit_windows(
-    trainer: Trainer, pinn: PINN, manifold: Manifold, given: FitState | None
+    trainer: Trainer, pinn: PINN, manifold: Manifold | None, given: FitState | None
 ) -> tuple[Any, FitLog]:
     ends = WindowEnds.of(pinn, manifold, trainer.args)
     state = _first(trainer, pinn, given)
