@@ -10,7 +10,7 @@ Say what is conserved, wrap the solver, and leave the rest of `diffrax.diffeqsol
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
 What is conserved    FirstIntegral, Constraint, check_invariance, drift
-Solvers              ManifoldProjection, RK4, Unrolled, statistics
+Solvers              ManifoldProjection, RK4, Unrolled, statistics, fast_cpu
 Projections          SimplifiedNewton (the default), Newton, ClosedForm, project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
@@ -26,6 +26,7 @@ from ._diagnostics import InvarianceEntry as InvarianceEntry
 from ._diagnostics import InvarianceReport as InvarianceReport
 from ._diagnostics import check_invariance as check_invariance
 from ._diagnostics import drift as drift
+from ._fast_cpu import fast_cpu as fast_cpu
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name

@@ -30,6 +30,7 @@ MAY_IMPORT = {
     "_printing": set(),
     "_replace_file": set(),
     "_tree": _TYPES,
+    "_fast_cpu": set(),
     "_manifold": _TREE,
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,

@@ -67,8 +67,8 @@ class Robertson(AbstractChemistry):
     with rates of 0.04, $3 \cdot 10^7$ and $10^4$: stiff by nine orders of magnitude.
 
     **Manifold**: the balance $A + B + C$. **Reference**: numerical, by Kvaerno5 at a tolerance of
-    1e-8, within 1e-9 of the published values, relative to each species. **Samples**: the initial
-    state, with a factor between 1/2 and 2.
+    1e-8; at $t = 40$ within 1e-7 of the published values, relative to each species. **Samples**:
+    the initial state, with a factor between 1/2 and 2.
 
     Source: H. H. Robertson, "The solution of a set of reaction rate equations", in "Numerical
     Analysis: an Introduction" (1966); F. Mazzia and C. Magherini, "Test Set for Initial Value
