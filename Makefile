@@ -60,6 +60,7 @@ test: $(TEST) ## run the tests, without the slow ones
 
 # ---- What a developer runs ----
 
+slow: export XLA_FLAGS ?=
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest -n $(WORKERS) -m slow
 
@@ -88,6 +89,7 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 	$(BIN)/python docs/browser.py site
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
+examples: export XLA_FLAGS ?= --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters
 examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
 	$(BIN)/python -m pytest -n $(WORKERS) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."

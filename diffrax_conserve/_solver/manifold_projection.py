@@ -5,11 +5,8 @@ from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._balance import has_rates
@@ -24,12 +21,7 @@ from .._custom_types import (
     Y,
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
-from .._manifold import (
-    check_manifold,
-    check_outputs,
-    check_values,
-    conserved_values,
-)
+from .._manifold import check_manifold, check_outputs, check_values, conserved_values
 from .._projection import (
     AbstractProjection,
     ProjectionInfo,
@@ -41,6 +33,7 @@ from .._projection import (
     tangential,
 )
 from .._tree import tree_norm, tree_sub, working_dtype
+from .checks import check_nested, check_positive, innermost
 from .count_rejections import FAILED_PROJECTION
 from .failure import failure
 from .initial import FINE, Initial, judge
@@ -128,15 +121,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 f"`solver` is {self.solver!r}, which is not a diffrax solver. Pass an instance, "
                 "for example `ManifoldProjection(diffrax.Tsit5(), manifold)`."
             )
-        _check_nested(self.solver)
+        check_nested(self.solver)
         check_manifold(self.manifold)
         if not isinstance(self.projection, AbstractProjection):
             raise TypeError(
                 f"`projection` is {self.projection!r}, which is not a projection. Pass an "
                 "instance, for example `projection=SimplifiedNewton()`."
             )
-        _check_positive("max_correction", self.max_correction)
-        _check_positive("threshold", self.threshold)
+        check_positive("max_correction", self.max_correction)
+        check_positive("threshold", self.threshold)
         if not isinstance(self.every, int) or self.every < 1:
             raise ValueError(
                 f"`every` is {self.every!r}, but it must be a positive integer: every how many "
@@ -162,15 +155,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
     @property
     def root_finder(self) -> Any:
-        return _innermost(self.solver).root_finder  # pyright: ignore
+        return innermost(self.solver).root_finder  # pyright: ignore
 
     @property
     def root_find_max_steps(self) -> Any:
-        return _innermost(self.solver).root_find_max_steps  # pyright: ignore
+        return innermost(self.solver).root_find_max_steps  # pyright: ignore
 
     @property
     def scan_kind(self) -> Any:
-        return _innermost(self.solver).scan_kind  # pyright: ignore
+        return innermost(self.solver).scan_kind  # pyright: ignore
 
     @property
     def interpolation_cls(self) -> MakeManifoldInterpolation:  # pyright: ignore
@@ -353,33 +346,3 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 the manifold is empty or has more scalar constraints than the state has unknowns, or if the metric
 or a conserved value does not fit.
 """
-
-
-def _check_positive(name: str, option: RealScalarLike | None) -> None:
-    if option is None or isinstance(option, jax.core.Tracer) or not eqx.is_array_like(option):
-        return
-    if not np.all(np.asarray(option) > 0):
-        raise ValueError(f"`{name}` is {option}, but it must be positive, or `None`.")
-
-
-def _check_nested(solver: dfx.AbstractSolver) -> None:
-    inner = _innermost(solver)
-    if (
-        inner is not solver
-        and isinstance(inner, dfx.AbstractImplicitSolver)
-        and not eqx.is_array_like(getattr(inner.root_finder, "rtol", 0.0))
-    ):
-        raise ValueError(
-            f"`ManifoldProjection` is given a {type(solver).__name__} of the implicit solver "
-            f"{type(inner).__name__}, whose root finder takes its tolerances from the step-size "
-            "controller; diffrax hands those through one wrapper only. Give them explicitly, for "
-            f"example `{type(inner).__name__}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
-            "norm=optimistix.max_norm))`."
-        )
-
-
-def _innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    # `HalfSolver` does not forward these itself.
-    while issubclass(type(solver), dfx.AbstractWrappedSolver):
-        solver = solver.solver  # pyright: ignore
-    return solver

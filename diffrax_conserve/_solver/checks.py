@@ -1,0 +1,38 @@
+"""What the arguments of a `ManifoldProjection` must be, and the solver inside others."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax.core
+import numpy as np
+
+from .._custom_types import RealScalarLike
+
+
+def check_positive(name: str, option: RealScalarLike | None) -> None:
+    if option is None or isinstance(option, jax.core.Tracer) or not eqx.is_array_like(option):
+        return
+    if not np.all(np.asarray(option) > 0):
+        raise ValueError(f"`{name}` is {option}, but it must be positive, or `None`.")
+
+
+def check_nested(solver: dfx.AbstractSolver) -> None:
+    inner = innermost(solver)
+    if (
+        inner is not solver
+        and isinstance(inner, dfx.AbstractImplicitSolver)
+        and not eqx.is_array_like(getattr(inner.root_finder, "rtol", 0.0))
+    ):
+        raise ValueError(
+            f"`ManifoldProjection` is given a {type(solver).__name__} of the implicit solver "
+            f"{type(inner).__name__}, whose root finder takes its tolerances from the step-size "
+            "controller; diffrax hands those through one wrapper only. Give them explicitly, for "
+            f"example `{type(inner).__name__}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
+            "norm=optimistix.max_norm))`."
+        )
+
+
+def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
+    # `HalfSolver` does not forward these itself.
+    while issubclass(type(solver), dfx.AbstractWrappedSolver):
+        solver = solver.solver  # pyright: ignore
+    return solver
