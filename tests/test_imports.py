@@ -40,7 +40,7 @@ MAY_IMPORT = {
     "learned": _CORE | {"_replace_file", "systems"},
     "systems": _CORE,
     "testing": _CORE | {"systems"},
-    PACKAGE: _CORE | _GUESTS,
+    PACKAGE: _CORE | _GUESTS | {"_fast_cpu"},
     "reproduce": _CORE | _GUESTS | {PACKAGE},
     "__main__": _CORE | _GUESTS | {"reproduce", PACKAGE},
 }

@@ -202,7 +202,7 @@ def test_a_full_disk(tmp_path, monkeypatch, capsys):
     argv = ["reproduce", "lotka-volterra", "--t1", "0.5", "--out", str(tmp_path / "out")]
     assert main(argv) == 1
     found = capsys.readouterr().err
-    assert found == "error: cannot write metrics.json: No space left on device\n"
+    assert found.endswith("\nerror: cannot write metrics.json: No space left on device\n")
 
 
 @pytest.mark.parametrize("redirection", ["| head -1", "> /dev/full"])

@@ -40,7 +40,7 @@ from .elimination import Vector
 from .iteration import Equations, iterate
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
-from .residual import Tolerance
+from .residual import Tolerance, within
 
 
 @final
@@ -128,14 +128,19 @@ def _project(
     before, jacobian = linearise(inline.residual, inline.candidate)
     gram_solver = jacobian.gram_solver(inline.weights)
     y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
-    at_y, count = jacobian, min(jacobian.inline_steps, max_steps)
+    last, at_y, count = before, jacobian, min(jacobian.inline_steps, max_steps)
     for step in range(count):
         change = gram_solver.solve(g)
         subtract = tree_cancel if step == count - 1 else tree_sub
         y = subtract(y, inline.correction(jacobian, change))
         multiplier = tree_sub(multiplier, change)
+        last = g
         g, at_y = linearise(inline.residual, y)
-    done = inline.safely_satisfied(g, inline.scale(at_y, y))
+    scale = inline.scale(at_y, y)
+    # XLA may compute `y` twice, for `g` and for the result, and round it in two ways. After a large
+    # correction whose terms cancel these would be different states.
+    close = within(last, tree_scale(float(jnp.finfo(working_dtype(y)).eps) ** (1 / 3), scale))
+    done = close & inline.safely_satisfied(g, scale)
     # Few steps need more. These start again: if they shared what is known here, it would be written
     # to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()

@@ -87,6 +87,10 @@ def tangent(
         print(pendulum(0.0, (jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0])), None))
         ```
 
+        ```text
+        (Array([0., 2.], dtype=float32), Array([-4.  , -9.81], dtype=float32))
+        ```
+
     ??? cite "Reference"
 
         E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer

@@ -47,9 +47,13 @@ class Mechanism(eqx.Module):
         import diffrax_conserve as dfc
 
         mechanism = dfc.systems.Mechanism(["NO + O3 -> NO2", "NO2 -> NO + O3"], [26.6, 0.35])
-        print(list(mechanism.manifold))  # ['NO + NO2', 'O3 + NO2']
+        print(list(mechanism.manifold))
         y0 = mechanism.state({"NO": 0.2, "O3": 0.04})
         mechanism.vector_field(0.0, y0, None)
+        ```
+
+        ```text
+        ['O3 + NO2', 'NO + NO2']
         ```
 
     Source: P. Érdi and J. Tóth, "Mathematical Models of Chemical Reactions" (1989).
