@@ -40,7 +40,7 @@ from .elimination import Vector
 from .iteration import Equations, iterate
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
-from .residual import Tolerance, within
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
 @final
@@ -139,7 +139,11 @@ def _project(
     scale = inline.scale(at_y, y)
     # XLA may compute `y` twice, for `g` and for the result, and round it in two ways. After a large
     # correction whose terms cancel these would be different states.
-    close = within(last, tree_scale(float(jnp.finfo(working_dtype(y)).eps) ** (1 / 3), scale))
+    roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
+    small = inline.tolerance(
+        jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
+    )
+    close = within(last, tree_scale(roundoff ** (-2 / 3), small))
     done = close & inline.safely_satisfied(g, scale)
     # Few steps need more. These start again: if they shared what is known here, it would be written
     # to memory at every step of the solve.
