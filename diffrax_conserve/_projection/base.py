@@ -104,6 +104,21 @@ class AbstractProjection(eqx.Module):
         """
 
 
+def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
+    """Raises unless `option` is structured like the state, with scalars or arrays as leaves."""
+    if jtu.tree_structure(option) != jtu.tree_structure(y):
+        raise ValueError(
+            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
+            f"{jtu.tree_structure(y)}. {remedy}"
+        )
+    for given, leaf in zip(jtu.tree_leaves(option), jtu.tree_leaves(y), strict=True):
+        if jnp.shape(given) not in ((), jnp.shape(leaf)):
+            raise ValueError(
+                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
+                f"{jnp.shape(leaf)}. Give a scalar or an array of the same shape."
+            )
+
+
 # The options that the Newton iterations share.
 NEWTON_OPTIONS = r"""**Arguments:**
 

@@ -30,7 +30,7 @@ from .._tree import (
     tree_tangents,
     working_dtype,
 )
-from .base import Outcome, ProjectionInfo, report
+from .base import Outcome, ProjectionInfo, check_like, report
 from .certainty import certain
 from .elimination import Vector
 from .implicit import solve_linearised
@@ -79,18 +79,8 @@ def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, y: Y) -> 
     single = bound is None or jtu.treedef_is_leaf(jtu.tree_structure(bound))
     if single and jnp.ndim(leaves[0]) == 0:
         return jtu.tree_map(lambda x: jnp.full_like(x, leaves[0]), y)
-    if jtu.tree_structure(bound) != jtu.tree_structure(y):
-        raise ValueError(
-            f"`{name}` has the structure {jtu.tree_structure(bound)}, but the state has "
-            f"{jtu.tree_structure(y)}. Give one number, or one bound (or an array) for each leaf "
-            "of the state."
-        )
-    for a, x in zip(jtu.tree_leaves(bound), jtu.tree_leaves(y), strict=True):
-        if jnp.shape(a) not in ((), jnp.shape(x)):
-            raise ValueError(
-                f"`{name}` has a leaf of shape {jnp.shape(a)} for a leaf of the state of shape "
-                f"{jnp.shape(x)}. Give a scalar or an array of the same shape."
-            )
+    remedy = "Give one number, or one bound (or an array) for each leaf of the state."
+    check_like(name, bound, y, remedy)
     return jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, y)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import tree_cancel, tree_mul, tree_scale, tree_sub
+from .base import Problem
 from .elimination import Vector
 from .jacobian import AbstractJacobian
 from .linearise import Elements, Joined, linearise
@@ -29,6 +30,17 @@ class Equations(eqx.Module):
     weights: Y
     magnitude: Vector
     tolerance: Tolerance
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        candidate: Y,
+        rtol: float | Array | None,
+        atol: float | Array | None,
+    ) -> "Equations":
+        tolerance = Tolerance(rtol, atol)
+        return cls(problem.residual, candidate, problem.weights, problem.magnitude, tolerance)
 
     def correction(self, jacobian: AbstractJacobian, multiplier: Vector) -> Y:
         """`M⁻¹ Gᵀ λ`."""

@@ -36,7 +36,7 @@ from .elimination import Vector
 from .implicit import SYSTEM_DENSE_MAX, solve_linearised
 from .iteration import Equations, iterate
 from .linearise import Residual, linearise
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
+from .residual import ROUNDOFF_MULTIPLE, within
 
 
 @final
@@ -100,13 +100,7 @@ class Newton(AbstractProjection):
                 "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
                 "pass `projection=SimplifiedNewton()`."
             )
-        equations = Equations(
-            problem.residual,
-            candidate,
-            problem.weights,
-            problem.magnitude,
-            Tolerance(self.rtol, self.atol),
-        )
+        equations = Equations.of(problem, candidate, self.rtol, self.atol)
         box = box_of(self.lower, self.upper, candidate)
         if box is not None:
             y, _, info = project_into(equations, box, frozen=False, max_steps=self.max_steps)

@@ -15,7 +15,7 @@ from .._manifold import (
     is_entry,
 )
 from .._tree import tree_mul, tree_sub
-from .base import AbstractProjection, Problem, ProjectionInfo
+from .base import AbstractProjection, Problem, ProjectionInfo, check_like
 from .linearise import linearise
 from .newton import Newton
 from .residual import largest, measure, relative, residual_of
@@ -161,18 +161,8 @@ def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
     """Raises unless `metric` is structured like the state."""
     if metric is None:
         return
-    if jtu.tree_structure(metric) != jtu.tree_structure(y):
-        raise ValueError(
-            f"`metric` has the structure {jtu.tree_structure(metric)}, but the state has "
-            f"{jtu.tree_structure(y)}. Give one weight (or an array of weights) for each leaf of "
-            "the state."
-        )
-    for weight, leaf in zip(jtu.tree_leaves(metric), jtu.tree_leaves(y), strict=True):
-        if jnp.shape(weight) not in ((), jnp.shape(leaf)):
-            raise ValueError(
-                f"`metric` has a leaf of shape {jnp.shape(weight)} for a leaf of the state of "
-                f"shape {jnp.shape(leaf)}. Give a scalar or an array of the same shape."
-            )
+    remedy = "Give one weight (or an array of weights) for each leaf of the state."
+    check_like("metric", metric, y, remedy)
 
 
 def inverse_metric(metric: PyTree[ArrayLike] | None, y: Y) -> Y:

@@ -40,7 +40,7 @@ from .elimination import Vector
 from .iteration import Equations, iterate
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
+from .residual import ROUNDOFF_MULTIPLE, within
 
 
 @final
@@ -93,13 +93,7 @@ class SimplifiedNewton(AbstractProjection):
         check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        equations = Equations(
-            problem.residual,
-            candidate,
-            problem.weights,
-            problem.magnitude,
-            Tolerance(self.rtol, self.atol),
-        )
+        equations = Equations.of(problem, candidate, self.rtol, self.atol)
         box = box_of(self.lower, self.upper, candidate)
         if box is not None:
             y, _, info = project_into(equations, box, frozen=True, max_steps=self.max_steps)
