@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow soak mutants lint format types docs examples bench bench-smoke bench-learned build clean distclean
+.PHONY: help demo test slow soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -94,28 +94,29 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	$(BIN)/python -m pytest -n $(WORKERS) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
+COSTS := overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
+  random_features
+TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures pollu
+STUDIES := first_same_as_last max_correction project_error claims
+
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
-	$(BIN)/python benchmarks/overhead.py
-	XLA_FLAGS= $(BIN)/python benchmarks/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
-	$(BIN)/python benchmarks/gradients.py
-	$(BIN)/python benchmarks/work_precision.py
-	$(BIN)/python benchmarks/scaling.py
-	$(BIN)/python benchmarks/unlike_lanes.py
-	$(BIN)/python benchmarks/devices.py
-	$(BIN)/python benchmarks/balance.py
-	$(BIN)/python benchmarks/report.py --write
+	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
+	XLA_FLAGS= $(BIN)/python benchmarks/cost/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
+	$(BIN)/python benchmarks/cost/report.py --write
+
+bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and judge them: many hours
+	set -e; for name in $(TRAININGS); do $(BIN)/python benchmarks/learned/$$name.py; done
+
+bench-studies: $(TEST) ## measure what options and claims of the pages rest on
+	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # At toy sizes nearly all of it is compilation, which takes half as long with XLA's older emitters.
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
-bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs
-	printf '%s\n' overhead gradients work_precision scaling random_features devices unlike_lanes balance \
+bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the tests run those of learned/
+	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
+	  learned/silent_failures learned/pollu learned/equal_cost \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
-	$(BIN)/python benchmarks/report.py
-
-bench-learned: $(PLOTS) ## measure what learned solvers cost
-	$(BIN)/python benchmarks/learned.py
-	$(BIN)/python benchmarks/sweeps.py
-	$(BIN)/python benchmarks/random_features.py
+	$(BIN)/python benchmarks/cost/report.py
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.
 build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own

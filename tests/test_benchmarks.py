@@ -19,9 +19,10 @@ FOLDER = Path(__file__).parent.parent / "benchmarks"
 
 def benchmark(name):
     """The benchmark as a module, loaded by its path; it finds its neighbours as a script does."""
-    if str(FOLDER) not in sys.path:
-        sys.path.append(str(FOLDER))
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    (file,) = FOLDER.glob(f"*/{name}.py")
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    spec = importlib.util.spec_from_file_location(name, file)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
@@ -259,7 +260,7 @@ def test_the_figures_show_every_curve(tmp_path):
 
 
 def test_a_smoke_run_of_the_cost_of_learning(capsys):
-    found = benchmark("learned").main(["--smoke"])
+    found = benchmark("learned_solvers").main(["--smoke"])
     assert found["epochs"]["rigid-body"]["ratio"] > 0
     assert found["solves"]["ratio"] > 0
     assert "| `rigid-body` |" in capsys.readouterr().out

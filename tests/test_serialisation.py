@@ -246,7 +246,7 @@ def test_every_pretrained_network(name, kind):
     system = dfc.systems.get(info["system"])
     assert file.stat().st_size < 150_000
     assert (network.layer is not None) == (kind == "conservative")
-    assert info["command"].startswith("python benchmarks/paper.py")
+    assert info["command"].startswith("python benchmarks/learned/paper.py")
     assert info["errors"]["plain"]["largest_state_error"] > 0
     assert len(info["history"]["epochs"]) == len(info["history"]["losses"])
     # It is the network whose error is noted.
@@ -268,7 +268,7 @@ def test_every_network_of_the_zoo(name):
     info = dfc.learned.read_info(file)["info"]
     system = dfc.systems.get(name)
     assert file.stat().st_size < 60_000
-    assert info["command"].startswith("python benchmarks/zoo.py")
+    assert info["command"].startswith("python benchmarks/learned/zoo.py")
     if isinstance(network, dfc.PINN):
         ts = jnp.linspace(0, system.t1, 20)
         error = jnp.linalg.norm(jax.vmap(network)(ts) - system.reference(ts), axis=1)

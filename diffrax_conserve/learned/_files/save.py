@@ -153,7 +153,7 @@ def read_info(path: PathLike) -> dict[str, Any]:
         ```
 
         ```text
-        python benchmarks/paper.py --system rigid-body --seed 0 --ship
+        python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship
         ```
     """
     header, _ = _read(path)

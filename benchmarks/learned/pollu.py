@@ -1,7 +1,7 @@
 """A flow map of POLLU from data: its error, its balances and signs, and what a step costs.
 
-    python benchmarks/pollu.py            # some minutes: writes results/pollu.json
-    python benchmarks/pollu.py --smoke    # toy sizes, to see that it runs
+    python benchmarks/learned/pollu.py            # some minutes: writes results/pollu.json
+    python benchmarks/learned/pollu.py --smoke    # toy sizes, to see that it runs
 
 Steps of up to two minutes, learned in Box-Cox coordinates from solves by Kvaerno5 that start from
 the published state with factors between 1/2 and 2; projected so that no concentration is negative.
@@ -22,7 +22,7 @@ import optax
 import diffrax_conserve as dfc
 
 jax.config.update("jax_enable_x64", True)
-OUT = Path(__file__).parent / "results" / "pollu.json"
+OUT = Path(__file__).parent.parent / "results" / "pollu.json"
 SYSTEM = dfc.systems.get("pollu")
 STEP, FIRST = 2.0, 0.05
 BOXCOX = dfc.learned.BoxCox(0.1)

@@ -3,7 +3,7 @@
 Each core of the machine is made a device of JAX. Prints, for plain and projected RK4, the time of
 each way relative to automatic sharding, and how many all-reduces its compiled program has. Times
 are seconds of the clock, the best of several rounds in turns; so only ratios inside one run mean
-something, and the machine should do nothing else. Run: `python benchmarks/devices.py`.
+something, and the machine should do nothing else. Run: `python benchmarks/cost/devices.py`.
 """
 
 import argparse

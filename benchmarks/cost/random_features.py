@@ -1,7 +1,7 @@
 """`RandomFeatureSolver`: how accurate and how fast, against the solvers of diffrax.
 
-    python benchmarks/random_features.py           # writes benchmarks/results/random_features.json
-    python benchmarks/random_features.py --smoke   # one tolerance, short solves, nothing is written
+    python benchmarks/cost/random_features.py           # writes benchmarks/results/random_features.json
+    python benchmarks/cost/random_features.py --smoke   # one tolerance, short solves, nothing is written
 
 Errors are against closed forms where there are some, else against Dopri8 or, for stiff problems,
 Kvaerno5 at tolerances near roundoff. Times are seconds of CPU of one compiled solve, the best of
@@ -27,7 +27,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve.learned._solvers.feature_basis import feature_basis, tabulate
 from diffrax_conserve.learned._solvers.galerkin import StepEquations, flatten, solve
 
-OUT = Path(__file__).parent / "results" / "random_features.json"
+OUT = Path(__file__).parent.parent / "results" / "random_features.json"
 
 
 class Problem(NamedTuple):

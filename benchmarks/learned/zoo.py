@@ -1,9 +1,9 @@
 """The best small networks: trains them by second-order methods, judges them, and ships them.
 
-    python benchmarks/zoo.py                              # five systems, three seeds: an hour
-    python benchmarks/zoo.py --system rigid-body --seed 0 --ship   # and ship this network
-    python benchmarks/zoo.py --table                      # only print the table of the results
-    python benchmarks/zoo.py --smoke                      # toy sizes, to see that it runs
+    python benchmarks/learned/zoo.py                              # five systems, three seeds: an hour
+    python benchmarks/learned/zoo.py --system rigid-body --seed 0 --ship   # and ship this network
+    python benchmarks/learned/zoo.py --table                      # only print the table of the results
+    python benchmarks/learned/zoo.py --smoke                      # toy sizes, to see that it runs
 
 One JSON file for each system and seed goes to `benchmarks/results/zoo/`.
 """
@@ -32,7 +32,7 @@ import trained
 
 import diffrax_conserve as dfc
 
-ROOT = Path(__file__).parent
+ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results" / "zoo"
 SHIPPED = ROOT.parent / "diffrax_conserve" / "pretrained"
 INITIAL_STATES = 100
@@ -366,7 +366,7 @@ def ship(network, record):
     domain = "the initial state" if spec.windows else "states along solutions"
     info = {
         **record,
-        "command": f"python benchmarks/zoo.py --system {record['system']} "
+        "command": f"python benchmarks/learned/zoo.py --system {record['system']} "
         f"--seed {record['seed']} --ship",
         "recipe": "second_order",
         "domain": domain,

@@ -205,7 +205,7 @@ def main(argv=None):
     times, cases = pendulums(options.smoke)
     drawn = figure(times, cases)
     if not options.smoke:
-        figures.save(drawn, measuring.HERE.parent / "docs" / "images" / "balance-laws.png")
+        figures.save(drawn, measuring.HERE.parent.parent / "docs" / "images" / "balance-laws.png")
     cases = {
         name: {key: {k: v for k, v in row.items() if k != "curve"} for key, row in rows.items()}
         for name, rows in cases.items()

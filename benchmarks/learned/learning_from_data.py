@@ -1,7 +1,7 @@
 """Vector fields and integrals that are learned from trajectories, projected and not.
 
-    python benchmarks/learning_from_data.py           # writes results/learning_from_data.json
-    python benchmarks/learning_from_data.py --smoke   # toy sizes; a minute of compilation
+    python benchmarks/learned/learning_from_data.py           # writes results/learning_from_data.json
+    python benchmarks/learned/learning_from_data.py --smoke   # toy sizes; a minute of compilation
 
 Known integrals, the rigid body: a neural vector field is fitted to short pieces of trajectories,
 exact or with noise, through plain solves and through projected ones. Unknown integral, the
@@ -29,7 +29,7 @@ import optax
 
 import diffrax_conserve as dfc
 
-OUT = Path(__file__).parent / "results" / "learning_from_data.json"
+OUT = Path(__file__).parent.parent / "results" / "learning_from_data.json"
 # With moments five times the paper's, so that it turns by less than one radian between two data.
 BODY = dfc.systems.RigidBody(inertia=(0.5, 1.0, 1.5))
 PREY = dfc.systems.get("lotka-volterra")

@@ -1,7 +1,7 @@
 """What learned solvers cost: a training epoch, and a solve against the bare network.
 
-    python benchmarks/learned.py           # writes benchmarks/results/learned.json, prints tables
-    python benchmarks/learned.py --smoke   # toy sizes, to see that it runs
+    python benchmarks/cost/learned_solvers.py           # writes benchmarks/results/learned_solvers.json, prints tables
+    python benchmarks/cost/learned_solvers.py --smoke   # toy sizes, to see that it runs
 
 An epoch is one value and gradient of the loss, at the sizes of the paper's recipe; that of the
 conservative network with all iterations of its layer, which is the most a schedule asks for.
@@ -22,7 +22,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve.learned._training.defect import defects, squared_norms, trainable
 from diffrax_conserve.reproduce._trained import KINDS, build, is_flow_map, is_learned
 
-OUT = Path(__file__).parent / "results" / "learned.json"
+OUT = Path(__file__).parent.parent / "results" / "learned_solvers.json"
 SYSTEMS = [name for name in dfc.systems.names() if is_learned(dfc.systems.get(name))]
 
 

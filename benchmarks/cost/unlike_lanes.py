@@ -1,7 +1,7 @@
 """What a batch costs whose lanes need different numbers of iterations.
 
 The time of a step and trajectory of projected RK4, beside that of the batch in which no lane needs
-more than the two iterations that every projection makes. `python benchmarks/unlike_lanes.py`.
+more than the two iterations that every projection makes. `python benchmarks/cost/unlike_lanes.py`.
 """
 
 import measuring  # isort: skip  (it sets XLA's options)

@@ -1,9 +1,9 @@
 """The paper's recipe, measured: trains its networks, judges them, and writes what it found.
 
-    python benchmarks/paper.py                              # five systems, three seeds: hours
-    python benchmarks/paper.py --system rigid-body --seed 0
-    python benchmarks/paper.py --system rigid-body --seed 0 --ship   # and ship these networks
-    python benchmarks/paper.py --smoke                      # toy sizes, to see that it runs
+    python benchmarks/learned/paper.py                              # five systems, three seeds: hours
+    python benchmarks/learned/paper.py --system rigid-body --seed 0
+    python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship   # and ship these networks
+    python benchmarks/learned/paper.py --smoke                      # toy sizes, to see that it runs
 
 One JSON file for each system, kind of network and seed goes to `benchmarks/results/paper/`.
 `--ship` writes the networks themselves into the package, with weights rounded to single precision:
@@ -26,7 +26,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve import reproduce as _reproduce
 from diffrax_conserve.reproduce._trained import KINDS, is_flow_map, is_learned
 
-ROOT = Path(__file__).parent
+ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results" / "paper"
 SHIPPED = ROOT.parent / "diffrax_conserve" / "pretrained"
 SYSTEMS = [name for name in dfc.systems.names() if is_learned(dfc.systems.get(name))]
@@ -119,7 +119,7 @@ def record(system, kind, seed, epochs, network, log, ship, out=RESULTS):
     if ship:
         info = {
             **result,
-            "command": f"python benchmarks/paper.py --system {system.name} --seed {seed} --ship"
+            "command": f"python benchmarks/learned/paper.py --system {system.name} --seed {seed} --ship"
             + ("" if epochs == 5000 else f" --epochs {epochs}"),
             "recipe": "paper",
             "horizon": system.t1,

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import figures
 import measuring
 
-ROOT = measuring.HERE.parent
+ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
     DOCS / "performance.md",
     DOCS / "appendix" / "performance.md",
-    measuring.HERE / "README.md",
+    measuring.RESULTS.parent / "README.md",
 ]
 UNROLLED = ", unrolled"
 NAMES = ("overhead", "gradients", "work_precision", "scaling")

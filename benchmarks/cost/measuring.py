@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import jax.random as jr
 
 HERE = Path(__file__).parent
-RESULTS = HERE / "results"
+RESULTS = HERE.parent / "results"
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "diffrax-conserve")
 
 _Name = TypeVar("_Name", bound=Hashable)
