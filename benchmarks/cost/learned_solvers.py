@@ -1,7 +1,7 @@
 """What learned solvers cost: a training epoch, and a solve against the bare network.
 
-    python benchmarks/cost/learned_solvers.py           # writes benchmarks/results/learned_solvers.json, prints tables
-    python benchmarks/cost/learned_solvers.py --smoke   # toy sizes, to see that it runs
+    python benchmarks/cost/learned_solvers.py  # writes its results, prints tables
+    python benchmarks/cost/learned_solvers.py --smoke  # toy sizes, to see that it runs
 
 An epoch is one value and gradient of the loss, at the sizes of the paper's recipe; that of the
 conservative network with all iterations of its layer, which is the most a schedule asks for.

@@ -1,7 +1,7 @@
 """`RandomFeatureSolver`: how accurate and how fast, against the solvers of diffrax.
 
-    python benchmarks/cost/random_features.py           # writes benchmarks/results/random_features.json
-    python benchmarks/cost/random_features.py --smoke   # one tolerance, short solves, nothing is written
+    python benchmarks/cost/random_features.py  # writes benchmarks/results/random_features.json
+    python benchmarks/cost/random_features.py --smoke  # one tolerance, nothing is written
 
 Errors are against closed forms where there are some, else against Dopri8 or, for stiff problems,
 Kvaerno5 at tolerances near roundoff. Times are seconds of CPU of one compiled solve, the best of

@@ -1,8 +1,8 @@
 """Correction sweeps and error estimates of learned flow maps, against classical methods.
 
-    python benchmarks/cost/sweeps.py             # the shipped networks; writes results/sweeps.json
-    python benchmarks/cost/sweeps.py NAME ...    # these shipped networks
-    python benchmarks/cost/sweeps.py --smoke     # toy sizes, to see that it runs
+    python benchmarks/cost/sweeps.py           # the shipped networks; writes results/sweeps.json
+    python benchmarks/cost/sweeps.py NAME ...  # these shipped networks
+    python benchmarks/cost/sweeps.py --smoke   # toy sizes, to see that it runs
 
 The error is that of one step of the flow map's longest length, from random states of the domain,
 against a solve at tolerance 1e-13: the median of the Euclidean norms. The cost is that of a

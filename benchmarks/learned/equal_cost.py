@@ -1,10 +1,10 @@
 """What a learned flow map is worth: its errors against those of classical methods of equal cost.
 
-    python benchmarks/learned/equal_cost.py                  # all systems; writes results/equal_cost.json
+    python benchmarks/learned/equal_cost.py  # all systems; writes results/equal_cost.json
     python benchmarks/learned/equal_cost.py --system double-pendulum
-    python benchmarks/learned/equal_cost.py --system double-pendulum --network FILE   # not the shipped one
-    python benchmarks/learned/equal_cost.py --table          # only print the tables of the results
-    python benchmarks/learned/equal_cost.py --smoke          # toy sizes, to see that it runs
+    python benchmarks/learned/equal_cost.py --system double-pendulum --network FILE  # another
+    python benchmarks/learned/equal_cost.py --table  # only print the tables of the results
+    python benchmarks/learned/equal_cost.py --smoke  # toy sizes, to see that it runs
 
 Every method is solved from the same 100 initial states over the system's horizon. Its error is the
 largest Euclidean distance from the reference over the system's steps; median, root mean square and

@@ -1,7 +1,7 @@
 """Vector fields and integrals that are learned from trajectories, projected and not.
 
-    python benchmarks/learned/learning_from_data.py           # writes results/learning_from_data.json
-    python benchmarks/learned/learning_from_data.py --smoke   # toy sizes; a minute of compilation
+    python benchmarks/learned/learning_from_data.py  # writes results/learning_from_data.json
+    python benchmarks/learned/learning_from_data.py --smoke  # toy sizes; a minute of compilation
 
 Known integrals, the rigid body: a neural vector field is fitted to short pieces of trajectories,
 exact or with noise, through plain solves and through projected ones. Unknown integral, the

@@ -1,9 +1,9 @@
 """The paper's recipe, measured: trains its networks, judges them, and writes what it found.
 
-    python benchmarks/learned/paper.py                              # five systems, three seeds: hours
+    python benchmarks/learned/paper.py  # five systems, three seeds: hours
     python benchmarks/learned/paper.py --system rigid-body --seed 0
-    python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship   # and ship these networks
-    python benchmarks/learned/paper.py --smoke                      # toy sizes, to see that it runs
+    python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship  # and ship
+    python benchmarks/learned/paper.py --smoke  # toy sizes, to see that it runs
 
 One JSON file for each system, kind of network and seed goes to `benchmarks/results/paper/`.
 `--ship` writes the networks themselves into the package, with weights rounded to single precision:
@@ -119,7 +119,8 @@ def record(system, kind, seed, epochs, network, log, ship, out=RESULTS):
     if ship:
         info = {
             **result,
-            "command": f"python benchmarks/learned/paper.py --system {system.name} --seed {seed} --ship"
+            "command": "python benchmarks/learned/paper.py "
+            f"--system {system.name} --seed {seed} --ship"
             + ("" if epochs == 5000 else f" --epochs {epochs}"),
             "recipe": "paper",
             "horizon": system.t1,

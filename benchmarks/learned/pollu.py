@@ -1,7 +1,7 @@
 """A flow map of POLLU from data: its error, its balances and signs, and what a step costs.
 
-    python benchmarks/learned/pollu.py            # some minutes: writes results/pollu.json
-    python benchmarks/learned/pollu.py --smoke    # toy sizes, to see that it runs
+    python benchmarks/learned/pollu.py          # some minutes: writes results/pollu.json
+    python benchmarks/learned/pollu.py --smoke  # toy sizes, to see that it runs
 
 Steps of up to two minutes, learned in Box-Cox coordinates from solves by Kvaerno5 that start from
 the published state with factors between 1/2 and 2; projected so that no concentration is negative.

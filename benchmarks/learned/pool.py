@@ -1,8 +1,8 @@
 """Where a flow map is trained: where solves start, where the network goes, where solutions go.
 
-    python benchmarks/learned/pool.py            # two systems, three seeds: writes results/pool.json
-    python benchmarks/learned/pool.py --table    # only print the table of the results
-    python benchmarks/learned/pool.py --smoke    # toy sizes, to see that it runs
+    python benchmarks/learned/pool.py          # two systems, three seeds: writes results/pool.json
+    python benchmarks/learned/pool.py --table  # only print the table of the results
+    python benchmarks/learned/pool.py --smoke  # toy sizes, to see that it runs
 
 The networks are those of the zoo, trained for fewer epochs and without its last updates.
 """

@@ -1,9 +1,9 @@
 """How often a PINN is wrong, and whether it says so: four oscillators over three periods.
 
-    python benchmarks/learned/silent_failures.py             # 25 seeds: writes results/silent_failures.json
-    python benchmarks/learned/silent_failures.py --seeds 5   # fewer
-    python benchmarks/learned/silent_failures.py --table     # only print the table of the results
-    python benchmarks/learned/silent_failures.py --smoke     # one seed of one system, few epochs
+    python benchmarks/learned/silent_failures.py  # 25 seeds: writes results/silent_failures.json
+    python benchmarks/learned/silent_failures.py --seeds 5  # fewer
+    python benchmarks/learned/silent_failures.py --table  # only print the table of the results
+    python benchmarks/learned/silent_failures.py --smoke  # one seed of one system, few epochs
 
 Twelve windows of thirty units, trained with `target=1e-8`. A silent failure is an error above 1e-4,
 relative to the largest component, without a warning. The reference is Dopri8 at 1e-13.

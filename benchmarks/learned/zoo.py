@@ -1,9 +1,9 @@
 """The best small networks: trains them by second-order methods, judges them, and ships them.
 
-    python benchmarks/learned/zoo.py                              # five systems, three seeds: an hour
-    python benchmarks/learned/zoo.py --system rigid-body --seed 0 --ship   # and ship this network
-    python benchmarks/learned/zoo.py --table                      # only print the table of the results
-    python benchmarks/learned/zoo.py --smoke                      # toy sizes, to see that it runs
+    python benchmarks/learned/zoo.py  # five systems, three seeds: an hour
+    python benchmarks/learned/zoo.py --system rigid-body --seed 0 --ship  # and ship this network
+    python benchmarks/learned/zoo.py --table  # only print the table of the results
+    python benchmarks/learned/zoo.py --smoke  # toy sizes, to see that it runs
 
 One JSON file for each system and seed goes to `benchmarks/results/zoo/`.
 """

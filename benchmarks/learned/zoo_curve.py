@@ -1,9 +1,9 @@
 """The error of the zoo's flow maps against the length of their training.
 
-    python benchmarks/learned/zoo_curve.py            # trains with fewer epochs: ten minutes
-    python benchmarks/learned/zoo_curve.py --table    # only print the table of the results
+    python benchmarks/learned/zoo_curve.py          # trains with fewer epochs: ten minutes
+    python benchmarks/learned/zoo_curve.py --table  # only print the table of the results
     python benchmarks/learned/zoo_curve.py --figure docs/images/zoo-training.svg
-    python benchmarks/learned/zoo_curve.py --smoke    # toy sizes, to see that it runs
+    python benchmarks/learned/zoo_curve.py --smoke  # toy sizes, to see that it runs
 
 The last point of each curve is the network of the zoo with the same seed. One JSON file for each
 system goes to `benchmarks/results/zoo-curve/`.

@@ -1,6 +1,6 @@
 """What the paper says of its figures, measured on the networks of its recipe.
 
-    python benchmarks/studies/claims.py      # the shipped networks; prints a few numbers for each claim
+    python benchmarks/studies/claims.py  # the shipped networks; prints a few numbers for each claim
 
 Its claims are about one solution of each system: here that from the catalogue's initial state.
 """

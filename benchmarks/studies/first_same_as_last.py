@@ -2,8 +2,8 @@
 
 Prints the largest state error at the final time for the plain solver, the projected one (which
 reuses the last stage, evaluated at the candidate), and the projected one with the first stage
-evaluated again at the projected state. Run: `python benchmarks/studies/first_same_as_last.py`, with `--smoke`
-for one row.
+evaluated again at the projected state. Run: `python benchmarks/studies/first_same_as_last.py`,
+with `--smoke` for one row.
 """
 
 import sys
