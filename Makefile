@@ -114,7 +114,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/silent_failures learned/pollu learned/equal_cost \
+	  learned/pollu learned/equal_cost \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 

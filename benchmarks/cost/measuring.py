@@ -23,7 +23,7 @@ from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # not in a test
+if Path(__file__).resolve().parents[1] in Path(sys.argv[0]).resolve().parents:  # not in a test
     # What the documentation recommends for single trajectories: XLA compiles the loop over the
     # steps into one kernel if a step accesses less than this, by default 1 kB. An `XLA_FLAGS` that
     # is set, and be it to nothing, stays.

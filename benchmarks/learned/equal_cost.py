@@ -26,12 +26,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import measuring
 import numpy as np
 import trained
 from zoo import apart
 
 import diffrax_conserve as dfc
+
+sys.path.append(str(Path(__file__).parent.parent / "cost"))
+import measuring
 
 RESULTS = Path(__file__).parent.parent / "results" / "equal-cost"
 SEPARATION = 0.2  # of the vortices, as in their training
