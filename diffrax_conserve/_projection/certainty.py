@@ -25,6 +25,8 @@ _SMALL_ANGLE, _SHORT_CORRECTION = 1e-2, 1e-5
 def certain(equations: Equations, y: Y, jacobian: AbstractJacobian) -> Float[Array, ""]:
     """One if the derivative of the projected state `y` is well determined, otherwise NaN."""
     dtype = working_dtype(y)
+    if equations.magnitude.size == 1:  # parallel to nothing
+        return jnp.ones((), dtype)
     eps = float(jnp.finfo(dtype).eps)
     sines = jacobian.sines(equations.weights)
     if sines is None:

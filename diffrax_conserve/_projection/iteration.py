@@ -1,5 +1,6 @@
 """Newton's iteration for the multipliers, the one loop of every iterative projection."""
 
+import functools as ft
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,12 +15,14 @@ from .base import Problem
 from .elimination import Vector
 from .jacobian import AbstractJacobian
 from .linearise import Elements, Joined, linearise
-from .residual import Tolerance, relative, within
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, relative, within
 
 # An iteration ends at this part of the tolerance, or where it no longer halves the residual.
 SAFELY = 0.25
 # Where a step with this much damping does not reduce the residual, none will.
 _MOST_DAMPING = 1e8
+# A start is taken whose squared residual is this part of the candidate's, or less.
+_WELL_STARTED = 1e-4
 
 
 class Equations(eqx.Module):
@@ -50,6 +53,18 @@ class Equations(eqx.Module):
         """What roundoff in the residual is relative to, at `y`, whose Jacobian is given."""
         return jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
 
+    def merit(self, g: Vector, scale: Vector) -> Array:
+        """The sum of squares of the residuals, relative to their scales and to what `atol` says is
+        small."""
+        atol = 0.0 if self.tolerance.atol is None else self.tolerance.atol
+
+        def square(g: Array, scale: Array) -> Array:
+            roundoff = ROUNDOFF_MULTIPLE * jnp.finfo(scale.dtype).eps
+            size = scale + jnp.asarray(atol, scale.dtype) / roundoff
+            return jnp.sum(jnp.square(relative(g, size)))
+
+        return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(square, g, scale)))
+
     def safely_satisfied(self, g: Vector, scale: Vector) -> Bool[Array, ""]:
         return within(g, tree_scale(SAFELY, self.tolerance(scale)))
 
@@ -74,10 +89,25 @@ class _Carry(NamedTuple):
     best: Iterate
 
 
+class Start(NamedTuple):
+    """The state and multipliers after `num_steps` steps, which are those of the candidate after
+    none."""
+
+    y: Y
+    multiplier: Vector
+    num_steps: Int[Array, ""]
+
+
 def iterate(
-    equations: Equations, *, frozen: bool, max_steps: int, enabled: Bool[Array, ""] | bool = True
+    equations: Equations,
+    *,
+    frozen: bool,
+    max_steps: int,
+    start: Start | None = None,
+    enabled: Bool[Array, ""] | bool = True,
 ) -> tuple[Vector, Iterate]:
-    r"""Newton's method from the candidate: the residual there, and where it ends.
+    r"""Newton's method from the candidate, or from a `start`: the residual at the candidate, and
+    where the iteration ends.
 
     Each step solves $(G(y) M^{-1} B^\top + D)\, \Delta = g(y)$ and moves $y$ by
     $-M^{-1} B^\top \Delta$. With `frozen`, $B$ is the Jacobian at the candidate, so that the
@@ -86,7 +116,8 @@ def iterate(
     the relative residual: it passes near points where gradients are parallel, and convergence is
     quadratic elsewhere. From a state whose residual is larger than the last one the iteration goes
     back, and takes that step again with ten times the $\mu$, as in the method of Levenberg and
-    Marquardt.
+    Marquardt. From a `start` whose residual is not a hundredth of the candidate's it goes back to
+    the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
     first = equations.scale(at_candidate, equations.candidate)
@@ -97,8 +128,8 @@ def iterate(
         _, returned, damping, last, y, multiplier, best = carry
         g, jacobian = linearise(equations.residual, y)
         scale = equations.scale(jacobian, y)
-        merit = _squares(g, scale)
-        better = (_squares(g, best.scale) < last) & (merit < jnp.inf)
+        merit = equations.merit(g, scale)
+        better = (equations.merit(g, best.scale) < last) & (merit < jnp.inf)
         stays = better | returned
         count = best.num_steps + (better & ~returned & (last < jnp.inf)).astype(int)
         success = within(g, equations.tolerance(scale))
@@ -110,7 +141,7 @@ def iterate(
 
         base = at_candidate if frozen else jacobian
         # Near a state of which all terms vanish the residual is never small beside them.
-        vanishing = jnp.minimum(1e-2, _squares(g, jtu.tree_map(jnp.maximum, scale, first)))
+        vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
         change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
 
@@ -128,12 +159,15 @@ def iterate(
     zero = jnp.where(enabled, 0, 0)
     zeros = jtu.tree_map(lambda x: jnp.zeros_like(x) + zero.astype(x.dtype), before)
     one = 1 + zero.astype(jtu.tree_leaves(before)[0].dtype)
-    y = equations.candidate
-    start = Iterate(y, zeros, before, first, zero)
-    carry = _Carry(enabled, zero > 0, one, one * jnp.inf, y, zeros, start)
+    damping, merit = one, one * jnp.inf
+    best = Iterate(equations.candidate, zeros, before, first, zero)
+    y, multiplier = best.y, zeros
+    if start is not None:
+        y, multiplier, count = start
+        required = _WELL_STARTED * equations.merit(before, first)
+        known = (count > 0) & (required < jnp.inf)
+        damping = jnp.where(known, 0.1 * damping, damping)  # so that it is one after a return
+        merit = jnp.where(known, required, merit)
+        best = best._replace(num_steps=zero + jnp.maximum(count - 1, 0))
+    carry = _Carry(enabled, zero > 0, damping, merit, y, multiplier, best)
     return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
-
-
-def _squares(g: Vector, scale: Vector) -> Array:
-    squares = jtu.tree_map(lambda x: jnp.sum(jnp.square(x)), relative(g, scale))
-    return sum(jtu.tree_leaves(squares))  # pyright: ignore

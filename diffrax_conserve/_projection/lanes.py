@@ -11,24 +11,26 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 _State = TypeVar("_State")
 
 # Lanes are gathered in up to so many blocks, each by itself, so that no block meets another: with a
 # batch that is sharded over that many devices nothing is sent between them.
 _BLOCKS = 32
-# One over the part of a block that is finished at a time.
+# One over the part of the lanes that is finished at a time, and the least number of them: of fewer
+# the arithmetic costs less than to start it.
 _SHARES = 8
+_LEAST_WIDTH = 64
 
 
 def continue_if_any(
-    fn: Callable[[Bool[Array, ""], Any], _State],
+    fn: Callable[[Bool[Array, ""], _State, Any], _State],
     flag: Bool[Array, ""],
     state: _State,
     operands: Any,
 ) -> _State:
-    """`fn(flag, operands)` if `flag` is set, and `state` if not.
+    """`fn(flag, state, operands)` if `flag` is set, and `state` if not.
 
     In a batch, the lanes whose flag is set are gathered, some at a time, finished by one copy of
     `fn`, and put back. (A `lax.cond` in a batch runs both branches for every lane.) What `fn`
@@ -36,12 +38,12 @@ def continue_if_any(
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
-    def lane(flag: Array, arrays: Any) -> _State:
-        return fn(flag, eqx.combine(arrays, static))
+    def lane(flag: Array, state: _State, arrays: Any) -> _State:
+        return fn(flag, state, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
     def alone(flag, state, arrays):
-        return lax.cond(flag, lambda: lane(flag, arrays), lambda: state)
+        return lax.cond(flag, lambda: lane(flag, state, arrays), lambda: state)
 
     @alone.def_vmap
     def batched(size, axes, flag, state, arrays):
@@ -82,12 +84,12 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
     lanes = flags.shape[0]
     blocks = math.gcd(lanes, _BLOCKS)
     length = lanes // blocks
-    width = -(-length // _SHARES)
+    width = min(length, -(-max(lanes // _SHARES, _LEAST_WIDTH) // blocks))
+    rounds = -(-length // width)
     flags, states, batch = jtu.tree_map(
         lambda x: x.reshape(blocks, length, *x.shape[1:]), (flags, states, batch)
     )
-    # The lanes to be finished, first in each block; beyond them an index that is out of range.
-    order = jax.vmap(lambda f: jnp.nonzero(f, size=width * _SHARES, fill_value=length)[0])(flags)
+    order = jax.vmap(lambda f: _positions(f, width * rounds))(flags)
     most = jnp.max(jnp.sum(flags, axis=1))
 
     def body(carry: tuple[Array, Any]) -> tuple[Array, Any]:
@@ -98,16 +100,24 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
             def taken(x: Array) -> Array:
                 return x.at[index].get(mode="clip")
 
-            def finished(flag: Array, batch: Any) -> Any:
-                return lane(flag, eqx.combine(batch, shared))
+            def finished(flag: Array, state: Any, batch: Any) -> Any:
+                return lane(flag, state, eqx.combine(batch, shared))
 
-            out = jax.vmap(finished)(index < length, jtu.tree_map(taken, batch))
+            out = jax.vmap(finished)(index < length, *jtu.tree_map(taken, (states, batch)))
             return jtu.tree_map(lambda x, y: x.at[index].set(y, mode="drop"), states, out)
 
         return start + width, jax.vmap(of_block)(states, batch, index)
 
     _, states = lax.while_loop(lambda carry: carry[0] < most, body, (jnp.zeros_like(most), states))
     return jtu.tree_map(lambda x: x.reshape(lanes, *x.shape[2:]), states)
+
+
+def _positions(flags: Bool[Array, " length"], size: int) -> Int[Array, " size"]:
+    """Where `flags` are set, and then an index that is out of range. As `jax.numpy.nonzero`, in
+    half the time."""
+    length = flags.shape[0]
+    place = jnp.where(flags, jnp.cumsum(flags) - 1, size)
+    return jnp.full(size, length).at[place].set(jnp.arange(length), mode="drop")
 
 
 def _broadcast(size: int, axes: Any, tree: Any) -> Any:

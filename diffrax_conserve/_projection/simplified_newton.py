@@ -37,7 +37,7 @@ from .base import (
 from .bounded import box_of, check_bounds, project_into
 from .certainty import certain
 from .elimination import Vector
-from .iteration import Equations, iterate
+from .iteration import Equations, Start, iterate
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
 from .residual import ROUNDOFF_MULTIPLE, within
@@ -118,7 +118,7 @@ _STARTS = 8
 def _project(
     equations: Equations, anchor: Y | None, *, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    inline, join = _in_scalars(equations)
+    inline, _, join = _in_scalars(equations)
     before, jacobian = linearise(inline.residual, inline.candidate)
     gram_solver = jacobian.gram_solver(inline.weights)
     y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
@@ -139,8 +139,8 @@ def _project(
     )
     close = within(last, tree_scale(roundoff ** (-2 / 3), small))
     done = close & inline.safely_satisfied(g, scale)
-    # Few steps need more. These start again: if they shared what is known here, it would be written
-    # to memory at every step of the solve.
+    # Few steps need more. These linearise again: if they shared what is known here, it would be
+    # written to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
     finish = ft.partial(_finish, max_steps)
     y, multiplier, count, outcome = continue_if_any(finish, ~done, state, (equations, anchor))
@@ -151,20 +151,24 @@ def _project(
     return y, multiplier, info
 
 
-def _in_scalars(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
-    """The same equations in scalars, if they are few and small, and the map from their states."""
+# The same equations in another form, and the maps to its states and back.
+_Converted = tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]
+
+
+def _in_scalars(equations: Equations) -> _Converted:
+    """In scalars, if they are few and small."""
     assert isinstance(equations.residual, Joined)
     residual, magnitude, split, join = written_out(
         equations.residual, equations.magnitude, equations.candidate
     )
-    return _of_states(equations, residual, split, magnitude=magnitude), join
+    return _of_states(equations, residual, split, magnitude=magnitude), split, join
 
 
-def _in_vectors(equations: Equations) -> tuple[Equations, Callable[[Y], Y]]:
-    """The same equations with a state in one array, and the map from such states."""
+def _in_vectors(equations: Equations) -> _Converted:
+    """With a state in one array."""
     assert isinstance(equations.residual, Joined)
     residual, split, join = flattened(equations.residual, equations.candidate)
-    return _of_states(equations, residual, split), join
+    return _of_states(equations, residual, split), split, join
 
 
 def _of_states(
@@ -180,33 +184,47 @@ def _of_states(
 
 
 def _finish(
-    max_steps: int, unfinished: Bool[Array, ""], operands: tuple[Equations, Y | None]
+    max_steps: int,
+    unfinished: Bool[Array, ""],
+    state: _State,
+    operands: tuple[Equations, Y | None],
 ) -> _State:
-    """All iterations, from the candidate; none unless `unfinished`.
+    """Further iterations, from `state`; none unless `unfinished`.
 
     With an anchor, a state near the manifold, they start again halfway to it where they fail.
     """
     equations, anchor = operands
 
-    def attempt(equations: Equations, enabled: Bool[Array, ""]) -> _State:
+    def attempt(equations: Equations, start: Start, enabled: Bool[Array, ""]) -> _State:
         products = equations.magnitude.size**2 * tree_size(equations.candidate)
         convert = _in_scalars if products <= _RARE_SCALARS_MAX else _in_vectors
-        equations, join = convert(equations)
-        before, last = iterate(equations, frozen=True, max_steps=max_steps, enabled=enabled)
+        equations, split, join = convert(equations)
+        y, multiplier, count = start
+        if isinstance(equations.magnitude, tuple):
+            multiplier = tuple(multiplier)
+        before, last = iterate(
+            equations,
+            frozen=True,
+            max_steps=max_steps,
+            start=Start(split(y), multiplier, count),
+            enabled=enabled,
+        )
         outcome = Outcome.of(before, last.g, last.scale, equations.tolerance)
         return join(last.y), as_array(last.multiplier), last.num_steps, outcome
 
+    start = Start(*state[:3])
     if anchor is None:
-        return attempt(equations, unfinished)
-    return _from_between(attempt, equations, anchor, unfinished)
+        return attempt(equations, start, unfinished)
+    return _from_between(attempt, equations, start, anchor, unfinished)
 
 
 _Attempts = tuple[Bool[Array, ""], Int[Array, ""], _State]
 
 
 def _from_between(
-    attempt: Callable[[Equations, Bool[Array, ""]], _State],
+    attempt: Callable[[Equations, Start, Bool[Array, ""]], _State],
     equations: Equations,
+    first: Start,
     anchor: Y,
     enabled: Bool[Array, ""],
 ) -> _State:
@@ -214,13 +232,15 @@ def _from_between(
         unfinished, index, _ = carry
         share = jnp.asarray(0.5, working_dtype(anchor)) ** index
         offset = tree_scale(share, tree_sub(equations.candidate, anchor))
-        start = jtu.tree_map(
-            lambda a, b: jnp.where(index == 0, a, b),
-            equations.candidate,
-            tree_add(anchor, offset),
-        )
+
+        def choose(a: Y, b: Y) -> Y:
+            return jtu.tree_map(lambda a, b: jnp.where(index == 0, a, b), a, b)
+
+        candidate = choose(equations.candidate, tree_add(anchor, offset))
+        zeros = jnp.zeros_like(first.multiplier), jnp.zeros_like(first.num_steps)
+        start = choose(first, Start(candidate, *zeros))
         y, multiplier, count, outcome = attempt(
-            dataclasses.replace(equations, candidate=start), unfinished
+            dataclasses.replace(equations, candidate=candidate), start, unfinished
         )
         # The derivative is that of the projection of the candidate, which this is not.
         multiplier = jnp.where(index == 0, multiplier, jnp.nan)
@@ -228,7 +248,7 @@ def _from_between(
         state = y, multiplier, count, outcome
         return unfinished & failed & (index + 1 < _STARTS), index + 1, state
 
-    like = eqx.filter_eval_shape(attempt, equations, enabled)
+    like = eqx.filter_eval_shape(attempt, equations, first, enabled)
     zeros = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     carry = (jnp.asarray(enabled), jnp.asarray(0), zeros)
     _, _, state = lax.while_loop(lambda carry: carry[0], body, carry)

@@ -58,7 +58,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the one at the
     candidate. To evaluate it again at the projected state costs one evaluation more a step, and did
     not pay: on five systems the errors were the same to within 20 % at tolerance 1e-8, and to
-    within a factor of 2.3 at 1e-5, some larger, some smaller (`benchmarks/studies/first_same_as_last.py`).
+    within a factor of 2.3 at 1e-5, some larger, some smaller
+    (`benchmarks/studies/first_same_as_last.py`).
 
     A solve ends with its first step, unsuccessfully, if the initial state violates a `Constraint`
     by more than the square root of roundoff, relative to the size of its terms (see

@@ -20,9 +20,9 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     which a loop over the stages updates in place. In a batch every stage then goes through memory.
     Written out, the whole step is one expression, which XLA keeps in registers: the same method
     with the same steps, error estimate and dense output, equal up to the order of its sums, and in
-    a batch of small systems about ten times as fast (`benchmarks/cost/overhead.py`). Compile time grows
-    with the number of stages times the size of the vector field: for a large system, or a single
-    long solve, it gains nothing.
+    a batch of small systems about ten times as fast (`benchmarks/cost/overhead.py`). Compile time
+    grows with the number of stages times the size of the vector field: for a large system, or a
+    single long solve, it gains nothing.
 
     !!! example
 
