@@ -19,6 +19,7 @@ from .base import AbstractProjection, Problem, ProjectionInfo, check_like
 from .linearise import linearise
 from .newton import Newton
 from .residual import largest, measure, relative, residual_of
+from .step import Step
 
 
 def project(
@@ -102,9 +103,10 @@ def apply(
     candidate: Y,
     args: Args,
     anchor: Y | None = None,
+    step: Step | None = None,
 ) -> tuple[Y, ProjectionInfo]:
     """`project` without its checks."""
-    problem = _problem(projection, manifold, values, t, candidate, args, anchor)
+    problem = _problem(projection, manifold, values, t, candidate, args, anchor, step)
     return projection.solve(problem, candidate)
 
 
@@ -140,10 +142,11 @@ def _problem(
     candidate: Y,
     args: Args,
     anchor: Y | None = None,
+    step: Step | None = None,
 ) -> Problem:
     residual, magnitude = residual_of(manifold, values, t, candidate, args)
     weights = inverse_metric(projection.metric, candidate)
-    return Problem(residual, magnitude, weights, t, args, values, anchor)
+    return Problem(residual, magnitude, weights, t, args, values, anchor, step)
 
 
 def check_state(y: Y, user: str = "a projection") -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Array, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, FirstIntegral, is_entry
-from .._projection import AbstractProjection, measure, relative
+from .._projection import AbstractProjection, SimplifiedNewton, measure, relative
 from .._projection.project import apply
 from .._tree import working_dtype
 
@@ -54,6 +54,8 @@ def judge(
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)
     if any(given):
+        if projection.sees_step:  # of which there is none yet
+            projection = SimplifiedNewton(metric=projection.metric)
         _, info = apply(projection, manifold, values, t, y, args)
         unreachable = (cause == FINE) & ~info.ok
         cause = jnp.where(unreachable, UNREACHABLE, cause).astype(jnp.int32)
