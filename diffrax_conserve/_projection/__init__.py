@@ -13,6 +13,7 @@ from .residual import largest as largest
 from .residual import measure as measure
 from .residual import relative as relative
 from .simplified_newton import SimplifiedNewton as SimplifiedNewton
+from .staged import Staged as Staged
 from .step import Step as Step
 from .tangent import TangentField as TangentField
 from .tangent import tangent as tangent

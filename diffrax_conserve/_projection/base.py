@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._printing import is_traced, printed
-from .._tree import tree_all_finite, tree_norm, tree_sub
+from .._tree import from_view, tree_all_finite, tree_norm, tree_sub
 from .elimination import Vector
 from .linearise import Joined, linearise
 from .residual import Tolerance, largest, relative, within
@@ -74,6 +74,9 @@ class Problem(eqx.Module):
     - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
     - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
         manifold, from which `residual` was made.
+    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s. Of a complex leaf,
+        everything else here, the candidate and the result have the real and the imaginary part
+        along a new first axis; `state` puts them together.
     - `anchor`: a state near the manifold, in dense output the nearer end of the step, to start
         from where the candidate leads nowhere; in a step `None`.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` where there is none, as in
@@ -86,8 +89,22 @@ class Problem(eqx.Module):
     t: RealScalarLike
     args: Args
     values: Values
+    like: Any
     anchor: Y | None = None
     step: Step | None = None
+
+    def state(self, y: Y) -> Any:
+        """A candidate as the state of the solve: the same, but with its complex leaves.
+
+        **Arguments:**
+
+        - `y`: a candidate.
+
+        **Returns:**
+
+        A state, complex where that of the solve is.
+        """
+        return from_view(y, self.like)
 
     def judge(
         self,

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._custom_types import RealScalarLike, Values, Y
+from .._tree import real_view
 from .base import AbstractProjection, Problem, ProjectionInfo, option
 
 
@@ -53,8 +54,10 @@ class ClosedForm(AbstractProjection):
             )
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        y = self.fn(problem.t, candidate, problem.args, problem.values)
-        _check_like(y, candidate)
+        state = problem.state(candidate)
+        y = self.fn(problem.t, state, problem.args, problem.values)
+        _check_like(y, state)
+        y = real_view(y)
         return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
 
 

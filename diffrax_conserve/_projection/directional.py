@@ -117,7 +117,7 @@ class _Carry(NamedTuple):
     unfinished: Bool[Array, ""]
     last: Real[Array, ""]
     length: Real[Array, ""]
-    count: Int[Array, ""]
+    num_steps: Int[Array, ""]
 
 
 @eqx.filter_custom_jvp
@@ -138,18 +138,18 @@ def _length(
         return residual(tree_add(candidate, tree_scale(length, direction)))[0]
 
     def body(carry: _Carry) -> _Carry:
-        _, last, length, count = carry
+        _, last, length, num_steps = carry
         g, slope = jax.jvp(along, (length,), (jnp.ones_like(length),))
         size = jnp.abs(g)
         # Where it no longer helps it ends; whether that is small enough is judged by others.
-        unfinished = (size > enough) & (size < 0.9 * last) & (count < max_steps) & (slope != 0)
+        unfinished = (size > enough) & (size < 0.9 * last) & (num_steps < max_steps) & (slope != 0)
         step = jnp.where(unfinished, g / jnp.where(slope == 0, 1, slope), 0)
-        return _Carry(unfinished, size, length - step, count + unfinished.astype(int))
+        return _Carry(unfinished, size, length - step, num_steps + unfinished.astype(int))
 
     zero = jnp.zeros((), magnitude.dtype)
     start = _Carry(jnp.asarray(True), jnp.full_like(zero, jnp.inf), zero, jnp.asarray(0))
     end = lax.while_loop(lambda carry: carry.unfinished, body, start)
-    return end.length, end.count
+    return end.length, end.num_steps
 
 
 @_length.def_jvp

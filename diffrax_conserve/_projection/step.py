@@ -1,11 +1,13 @@
 """What a projection may know about the step whose candidate it projects."""
 
-from typing import final
+import dataclasses
+from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
 
 from .._custom_types import RealScalarLike, Y
+from .._tree import real_view
 
 
 @final
@@ -31,7 +33,11 @@ class Step(eqx.Module):
     path: dfx.AbstractLocalInterpolation
     direction: RealScalarLike
 
-    def evaluate(self, t: RealScalarLike) -> Y:
+    def view(self) -> "Step":
+        """The same as a projection sees it: its states are those of `real_view`."""
+        return dataclasses.replace(self, y0=real_view(self.y0), error=real_view(self.error))
+
+    def evaluate(self, t: RealScalarLike) -> Any:
         """The dense output of the wrapped solver, before any projection.
 
         **Arguments:**
@@ -42,4 +48,4 @@ class Step(eqx.Module):
 
         The state there, a candidate.
         """
-        return self.path.evaluate(t * self.direction)
+        return real_view(self.path.evaluate(t * self.direction))

@@ -196,7 +196,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 "`diffrax.RecursiveCheckpointAdjoint()`."
             )
         t = t0 * time_direction(terms, t0)
-        check_state(y0)
+        check_state(y0, kind=jnp.inexact)
         check_metric(self.projection.metric, y0)
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
