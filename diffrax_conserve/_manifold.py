@@ -86,13 +86,12 @@ class FirstIntegral(AbstractConserved):
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
-    be differentiated) that returns a PyTree of real arrays. Every array element is one first
-    integral.
+    be differentiated) that returns a PyTree of real arrays. Every element is one first integral.
 - `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
     from the initial state of the solve. With `rate` it is the value at the start of the solve.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
     $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
-- `jacobian`: the derivative of `fn` by the state; see [`diffrax_conserve.Constraint`][].
+- `jacobian`: as of a [`diffrax_conserve.Constraint`][].
 """
 
 
@@ -161,8 +160,7 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
     constraint.
 - `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
     `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
-    `jax.pure_callback`. Derivatives that need more of `fn` or `jacobian` than that are taken by
-    autodiff of them, which is an error where that is impossible. Default: autodiff.
+    `jax.pure_callback`. What more a derivative needs is taken by autodiff of both, or is an error.
 """
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._printing import is_traced, printed
-from .._tree import from_view, tree_all_finite, tree_norm, tree_sub
+from .._tree import from_view, tree_all_finite, tree_norm, tree_stop_gradient, tree_sub
 from .elimination import Vector
 from .linearise import Joined, linearise
 from .residual import Tolerance, largest, relative, within
@@ -127,9 +127,12 @@ class Problem(eqx.Module):
 
         A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
         """
-        before, jacobian = linearise(self.residual, candidate)
-        after, at_y = linearise(self.residual, y)
-        scale = jtu.tree_map(jnp.add, self.magnitude, at_y.scale(y))
+        # A verdict has no derivative, and that of a Jacobian may not exist.
+        given = self.residual, self.magnitude, candidate, y
+        residual, magnitude, candidate, y = tree_stop_gradient(given)
+        before, jacobian = linearise(residual, candidate)
+        after, at_y = linearise(residual, y)
+        scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
         outcome = Outcome.of(before, after, scale, Tolerance(rtol, atol))
         rank = jacobian.gram_solver(self.weights).rank
         count = jnp.asarray(num_steps)
@@ -191,7 +194,8 @@ NEWTON_OPTIONS = r"""**Arguments:**
     PyTrees like the state of scalars or arrays. The result is
     $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest point of the
     manifold within the bounds, which it never leaves. Where there is none the projection fails.
-    Derivatives hold what is at a bound there. Default: none.
+    Derivatives hold what is at a bound there. Of a complex component they bound both parts.
+    Default: none.
 
 **Raises:**
 
