@@ -17,7 +17,7 @@ from .._manifold import (
     conserved_values,
     is_entry,
 )
-from .._tree import from_view, real_view, tree_mul, tree_sub
+from .._tree import from_view, real_view, tree_mul, tree_stop_gradient, tree_sub
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like
 from .linearise import linearise
 from .newton import Newton
@@ -135,7 +135,8 @@ def relative_residual(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> Real[Array, ""]:
     """The largest residual at `y`, relative to its scale there."""
-    return largest(relative(*measure(manifold, values, t, y, args)))
+    given = tree_stop_gradient((manifold, values, t, y, args))
+    return largest(relative(*measure(*given)))
 
 
 def _problem(
