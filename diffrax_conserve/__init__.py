@@ -11,7 +11,8 @@ Say what is conserved, wrap the solver, and leave the rest of `diffrax.diffeqsol
 
 What is conserved    FirstIntegral, Constraint, check_invariance, drift
 Solvers              ManifoldProjection, RK4, Unrolled, statistics, fast_cpu
-Projections          SimplifiedNewton (the default), Newton, ClosedForm, project
+Projections          SimplifiedNewton (the default), Newton, ClosedForm, Directional, Staged,
+                     project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
 Your own tests       import diffrax_conserve.testing
@@ -32,10 +33,13 @@ from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
 from ._projection import AbstractProjection as AbstractProjection
 from ._projection import ClosedForm as ClosedForm
+from ._projection import Directional as Directional
 from ._projection import Newton as Newton
 from ._projection import Problem as Problem
 from ._projection import ProjectionInfo as ProjectionInfo
 from ._projection import SimplifiedNewton as SimplifiedNewton
+from ._projection import Staged as Staged
+from ._projection import Step as Step
 from ._projection import TangentField as TangentField
 from ._projection import project as project
 from ._projection import tangent as tangent

@@ -54,6 +54,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
     ends: tuple[Y, Y]
+    error: Y | None
     target: PackedTarget
 
     def evaluate(
@@ -68,7 +69,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         anchor = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
-        y, info = target.project(t0, candidate, anchor)
+        step = target.step(self.t0, self.t1, self.ends[0], self.error, lambda: self.inner)
+        y, info = target.project(t0, candidate, anchor, step)
         okay = info.ok
         if not isinstance(target.projection, SimplifiedNewton):
             lower, upper = (getattr(target.projection, name, None) for name in ("lower", "upper"))
@@ -96,7 +98,8 @@ class MakeManifoldInterpolation:
         t1: RealScalarLike,
         inner: DenseInfo,
         ends: tuple[Y, Y],
+        error: Y | None,
         target: PackedTarget,
     ) -> ManifoldInterpolation:
         interpolation = self.inner_cls(t0=t0, t1=t1, **inner)
-        return ManifoldInterpolation(t0, t1, interpolation, ends, target)
+        return ManifoldInterpolation(t0, t1, interpolation, ends, error, target)

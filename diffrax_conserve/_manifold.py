@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 from ._tree import tree_shapes
+from ._with_jacobian import WithJacobian
 
 
 class AbstractConserved(eqx.Module):
@@ -55,9 +56,14 @@ class FirstIntegral(AbstractConserved):
     rate: ConstraintFn | None
 
     def __init__(
-        self, fn: ConstraintFn, *, value: Values | None = None, rate: ConstraintFn | None = None
+        self,
+        fn: ConstraintFn,
+        *,
+        value: Values | None = None,
+        rate: ConstraintFn | None = None,
+        jacobian: Any = None,
     ):
-        self.fn = fn
+        self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
         self.rate = rate
         # Arrays, so that another value does not compile again.
         self.value = jtu.tree_map(
@@ -80,12 +86,12 @@ class FirstIntegral(AbstractConserved):
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
-    be differentiated) that returns a PyTree of real arrays. Every array element is one first
-    integral.
+    be differentiated) that returns a PyTree of real arrays. Every element is one first integral.
 - `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
     from the initial state of the solve. With `rate` it is the value at the start of the solve.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
     $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
+- `jacobian`: as of a [`diffrax_conserve.Constraint`][].
 """
 
 
@@ -106,6 +112,9 @@ class Constraint(AbstractConserved):
     """
 
     fn: ConstraintFn
+
+    def __init__(self, fn: ConstraintFn, *, jacobian: Any = None):
+        self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
 
     def __check_init__(self):
         _check_callable(self)
@@ -149,6 +158,9 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
     constraint.
+- `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
+    `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
+    `jax.pure_callback`. What more a derivative needs is taken by autodiff of both, or is an error.
 """
 
 
@@ -172,10 +184,11 @@ def slope_like(y: Y, slope: Y) -> Y:
 
 
 def _check_callable(entry: AbstractConserved) -> None:
-    if not callable(entry.fn):
+    fn = entry.fn.fn if isinstance(entry.fn, WithJacobian) else entry.fn
+    if not callable(fn):
         name = type(entry).__name__
         raise TypeError(
-            f"`{name}(fn)` takes a callable `fn(t, y, args)`, but `fn` is {entry.fn!r}. "
+            f"`{name}(fn)` takes a callable `fn(t, y, args)`, but `fn` is {fn!r}. "
             f"Write for example `{name}(lambda t, y, args: ...)`."
         )
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _PRINTING = {"_printing"}
 _TREE = _TYPES | {"_tree"}
-_MANIFOLD = _TREE | {"_manifold"}
+_MANIFOLD = _TREE | {"_with_jacobian", "_manifold"}
 _BALANCE = _MANIFOLD | {"_balance"}
 _PROJECTION = _BALANCE | _PRINTING | {"_projection"}
 _CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
@@ -31,7 +31,8 @@ MAY_IMPORT = {
     "_replace_file": set(),
     "_tree": _TYPES,
     "_fast_cpu": set(),
-    "_manifold": _TREE,
+    "_with_jacobian": _TREE,
+    "_manifold": _TREE | {"_with_jacobian"},
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,
     "_interpolation": _PROJECTION,

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import AbstractConserved, Constraint, check_manifold, rate_of
+from .._tree import from_view, real_view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,12 +206,13 @@ def _measure(
 
 
 def _relative_sizes(
-    entry: AbstractConserved, t: Float[Array, ""], y: Any, f: Any, args: Args
+    entry: AbstractConserved, t: Float[Array, ""], state: Any, f: Any, args: Args
 ) -> tuple[Array, Array]:
-    def fn(t: Float[Array, ""], y: Any) -> list[Array]:
-        return [jnp.ravel(x) for x in jtu.tree_leaves(entry.fn(t, y, args))]
+    def fn(t: Float[Array, ""], view: Any) -> list[Array]:
+        return [jnp.ravel(x) for x in jtu.tree_leaves(entry.fn(t, from_view(view, state), args))]
 
-    f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, y)
+    f = real_view(jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, state))
+    y = real_view(state)
     value, along_flow = jax.jvp(fn, (t, y), (jnp.ones_like(t), f))
     jacobian = jax.jacrev(fn, argnums=(0, 1))(t, y)
     # The sizes of what cancels: of the derivative's terms, and of the value's to first order.
@@ -218,7 +220,7 @@ def _relative_sizes(
     sizes = [_term_sizes(rows, (t, y)) for rows in jacobian]
     rate = rate_of(entry)
     if rate is not None:
-        rates = [jnp.ravel(x) for x in jtu.tree_leaves(rate(t, y, args))]
+        rates = [jnp.ravel(x) for x in jtu.tree_leaves(rate(t, state, args))]
         along_flow = [a - b for a, b in zip(along_flow, rates, strict=True)]
         speeds = [a + jnp.abs(b) for a, b in zip(speeds, rates, strict=True)]
     residual = value if isinstance(entry, Constraint) else [jnp.zeros_like(x) for x in value]

@@ -3,6 +3,7 @@ from .base import Problem as Problem
 from .base import ProjectionInfo as ProjectionInfo
 from .base import option as option
 from .closed_form import ClosedForm as ClosedForm
+from .directional import Directional as Directional
 from .newton import Newton as Newton
 from .project import check_metric as check_metric
 from .project import check_state as check_state
@@ -12,6 +13,8 @@ from .residual import largest as largest
 from .residual import measure as measure
 from .residual import relative as relative
 from .simplified_newton import SimplifiedNewton as SimplifiedNewton
+from .staged import Staged as Staged
+from .step import Step as Step
 from .tangent import TangentField as TangentField
 from .tangent import tangent as tangent
 from .target import Target as Target

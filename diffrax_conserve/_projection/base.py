@@ -1,7 +1,7 @@
 """What every projection takes and returns."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.core
@@ -11,12 +11,13 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from .._custom_types import Args, RealScalarLike, Values, Y
+from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._printing import is_traced, printed
-from .._tree import tree_all_finite, tree_norm, tree_sub
+from .._tree import from_view, tree_all_finite, tree_norm, tree_stop_gradient, tree_sub
 from .elimination import Vector
-from .linearise import Joined
+from .linearise import Joined, linearise
 from .residual import Tolerance, largest, relative, within
+from .step import Step
 
 
 class ProjectionInfo(eqx.Module):
@@ -73,8 +74,13 @@ class Problem(eqx.Module):
     - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
     - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
         manifold, from which `residual` was made.
+    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s. Of a complex leaf,
+        everything else here, the candidate and the result have the real and the imaginary part
+        along a new first axis; `state` puts them together.
     - `anchor`: a state near the manifold, in dense output the nearer end of the step, to start
         from where the candidate leads nowhere; in a step `None`.
+    - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` where there is none, as in
+        [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
     """
 
     residual: Joined
@@ -83,7 +89,54 @@ class Problem(eqx.Module):
     t: RealScalarLike
     args: Args
     values: Values
+    like: Any
     anchor: Y | None = None
+    step: Step | None = None
+
+    def state(self, y: Y) -> Any:
+        """A candidate as the state of the solve: the same, but with its complex leaves.
+
+        **Arguments:**
+
+        - `y`: a candidate.
+
+        **Returns:**
+
+        A state, complex where that of the solve is.
+        """
+        return from_view(y, self.like)
+
+    def judge(
+        self,
+        candidate: Y,
+        y: Y,
+        num_steps: IntScalarLike = 1,
+        *,
+        rtol: float | Array | None = None,
+        atol: float | Array | None = None,
+    ) -> "ProjectionInfo":
+        """The report on a projection that led from `candidate` to `y`: what `solve` returns.
+
+        **Arguments:**
+
+        - `candidate`, `y`: the states before and after.
+        - `num_steps`: how many iterations were made.
+        - `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
+
+        **Returns:**
+
+        A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
+        """
+        # A verdict has no derivative, and that of a Jacobian may not exist.
+        given = self.residual, self.magnitude, candidate, y
+        residual, magnitude, candidate, y = tree_stop_gradient(given)
+        before, jacobian = linearise(residual, candidate)
+        after, at_y = linearise(residual, y)
+        scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
+        outcome = Outcome.of(before, after, scale, Tolerance(rtol, atol))
+        rank = jacobian.gram_solver(self.weights).rank
+        count = jnp.asarray(num_steps)
+        return report(outcome, count, candidate, y, before, after, scale, rank)
 
 
 def option(default: Any, **kwargs: Any) -> Any:
@@ -92,9 +145,15 @@ def option(default: Any, **kwargs: Any) -> Any:
 
 
 class AbstractProjection(eqx.Module):
-    """A way to return from a candidate to the manifold."""
+    """A way to return from a candidate to the manifold.
+
+    Write your own as a subclass with a field `metric` and the method `solve`; see "Your own
+    projection" in the guide.
+    """
 
     metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
+    # Whether `Problem.step` is given. Then the error estimate is saved with dense output.
+    sees_step: ClassVar[bool] = True
 
     @abc.abstractmethod
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
@@ -135,7 +194,8 @@ NEWTON_OPTIONS = r"""**Arguments:**
     PyTrees like the state of scalars or arrays. The result is
     $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest point of the
     manifold within the bounds, which it never leaves. Where there is none the projection fails.
-    Derivatives hold what is at a bound there. Default: none.
+    Derivatives hold what is at a bound there. Of a complex component they bound both parts.
+    Default: none.
 
 **Raises:**
 

@@ -1,7 +1,7 @@
 """A projection that the user knows how to write down."""
 
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,9 +9,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._custom_types import RealScalarLike, Values, Y
-from .base import AbstractProjection, Outcome, Problem, ProjectionInfo, option, report
-from .linearise import linearise
-from .residual import Tolerance
+from .._tree import real_view
+from .base import AbstractProjection, Problem, ProjectionInfo, option
 
 
 @final
@@ -45,6 +44,7 @@ class ClosedForm(AbstractProjection):
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
     metric: None = eqx.field(default=None, init=False)
+    sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
         if not callable(self.fn):
@@ -54,15 +54,11 @@ class ClosedForm(AbstractProjection):
             )
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        y = self.fn(problem.t, candidate, problem.args, problem.values)
-        _check_like(y, candidate)
-        before, jacobian = linearise(problem.residual, candidate)
-        after, at_y = linearise(problem.residual, y)
-        scale = problem.magnitude + at_y.scale(y)
-        outcome = Outcome.of(before, after, scale, Tolerance(self.rtol, self.atol))
-        rank = jacobian.gram_solver(problem.weights).rank
-        count = jnp.asarray(1)
-        return y, report(outcome, count, candidate, y, before, after, scale, rank)
+        state = problem.state(candidate)
+        y = self.fn(problem.t, state, problem.args, problem.values)
+        _check_like(y, state)
+        y = real_view(y)
+        return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
 
 
 ClosedForm.__init__.__doc__ = r"""**Arguments:**

@@ -1,6 +1,6 @@
 """Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
 
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.lax as lax
@@ -84,6 +84,7 @@ class Newton(AbstractProjection):
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
+    sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
         check_bounds(self.lower, self.upper)

@@ -1,5 +1,8 @@
 """`project`: one state to the manifold. Also what the solver and the interpolation call."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree, Real
@@ -14,11 +17,12 @@ from .._manifold import (
     conserved_values,
     is_entry,
 )
-from .._tree import tree_mul, tree_sub
+from .._tree import from_view, real_view, tree_mul, tree_stop_gradient, tree_sub
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like
 from .linearise import linearise
 from .newton import Newton
 from .residual import largest, measure, relative, residual_of
+from .step import Step
 
 
 def project(
@@ -38,7 +42,7 @@ def project(
     **Arguments:**
 
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
-    - `y`: the candidate, any PyTree of real floating-point arrays.
+    - `y`: the candidate, any PyTree of floating-point arrays, real or complex.
     - `t`, `args`: passed to the functions of the manifold.
     - `value`: the conserved values: a PyTree like `manifold`, with what `fn` is to be kept at in
         the place of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed
@@ -68,7 +72,7 @@ def project(
     check_manifold(manifold)
     projection = Newton() if projection is None else projection
     y = jtu.tree_map(jnp.asarray, y)
-    check_state(y)
+    check_state(y, kind=jnp.inexact)
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
     if value is None:
@@ -102,10 +106,12 @@ def apply(
     candidate: Y,
     args: Args,
     anchor: Y | None = None,
+    step: Step | None = None,
 ) -> tuple[Y, ProjectionInfo]:
     """`project` without its checks."""
-    problem = _problem(projection, manifold, values, t, candidate, args, anchor)
-    return projection.solve(problem, candidate)
+    problem = _problem(projection, manifold, values, t, candidate, args, anchor, step)
+    y, info = projection.solve(problem, real_view(candidate))
+    return from_view(y, candidate), info
 
 
 def tangential(
@@ -119,17 +125,18 @@ def tangential(
 ) -> Y:
     """The part of `vector` that is tangent to the manifold at `y`, `v - M⁻¹Gᵀ(GM⁻¹Gᵀ)⁻¹G v`."""
     problem = _problem(projection, manifold, values, t, y, args)
-    _, jacobian = linearise(problem.residual, y)
+    _, jacobian = linearise(problem.residual, real_view(y))
     gram_solver = jacobian.gram_solver(problem.weights)
-    normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(vector)))
-    return tree_sub(vector, tree_mul(normal, problem.weights))
+    normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(real_view(vector))))
+    return tree_sub(vector, from_view(tree_mul(normal, problem.weights), vector))
 
 
 def relative_residual(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> Real[Array, ""]:
     """The largest residual at `y`, relative to its scale there."""
-    return largest(relative(*measure(manifold, values, t, y, args)))
+    given = tree_stop_gradient((manifold, values, t, y, args))
+    return largest(relative(*measure(*given)))
 
 
 def _problem(
@@ -140,20 +147,28 @@ def _problem(
     candidate: Y,
     args: Args,
     anchor: Y | None = None,
+    step: Step | None = None,
 ) -> Problem:
     residual, magnitude = residual_of(manifold, values, t, candidate, args)
-    weights = inverse_metric(projection.metric, candidate)
-    return Problem(residual, magnitude, weights, t, args, values, anchor)
+    weights = inverse_metric(projection.metric, real_view(candidate))
+    anchor, step = real_view(anchor), None if step is None else step.view()
+    like = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), candidate)
+    return Problem(residual, magnitude, weights, t, args, values, like, anchor, step)
 
 
-def check_state(y: Y, user: str = "a projection") -> None:
-    """Raises unless every leaf of the state is a real floating-point array, as `user` needs."""
+def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
+    """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
     for leaf in jtu.tree_leaves(y):
-        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+        if not jnp.issubdtype(jnp.result_type(leaf), kind):
+            remedy = (
+                "floating-point states, real or complex. Convert it, for example by "
+                "`jnp.asarray(..., dtype=float)`."
+                if kind is jnp.inexact
+                else "real floating-point states. Split a complex leaf into its real and its "
+                "imaginary part."
+            )
             raise TypeError(
-                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but {user} needs "
-                "real floating-point states. Split a complex leaf into its real and its imaginary "
-                "part."
+                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but {user} needs {remedy}"
             )
 
 

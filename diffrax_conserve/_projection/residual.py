@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate
-from .._tree import tree_max, working_dtype
+from .._tree import from_view, real_view, tree_max, working_dtype
 from .elimination import Vector
 from .linearise import Joined, linearise
 
@@ -28,16 +28,17 @@ ROUNDOFF_MULTIPLE = 16
 def residual_of(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Joined, Real[Array, " m"]]:
-    """The residual as a function of the state, and the absolute conserved values, as vectors."""
+    """The residual as a function of the state, or of the `real_view` of a complex one, and the
+    absolute conserved values, as vectors."""
     dtype = working_dtype(y)
 
-    def parts(y: Y) -> list[Array]:
-        out = evaluate(manifold, t, y, args)
+    def parts(view: Y) -> list[Array]:
+        out = evaluate(manifold, t, from_view(view, y), args)
         residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
         return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
 
     # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
-    residual = Joined(eqx.filter_closure_convert(parts, y))
+    residual = Joined(eqx.filter_closure_convert(parts, real_view(y)))
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), y)
     magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)
     return residual, jnp.concatenate(
@@ -60,10 +61,11 @@ def measure(
     of `y`: what a constraint on a component that is zero up to roundoff is to be compared with.
     """
     residual, magnitude = residual_of(manifold, values, t, y, args)
-    g, jacobian = linearise(residual, y)
+    view = real_view(y)
+    g, jacobian = linearise(residual, view)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     largest = tree_max(y)
-    sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), y) if uniform else y
+    sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), view) if uniform else view
     return shaped(g, like), shaped(magnitude + jacobian.scale(sizes), like)
 
 

@@ -4,7 +4,7 @@ the candidate. For candidates that are as close as an integrator's local error."
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.lax as lax
@@ -88,6 +88,7 @@ class SimplifiedNewton(AbstractProjection):
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
+    sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
         check_bounds(self.lower, self.upper)

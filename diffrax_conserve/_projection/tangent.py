@@ -22,7 +22,7 @@ from .._manifold import (
     rate_of,
     slope_like,
 )
-from .._tree import tree_add, tree_mul
+from .._tree import from_view, real_view, tree_add, tree_mul
 from .base import positive_weights
 from .linearise import as_array, linearise, written_out
 from .project import check_metric, check_state, inverse_metric
@@ -153,7 +153,7 @@ class TangentField(eqx.Module):
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
         """The given field, what is added to it, and the multipliers."""
         y = jtu.tree_map(jnp.asarray, y)
-        check_state(y, "`tangent`")
+        check_state(y, "`tangent`", jnp.inexact)
         check_metric(self.metric, y)
         check_outputs(self.manifold, t, y, args)
         slope = slope_like(y, self.vector_field(t, y, args))
@@ -161,12 +161,13 @@ class TangentField(eqx.Module):
         check_values(self.manifold, values, t, y, args)
         wrong = self._wrong_rates(t, y, args, slope, values)
         residual, magnitude = residual_of(self.manifold, values, t, y, args)
-        inline, _, split, join = written_out(residual, magnitude, y)
-        g, jacobian = linearise(inline, split(y))
-        weights = split(inverse_metric(self.metric, y))
+        view = real_view(y)
+        inline, _, split, join = written_out(residual, magnitude, view)
+        g, jacobian = linearise(inline, split(view))
+        weights = split(inverse_metric(self.metric, view))
         wrong = tuple(wrong) if isinstance(g, tuple) else wrong
         multiplier = jacobian.gram_solver(weights).solve(wrong)
-        correction = join(tree_mul(jacobian.pullback(multiplier), weights))
+        correction = from_view(join(tree_mul(jacobian.pullback(multiplier), weights)), y)
         return slope, correction, shaped(as_array(multiplier), values)
 
     def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._tree import tree_add, tree_all_finite, working_dtype
 from .base import AbstractProjection, Outcome, ProjectionInfo
 from .project import apply, relative_residual
+from .step import Step
 
 # diffrax traces a step three times, but what is compiled on its own is traced once.
 _apply = eqx.filter_jit(apply)
@@ -54,12 +56,30 @@ class Target(eqx.Module):
         gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
         return dataclasses.replace(self, gained=tree_add(self.gained, gained))
 
+    def step(
+        self,
+        start: RealScalarLike,
+        end: RealScalarLike,
+        y0: Y,
+        error: Y | None,
+        path: Callable[[], dfx.AbstractLocalInterpolation],
+    ) -> Step | None:
+        """What a projection that asks for it may know about the step."""
+        if not self.projection.sees_step:
+            return None
+        start, end = start * self.direction, end * self.direction
+        return Step(start, end, y0, error, path(), self.direction)
+
     def project(
-        self, t: RealScalarLike, candidate: Y, anchor: Y | None = None
+        self,
+        t: RealScalarLike,
+        candidate: Y,
+        anchor: Y | None = None,
+        step: Step | None = None,
     ) -> tuple[Y, ProjectionInfo]:
         t = t * self.direction
         if self.threshold is None and self.due is None:
-            return self._project(t, candidate, anchor)
+            return self._project(t, candidate, anchor, step)
         residual = relative_residual(self.manifold, self.now, t, candidate, self.args)
         needed = jnp.asarray(True) if self.due is None else self.due
         if self.threshold is not None:
@@ -67,14 +87,15 @@ class Target(eqx.Module):
         needed = needed | ~tree_all_finite(candidate)
         return lax.cond(
             needed,
-            lambda: self._project(t, candidate, anchor),
+            lambda: self._project(t, candidate, anchor, step),
             lambda: (candidate, _untouched(candidate, residual)),
         )
 
     def _project(
-        self, t: RealScalarLike, candidate: Y, anchor: Y | None
+        self, t: RealScalarLike, candidate: Y, anchor: Y | None, step: Step | None
     ) -> tuple[Y, ProjectionInfo]:
-        return _apply(self.projection, self.manifold, self.now, t, candidate, self.args, anchor)
+        now, args = self.now, self.args
+        return _apply(self.projection, self.manifold, now, t, candidate, args, anchor, step)
 
     def too_far(self, info: ProjectionInfo) -> Bool[Array, ""]:
         """Whether a projection that succeeded moved the state further than it may."""

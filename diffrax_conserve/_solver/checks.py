@@ -6,6 +6,7 @@ import jax.core
 import numpy as np
 
 from .._custom_types import RealScalarLike
+from .._projection import AbstractProjection, Directional
 
 
 def check_positive(name: str, option: RealScalarLike | None) -> None:
@@ -36,3 +37,16 @@ def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
     while issubclass(type(solver), dfx.AbstractWrappedSolver):
         solver = solver.solver  # pyright: ignore
     return solver
+
+
+def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
+    if not isinstance(projection, Directional):
+        return
+    while issubclass(type(solver), dfx.AbstractWrappedSolver):
+        if type(solver) is dfx.HalfSolver:
+            raise ValueError(
+                "`Directional` moves along the error estimate of the wrapped solver, but "
+                "`diffrax.HalfSolver` gives it without its sign. Wrap a solver with an embedded "
+                "method, such as `diffrax.Tsit5()`, or pass `projection=SimplifiedNewton()`."
+            )
+        solver = solver.solver  # pyright: ignore

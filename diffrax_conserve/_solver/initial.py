@@ -7,9 +7,9 @@ from jaxtyping import Array, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, FirstIntegral, is_entry
-from .._projection import AbstractProjection, measure, relative
+from .._projection import AbstractProjection, SimplifiedNewton, measure, relative
 from .._projection.project import apply
-from .._tree import working_dtype
+from .._tree import tree_stop_gradient, working_dtype
 
 FINE, NOT_FINITE, VIOLATED, UNREACHABLE = range(4)
 
@@ -35,6 +35,8 @@ def judge(
     """A `Constraint` is violated if its residual is larger than the square root of roundoff,
     relative to the size of its terms; smaller ones are removed by the first step. A first integral
     with a `value` of its own may start elsewhere, if that value can be reached from there."""
+    # A verdict has no derivative, and that of a Jacobian may not exist.
+    manifold, values, t, y, args = tree_stop_gradient((manifold, values, t, y, args))
     dtype = working_dtype(y)
     limit = jnp.finfo(dtype).eps ** 0.5
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
@@ -54,6 +56,8 @@ def judge(
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)
     if any(given):
+        if projection.sees_step:  # of which there is none yet
+            projection = SimplifiedNewton(metric=projection.metric)
         _, info = apply(projection, manifold, values, t, y, args)
         unreachable = (cause == FINE) & ~info.ok
         cause = jnp.where(unreachable, UNREACHABLE, cause).astype(jnp.int32)

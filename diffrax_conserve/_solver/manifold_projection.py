@@ -1,10 +1,9 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
-from collections.abc import Callable
+import functools as ft
 from typing import Any, final
 
 import diffrax as dfx
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
@@ -17,14 +16,12 @@ from .._custom_types import (
     DenseInfo,
     Manifold,
     RealScalarLike,
-    Values,
     Y,
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import check_manifold, check_outputs, check_values, conserved_values
 from .._projection import (
     AbstractProjection,
-    ProjectionInfo,
     SimplifiedNewton,
     Target,
     check_metric,
@@ -33,10 +30,11 @@ from .._projection import (
     tangential,
 )
 from .._tree import tree_norm, tree_sub, working_dtype
-from .checks import check_nested, check_positive, innermost
+from .checks import check_direction, check_nested, check_positive, innermost
 from .count_rejections import FAILED_PROJECTION
 from .failure import failure
 from .initial import FINE, Initial, judge
+from .state import State
 from .statistics import ProjectionStatistics
 from .terms import is_backsolve, is_ode, time_direction
 
@@ -129,6 +127,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 f"`projection` is {self.projection!r}, which is not a projection. Pass an "
                 "instance, for example `projection=SimplifiedNewton()`."
             )
+        check_direction(self.solver, self.projection)
         check_positive("max_correction", self.max_correction)
         check_positive("threshold", self.threshold)
         if not isinstance(self.every, int) or self.every < 1:
@@ -189,7 +188,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-    ) -> "_State":
+    ) -> State:
         if is_backsolve(terms):
             raise ValueError(
                 "`ManifoldProjection` cannot solve the adjoint equations of "
@@ -198,14 +197,14 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 "`diffrax.RecursiveCheckpointAdjoint()`."
             )
         t = t0 * time_direction(terms, t0)
-        check_state(y0)
+        check_state(y0, kind=jnp.inexact)
         check_metric(self.projection.metric, y0)
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
         values = jtu.tree_map(jnp.asarray, values)
         num_constraints = sum(jnp.size(value) for value in jtu.tree_leaves(values))
-        return _State(
+        return State(
             self.solver.init(terms, t0, t1, y0, args),
             values,
             jtu.tree_map(jnp.zeros_like, values) if has_rates(self.manifold) else None,
@@ -221,29 +220,27 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: "_State",
+        solver_state: State,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y | None, DenseInfo, "_State", dfx.RESULTS]:
+    ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
         start = self._target(terms, t1, y0, candidate, args, solver_state)
-        target = start.advanced(t0, t1, self._path(t0, t1, dense_info))
-        y1, info = target.project(t1, candidate)
+        # Called only where something is asked of it.
+        path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
+        target = start.advanced(t0, t1, lambda t: path().evaluate(t))
+        step = target.step(t0, t1, y0, error, path)
+        y1, info = target.project(t1, candidate, step=step)
         too_far = target.too_far(info)
         success = info.ok & ~too_far & (solver_state.initial.cause == FINE)
+        shown = None if step is None else error
         error = self._error(error, target, t1, y1)
         error = _judged(error, success, _is_hopeless(solver_state.initial, y0, candidate))
         failed = failure(info, too_far, solver_state.initial, self.manifold, solver_state.values)
         result = dfx.RESULTS.where(success | (result != dfx.RESULTS.successful), result, failed)
-        dense_info = dict(inner=dense_info, ends=(y0, y1), target=PackedTarget(start))
+        dense_info = dict(inner=dense_info, ends=(y0, y1), error=shown, target=PackedTarget(start))
         return y1, error, dense_info, solver_state.next(inner, target.gained, info), result
-
-    def _path(
-        self, t0: RealScalarLike, t1: RealScalarLike, dense_info: DenseInfo
-    ) -> Callable[[RealScalarLike], Y]:
-        """The dense output of the wrapped solver in one step."""
-        return lambda t: self.solver.interpolation_cls(t0=t0, t1=t1, **dense_info).evaluate(t)
 
     def _target(
         self,
@@ -252,7 +249,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         y0: Y,
         candidate: Y,
         args: Args,
-        state: "_State",
+        state: State,
     ) -> Target:
         return Target(
             self.projection,
@@ -300,29 +297,12 @@ def _judged(error: Y | None, success: BoolScalarLike, hopeless: BoolScalarLike) 
     return jtu.tree_map(lambda e: jnp.where(success, e, failed.astype(e.dtype)), error)
 
 
-class _State(eqx.Module):
-    """What a `ManifoldProjection` carries from step to step."""
-
-    inner: Any
-    values: Values
-    # What their rates have added to them, by itself: of each step it is little beside the value.
-    gained: Values | None
-    num_steps: Array | None  # counted only if not every step is projected
-    statistics: ProjectionStatistics
-    initial: Initial
-
-    def next(self, inner: Any, gained: Values | None, info: ProjectionInfo) -> "_State":
-        num_steps = None if self.num_steps is None else self.num_steps + 1
-        offset = jnp.where(info.num_steps > 0, 0, self.initial.offset)
-        initial = Initial(self.initial.cause, self.initial.position, offset)
-        return _State(inner, self.values, gained, num_steps, self.statistics.add(info), initial)
-
-
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
-- `projection`: how to return to the manifold: a `SimplifiedNewton`, a `Newton` or a `ClosedForm`.
+- `projection`: how to return to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
+    `Directional`, or your own.
 - `max_correction`: a projection fails if it moves the candidate by more than this times the length
     of the step, $\|\hat y - y_n\|$ (and by more than $\sqrt\varepsilon \|\hat y\|$), in the
     Euclidean norm. It guards against landing on another component of the manifold, and against

@@ -1,0 +1,51 @@
+"""What a projection may know about the step whose candidate it projects."""
+
+import dataclasses
+from typing import Any, final
+
+import diffrax as dfx
+import equinox as eqx
+
+from .._custom_types import RealScalarLike, Y
+from .._tree import real_view
+
+
+@final
+class Step(eqx.Module):
+    r"""The step of a solve in which a projection is called.
+
+    All times are those of the vector field, also in a solve backwards in time, where `t1 < t0`. At
+    a saved time inside the step, and in dense output, it is the same step: the candidate is then
+    the dense output at `Problem.t`.
+
+    **Attributes:**
+
+    - `t0`, `t1`: where the step starts, and where it ends; the step size is `t1 - t0`.
+    - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
+    - `error`: the error estimate of the wrapped solver at `t1`, shaped like the state, or `None`
+        where it has none.
+    """
+
+    t0: RealScalarLike
+    t1: RealScalarLike
+    y0: Y
+    error: Y | None
+    path: dfx.AbstractLocalInterpolation
+    direction: RealScalarLike
+
+    def view(self) -> "Step":
+        """The same as a projection sees it: its states are those of `real_view`."""
+        return dataclasses.replace(self, y0=real_view(self.y0), error=real_view(self.error))
+
+    def evaluate(self, t: RealScalarLike) -> Any:
+        """The dense output of the wrapped solver, before any projection.
+
+        **Arguments:**
+
+        - `t`: a time between `t0` and `t1`.
+
+        **Returns:**
+
+        The state there, a candidate.
+        """
+        return real_view(self.path.evaluate(t * self.direction))

@@ -1,0 +1,76 @@
+"""Functions that come with their Jacobian, for those that autodiff cannot see."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ._custom_types import Args, ConstraintFn, RealScalarLike, Values, Y
+from ._tree import tree_tangents
+
+
+class WithJacobian(eqx.Module):
+    """`fn`, differentiated by the state as `jacobian` says, and by all else as it is written."""
+
+    fn: ConstraintFn
+    jacobian: Any  # a function like `fn`; checked below, with a remedy
+
+    def __check_init__(self):
+        if not callable(self.jacobian):
+            raise TypeError(
+                f"`jacobian` is {self.jacobian!r}, which is not callable. Pass a function "
+                "`jacobian(t, y, args)` that returns the derivative of `fn` by the state, or "
+                "`None`."
+            )
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        return _call((self.fn, self.jacobian, t, args), y)
+
+
+@eqx.filter_custom_jvp
+def _call(others: Any, y: Y) -> Values:
+    fn, _, t, args = others
+    return jtu.tree_map(jnp.asarray, fn(t, y, args))
+
+
+@_call.def_jvp
+def _call_jvp(primals, tangents):
+    """`J ẏ`, and what autodiff says of the time, the parameters and the arrays of `fn`."""
+    others, y = primals
+    t_others, t_y = tangents
+    fn, jacobian, t, args = others
+    value = _call(others, y)
+    total = None
+    if any(x is not None for x in jtu.tree_leaves(t_y)):
+        t_y = tree_tangents(y, t_y)
+        rows = jacobian(t, y, args)
+        total = jtu.tree_map(lambda v, row: _product(v, row, t_y), value, rows)
+    t_fn, _, t_t, t_args = t_others
+    if jtu.tree_leaves((t_fn, t_t, t_args)):
+        given = (fn, t, args), (t_fn, t_t, t_args)
+        _, rest = eqx.filter_jvp(lambda f, t, args: f(t, y, args), *given)
+        rest = tree_tangents(value, rest)
+        total = rest if total is None else jtu.tree_map(jnp.add, total, rest)
+    if total is None:
+        total = jtu.tree_map(jnp.zeros_like, value)
+    return value, total
+
+
+def _product(value: Array, row: Any, t_y: Y) -> Array:
+    """`row · ẏ`, where `row` is shaped like the state, each leaf with the axes of `value` first."""
+    expected = jtu.tree_map(lambda t: value.shape + t.shape, t_y)
+    got = jtu.tree_map(jnp.shape, row)
+    if got != expected:
+        raise ValueError(
+            f"`jacobian` returned arrays of the shapes {got}, but they must be {expected}: for "
+            "each array that `fn` returns a PyTree like the state, each leaf with the axes of that "
+            "array first, as `jax.jacrev(fn, argnums=1)` returns them."
+        )
+    terms = jtu.tree_map(
+        lambda r, t: jnp.real(jnp.tensordot(jnp.asarray(r), t, axes=t.ndim)).astype(value.dtype),
+        row,
+        t_y,
+    )
+    return sum(jtu.tree_leaves(terms))  # pyright: ignore[reportReturnType]

@@ -1,0 +1,239 @@
+"""Complex states: real functions of them, kept by corrections of real and imaginary parts."""
+
+import diffrax as dfx
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import diffrax_conserve as dfc
+
+pytestmark = pytest.mark.filterwarnings("ignore:Complex dtype support")
+
+# ---- A soliton of the nonlinear Schrödinger equation ----
+
+POINTS, LENGTH = 128, 40.0
+GRID = LENGTH * (np.arange(POINTS) / POINTS - 0.5)
+WAVES = 2 * np.pi * np.fft.fftfreq(POINTS, LENGTH / POINTS)
+
+
+def schroedinger(t, u, args):
+    """`i u' = -u''/2 - |u|² u`, by Fourier transforms."""
+    return 0.5j * jnp.fft.ifft(-(WAVES**2) * jnp.fft.fft(u)) + 1j * jnp.abs(u) ** 2 * u
+
+
+def norm(t, u, args):
+    return jnp.sum(u.real**2 + u.imag**2) * LENGTH / POINTS
+
+
+def energy(t, u, args):
+    slope = jnp.fft.ifft(1j * WAVES * jnp.fft.fft(u))
+    squares = [x.real**2 + x.imag**2 for x in (slope, u)]
+    return jnp.sum(squares[0] - squares[1] ** 2) / 2 * LENGTH / POINTS
+
+
+# At the largest wave number of an even grid the square of a first derivative is not the second.
+SOLITON = jnp.asarray((1 / np.cosh(GRID)).astype(complex))
+MANIFOLD = {"norm": dfc.FirstIntegral(norm), "energy": dfc.FirstIntegral(energy)}
+
+
+@eqx.filter_jit
+def soliton(solver, steps):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(schroedinger),
+        solver,
+        0.0,
+        0.02 * steps,
+        0.02,
+        SOLITON,
+        max_steps=steps + 1,
+        saveat=dfx.SaveAt(t0=True, ts=jnp.linspace(0, 0.02 * steps, 51)[1:]),
+    )
+
+
+@pytest.mark.parametrize("steps", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_a_soliton_keeps_norm_and_energy(steps):
+    sol = soliton(dfc.ManifoldProjection(dfc.RK4(), MANIFOLD), steps)
+    for drift in jax.tree.leaves(dfc.drift(sol, MANIFOLD)):
+        assert jnp.max(jnp.abs(drift)) < 4e-15
+    if steps == 200:
+        exact = SOLITON * np.exp(0.5j * 4.0)
+        assert np.max(np.abs(sol.ys[-1] - exact)) < 1e-5
+        plain = dfc.drift(soliton(dfc.RK4(), steps), MANIFOLD)
+        assert max(jnp.max(jnp.abs(x)) for x in jax.tree.leaves(plain)) > 1e-12
+
+
+def test_the_invariance_is_proved():
+    def states(key):
+        parts = jax.random.normal(key, (2, POINTS)) * np.exp(-(GRID**2) / 9)
+        return parts[0] + 1j * parts[1]
+
+    assert dfc.check_invariance(schroedinger, MANIFOLD, states, num_states=5).ok
+    wrong = dfc.FirstIntegral(lambda t, u, args: jnp.sum(u.real**2))
+    assert not dfc.check_invariance(schroedinger, wrong, states, num_states=5).ok
+
+
+# ---- A small one, and the same in real numbers ----
+
+
+def field(t, y, args):
+    """Two oscillators that exchange quanta, and one by itself."""
+    a, b = y["z"]
+    coupling = args * jnp.stack([b, a])
+    return {"z": -1j * (jnp.array([1.0, 2.0]) * y["z"] + coupling), "x": -1j * y["x"]}
+
+
+def quanta(t, y, args):
+    z = y["z"]
+    return {
+        "number": jnp.sum(z.real**2 + z.imag**2),
+        "energy": jnp.sum(jnp.array([1.0, 2.0]) * jnp.abs(z) ** 2)
+        + 2 * args * jnp.real(jnp.conj(z[0]) * z[1]),
+        "amplitude": jnp.sum(jnp.abs(y["x"]) ** 2),
+    }
+
+
+QUANTA = dfc.FirstIntegral(quanta)
+Z0 = {"z": jnp.array([1.0 + 0.5j, -0.3 + 0.2j]), "x": jnp.array([0.6 + 0.1j])}
+ARGS = jnp.array(0.3)
+
+
+def split(y):
+    return {"re": y["z"].real, "im": y["z"].imag, "x": jnp.stack([y["x"].real, y["x"].imag])}
+
+
+def join(y):
+    return {"z": y["re"] + 1j * y["im"], "x": y["x"][..., 0, :] + 1j * y["x"][..., 1, :]}
+
+
+def real_field(t, y, args):
+    return split(field(t, join(y), args))
+
+
+REAL_QUANTA = dfc.FirstIntegral(lambda t, y, args: quanta(t, join(y), args))
+TWO = jnp.array([2.0, 5.0])
+SIMPLIFIED = dfc.SimplifiedNewton()
+PROJECTIONS = {
+    "simplified": (SIMPLIFIED, SIMPLIFIED),
+    "newton": (dfc.Newton(), dfc.Newton()),
+    "metric": (
+        dfc.SimplifiedNewton(metric={"z": TWO, "x": 3.0}),
+        dfc.SimplifiedNewton(
+            metric={"re": jnp.array([2.0, 5.0]), "im": jnp.array([2.0, 5.0]), "x": 3.0}
+        ),
+    ),
+    "bounded": (dfc.SimplifiedNewton(upper=0.98), dfc.SimplifiedNewton(upper=0.98)),
+    "staged": (dfc.Staged(("q", SIMPLIFIED)), dfc.Staged(("q", SIMPLIFIED))),
+}
+
+
+@eqx.filter_jit
+def solve(projection, y0=Z0, args=ARGS, vf=field, manifold=QUANTA, inner=None, **options):
+    inner = dfx.Bosh3() if inner is None else inner
+    solver = dfc.ManifoldProjection(inner, {"q": manifold}, projection=projection)
+    options = {"t1": 0.6, "dt0": 0.1, "throw": False} | options
+    t1, dt0 = options.pop("t1"), options.pop("dt0")
+    return dfx.diffeqsolve(dfx.ODETerm(vf), solver, 0.0, t1, dt0, y0, args, **options)
+
+
+@pytest.mark.parametrize("name", PROJECTIONS)
+def test_it_is_the_solve_in_real_and_imaginary_parts(name):
+    complex_one, real_one = PROJECTIONS[name]
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9), dense=True)
+    got = solve(complex_one, saveat=saveat)
+    expected = solve(real_one, split(Z0), vf=real_field, manifold=REAL_QUANTA, saveat=saveat)
+    assert got.ys["z"].dtype == jnp.complex128
+    for a, b in [
+        (got.ys, join(expected.ys)),
+        (got.evaluate(0.37), join(expected.evaluate(0.37))),
+    ]:
+        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-11)
+    assert (got.result == dfx.RESULTS.successful) == (expected.result == dfx.RESULTS.successful)
+
+
+def test_adaptive_steps_directions_and_formulas():
+    number = {"q": dfc.FirstIntegral(lambda t, y, args: quanta(t, y, args)["number"])}
+    controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+
+    def scaled(t, y, args, values):
+        now = jnp.sqrt(values["q"] / quanta(t, y, args)["number"])
+        return y | {"z": y["z"] * now}
+
+    for projection in (dfc.Directional(), dfc.ClosedForm(scaled), dfc.SimplifiedNewton()):
+        sol = solve(
+            projection,
+            manifold=number["q"],
+            stepsize_controller=controller,
+            inner=dfx.Tsit5(),
+            saveat=dfx.SaveAt(t0=True, steps=True),
+        )
+        assert sol.result == dfx.RESULTS.successful
+        assert jnp.max(jnp.abs(dfc.drift(sol, number, ARGS)["q"])) < 4e-15
+
+
+def test_derivatives_agree_with_those_in_parts():
+    def run(vf, manifold, adjoint):
+        def end(y0, args):
+            ys = solve(SIMPLIFIED, y0, args, vf, manifold, adjoint=adjoint).ys
+            return jax.tree.map(lambda x: x[-1], ys)
+
+        return end
+
+    reverse, forward = dfx.RecursiveCheckpointAdjoint(), dfx.ForwardMode()
+
+    def total(y):
+        z, x = y["z"], y["x"]
+        return z[0].real + 2 * z[1].real + jnp.sum(z.imag**2) + x[0].real
+
+    got = jax.grad(lambda y, a: total(run(field, QUANTA, reverse)(y, a)), (0, 1))(Z0, ARGS)
+    expected = jax.grad(
+        lambda y, a: total(join(run(real_field, REAL_QUANTA, reverse)(y, a))), (0, 1)
+    )(split(Z0), ARGS)
+    # jax's convention of the gradient by a complex number: the conjugate.
+    np.testing.assert_allclose(got[0]["z"], expected[0]["re"] - 1j * expected[0]["im"], rtol=1e-10)
+    np.testing.assert_allclose(got[1], expected[1], rtol=1e-10)
+    t = jax.tree.map(lambda x: (0.3 + 0.7j) * x if jnp.iscomplexobj(x) else x, Z0)
+    _, along = jax.jvp(lambda y: run(field, QUANTA, forward)(y, ARGS), (Z0,), (t,))
+    _, parts = jax.jvp(
+        lambda y: run(real_field, REAL_QUANTA, forward)(y, ARGS), (split(Z0),), (split(t),)
+    )
+    np.testing.assert_allclose(along["z"], join(parts)["z"], rtol=1e-10)
+
+
+@settings(max_examples=15)
+@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6))
+def test_project_alone_and_in_a_batch(numbers):
+    y = {
+        "z": jnp.array([1 + 0.1 * numbers[0] + 0.1j * numbers[1], 0.5 + 0.2j * numbers[2]]),
+        "x": jnp.array([0.7 + (0.4 + 0.1 * numbers[3]) * 1j]),
+    }
+    (alone, info), batch = projected(y)
+    if info.ok:
+        found = quanta(0.0, alone, ARGS)
+        np.testing.assert_allclose(found["number"], 1.3, rtol=1e-14)
+        np.testing.assert_allclose(found["amplitude"], 0.6, rtol=1e-14)
+        np.testing.assert_allclose(batch["z"][1], alone["z"], rtol=1e-12)
+
+
+CIRCLES = dfc.FirstIntegral(
+    lambda t, y, args: {k: quanta(t, y, args)[k] for k in ("number", "amplitude")}
+)
+VALUE = {"number": 1.3, "amplitude": 0.6}
+
+
+@eqx.filter_jit
+def projected(y):
+    def one(y):
+        return dfc.project(CIRCLES, y, value=VALUE, args=ARGS, projection=SIMPLIFIED)
+
+    sizes = jnp.array([1.01, 1.0])
+    return one(y), jax.vmap(lambda s: one(jax.tree.map(lambda x: s * x, y))[0])(sizes)
+
+
+def test_a_complex_value_is_refused():
+    with pytest.raises(TypeError, match="real and its imaginary"):
+        dfc.project(dfc.Constraint(lambda t, y, args: y[0]), jnp.ones(2) * 1j)

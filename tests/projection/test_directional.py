@@ -1,0 +1,162 @@
+"""Projection along the error estimate."""
+
+import diffrax as dfx
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+MASSES = jnp.array([1.0, 2.0, 0.7])
+
+
+def chain(t, y, args):
+    """Three masses on nonlinear springs between them: total momentum is kept."""
+    q, v = y
+    s = args * (jnp.diff(q) + jnp.diff(q) ** 3)
+    return v, jnp.array([s[0], s[1] - s[0], -s[1]]) / MASSES
+
+
+def energy(t, y, args):
+    q, v = y
+    x = jnp.diff(q)
+    return jnp.sum(MASSES * v**2) / 2 + args * jnp.sum(x**2 / 2 + x**4 / 4)
+
+
+def momentum(y):
+    return jnp.sum(MASSES * y[1], axis=-1)
+
+
+ENERGY, TERM = dfc.FirstIntegral(energy), dfx.ODETerm(chain)
+Y0 = jnp.array([0.0, 0.5, -0.3]), jnp.array([0.4, -0.1, 0.9])
+ONE = jnp.array(1.0)
+
+
+@eqx.filter_jit
+def solve(inner, y0=Y0, args=ONE, t1=3.0, dt0=0.05, **options):
+    solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())
+    return dfx.diffeqsolve(TERM, solver, 0.0, t1, dt0, y0, args, **options)
+
+
+ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("inner", [dfx.Tsit5(), dfx.Dopri5()], ids=["tsit5", "dopri5"])
+@pytest.mark.parametrize(
+    "options", [{}, {"stepsize_controller": ADAPTIVE}], ids=["fixed", "adaptive"]
+)
+def test_energy_and_momentum_are_kept_at_every_saved_time(inner, options):
+    sol = solve(inner, saveat=dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True), **options)
+    assert jnp.max(jnp.abs(dfc.drift(sol, ENERGY, ONE))) < 4e-15
+    np.testing.assert_allclose(momentum(sol.ys), momentum(Y0), rtol=1e-13)
+    between = jax.vmap(sol.evaluate)(jnp.linspace(0.0, 3.0, 77))
+    np.testing.assert_allclose(momentum(between), momentum(Y0), rtol=1e-13)
+    np.testing.assert_allclose(
+        jax.vmap(energy, (None, 0, None))(0.0, between, ONE), energy(0.0, Y0, ONE), rtol=4e-15
+    )
+
+
+def test_it_lies_on_the_line_along_the_embedded_difference():
+    """One step against Dopri5 by hand, with the root from numpy."""
+    plain = dfx.diffeqsolve(TERM, dfx.Dopri5(), 0.0, 0.2, 0.2, Y0, ONE).ys
+    _, error, *_ = dfx.Dopri5().step(
+        TERM, 0.0, 0.2, Y0, ONE, dfx.Dopri5().init(TERM, 0.0, 0.2, Y0, ONE), False
+    )
+    found = solve(dfx.Dopri5(), t1=0.2, dt0=0.2).ys
+    w = np.concatenate(error)
+    moved = np.concatenate([a[-1] - b[-1] for a, b in zip(found, plain, strict=True)])
+    np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), atol=1e-15)
+    assert abs(energy(0.0, jax.tree.map(lambda x: x[-1], plain), ONE) - energy(0.0, Y0, ONE)) > 1e-9
+
+
+@pytest.mark.parametrize(
+    ("inner", "order"),
+    [pytest.param(dfx.Bosh3(), 3, id="bosh3"), pytest.param(dfx.Dopri5(), 5, id="dopri5")],
+)
+def test_the_order_survives(inner, order):
+    solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())
+    dct.assert_order(solver, TERM, Y0, t1=0.3, dt0=0.05, args=ONE, order=order)
+
+
+def test_derivatives_in_both_modes_agree_with_finite_differences():
+    def run(y0, args):
+        return jax.tree.map(lambda x: x[-1], solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2).ys)
+
+    def forward(y0, args):
+        sol = solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2, adjoint=dfx.ForwardMode())
+        return jax.tree.map(lambda x: x[-1], sol.ys)
+
+    dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=False)
+    t = (Y0, ONE)
+    _, along = jax.jvp(forward, t, t)
+    _, pull = jax.vjp(run, *t)
+    weights = jax.tree.map(jnp.ones_like, along)
+    a = sum(jnp.sum(x * y) for x, y in zip(along, weights, strict=True))
+    back = pull(weights)
+    b = sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(t), strict=True))
+    np.testing.assert_allclose(a, b, rtol=1e-10)
+
+
+@settings(max_examples=5)
+@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6))
+def test_a_lane_of_a_batch_is_that_lane_alone_and_success_means_kept(numbers):
+    numbers = jnp.array(numbers)
+    y0 = Y0[0] + 0.3 * numbers[:3], Y0[1] + 0.3 * numbers[3:]
+    alone = solve(dfx.Tsit5(), y0, t1=0.5, throw=False)
+    batch = lanes(jax.tree.map(lambda a, b: jnp.stack([a, b, a]), Y0, y0))
+    np.testing.assert_allclose(batch[0][1], alone.ys[0], rtol=1e-8)
+    if alone.result == dfx.RESULTS.successful:
+        end = jax.tree.map(lambda x: x[-1], alone.ys)
+        np.testing.assert_allclose(energy(0, end, ONE), energy(0, y0, ONE), rtol=1e-13)
+        np.testing.assert_allclose(momentum(end), momentum(y0), atol=1e-14)
+
+
+@eqx.filter_jit
+def lanes(y0):
+    return jax.vmap(lambda y: solve(dfx.Tsit5(), y, t1=0.5, throw=False).ys)(y0)
+
+
+def test_a_tangent_direction_is_a_failure():
+    """On a circle whose field is constant speed, the error estimate is made tangent by hand."""
+
+    class Tangent(dfx.Euler):
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            y1, _, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+            return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
+
+    circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(Tangent(), circle, projection=dfc.Directional())
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+    sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
+def test_what_cannot_be_is_refused_before_compilation():
+    two = (ENERGY, dfc.FirstIntegral(lambda t, y, args: momentum(y)))
+
+    def run(inner, manifold):
+        solver = dfc.ManifoldProjection(inner, manifold, projection=dfc.Directional())
+        jax.eval_shape(lambda: dfx.diffeqsolve(TERM, solver, 0, 1, 0.1, Y0, ONE).ys)
+
+    with pytest.raises(ValueError, match="2 scalar constraints"):
+        run(dfx.Tsit5(), two)
+    with pytest.raises(ValueError, match="without its sign"):
+        run(dfx.HalfSolver(dfc.RK4()), ENERGY)
+    with pytest.raises(ValueError, match="embedded method"):
+        run(dfc.RK4(), ENERGY)
+    with pytest.raises(ValueError, match=r"Elsewhere pass `projection=Newton\(\)`"):
+        dfc.project(ENERGY, Y0, args=ONE, value=0.0, projection=dfc.Directional())
+
+
+def test_a_value_of_its_own_can_be_reached_by_the_first_step():
+    value = energy(0.0, Y0, ONE) * (1 + 1e-9)
+    near = dfc.FirstIntegral(energy, value=value)
+    solver = dfc.ManifoldProjection(dfx.Dopri5(), near, projection=dfc.Directional())
+    sol = dfx.diffeqsolve(TERM, solver, 0.0, 1.0, 0.1, Y0, ONE)
+    end = jax.tree.map(lambda x: x[-1], sol.ys)
+    np.testing.assert_allclose(energy(0.0, end, ONE), value, rtol=1e-13)

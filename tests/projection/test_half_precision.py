@@ -1,0 +1,48 @@
+"""States of half precision work with every projection, or are refused with a remedy."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+SQUARE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+WORK = {
+    "simplified": dfc.SimplifiedNewton(),
+    "bounded": dfc.SimplifiedNewton(lower=-2.0),
+    "formula": dfc.ClosedForm(lambda t, y, args, v: y * jnp.sqrt(v["square"] / jnp.sum(y**2))),
+    "directional": dfc.Directional(),
+    "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
+}
+DTYPES = pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+
+
+def solve(projection, dtype):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])),
+        dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection),
+        *jnp.array([0, 1, 0.125], dtype),
+        jnp.array([1.0, 0.5], dtype),
+        saveat=dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype)),
+    )
+
+
+@DTYPES
+@pytest.mark.parametrize("name", WORK)
+def test_it_works_in_half_precision(name, dtype):
+    ys = solve(WORK[name], dtype).ys
+    assert ys.dtype == dtype
+    squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
+    # The tolerance, of a scale of three times the square, and what rounding the state costs.
+    np.testing.assert_allclose(
+        squares, 1.25, atol=(16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
+    )
+
+
+@DTYPES
+@pytest.mark.parametrize("projection", [dfc.Newton(), dfc.Newton(upper=2.0)])
+def test_it_is_refused_before_compilation(projection, dtype):
+    with pytest.raises(TypeError, match="Convert the state to float32"):
+        jax.eval_shape(lambda: solve(projection, dtype).ys)

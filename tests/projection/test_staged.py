@@ -1,0 +1,131 @@
+"""Projection part by part: positions, then velocities."""
+
+import diffrax as dfx
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+GRAVITY = 13.7503716373294544  # that of cvPendulum: the period is 2
+INF = jnp.inf
+
+
+def pendulum(t, y, args):
+    q, v = y
+    tension = jnp.sum(v**2) - args * q[1]
+    return v, -q * tension - jnp.stack([jnp.zeros_like(args), args])
+
+
+MANIFOLD = {
+    "tangent": dfc.Constraint(lambda t, y, args: jnp.sum(y[0] * y[1])),
+    "circle": dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1),
+}
+FIRST, SECOND = (
+    dfc.SimplifiedNewton(metric=(1.0, INF), atol=1e-15),
+    dfc.SimplifiedNewton(metric=(INF, 1.0), atol=1e-15),
+)
+STAGED = dfc.Staged(("circle", FIRST), ("tangent", SECOND))
+Y0, TERM = (jnp.array([1.0, 0.0]), jnp.zeros(2)), dfx.ODETerm(pendulum)
+
+
+@eqx.filter_jit
+def solve(projection, y0=Y0, args=GRAVITY, t1=30.0, tol=1e-7, **options):
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), MANIFOLD, projection=projection)
+    controller = dfx.PIDController(rtol=tol, atol=tol)
+    options = {"dt0": None, "stepsize_controller": controller, "max_steps": 4096} | options
+    return dfx.diffeqsolve(TERM, solver, 0.0, t1, y0=y0, args=jnp.asarray(args), **options)
+
+
+def test_cvode_s_pendulum():
+    """After 15 periods it is where it was. CVODE itself is off by 7.8e-5."""
+    errors = [
+        np.max(np.abs(solve(projection).ys[0][-1] - np.array([1.0, 0.0])))
+        for projection in (dfc.SimplifiedNewton(atol=1e-15), STAGED)
+    ]
+    assert errors[0] > 1e-6
+    assert errors[1] < 2e-7
+
+
+vectors = st.tuples(st.floats(-1, 1), st.floats(-1, 1)).map(np.array)
+
+
+@eqx.filter_jit
+def projected(y):
+    return dfc.project(MANIFOLD, y, projection=STAGED)
+
+
+@settings(max_examples=20)
+@given(st.floats(0, 6.3), vectors, vectors, vectors)
+def test_it_is_the_two_projections_by_hand(angle, velocity, dq, dv):
+    """Radially to the circle, then the velocity along it: CVODE's `proj`."""
+    q = np.array([np.cos(angle), np.sin(angle)]) + 1e-2 * dq
+    v = velocity + 1e-2 * dv
+    (found_q, found_v), info = projected((q, v))
+    unit = q / np.linalg.norm(q)
+    assert info.ok
+    np.testing.assert_allclose(found_q, unit, atol=4e-15)
+    np.testing.assert_allclose(found_v, v - unit * (unit @ v), atol=4e-15)
+
+
+def test_what_an_earlier_stage_reached_is_held():
+    """Even where a later one may move everything."""
+    radius = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**3))
+    y = jnp.array([1.0, 0.5, -0.2])
+    staged = dfc.Staged((0, dfc.SimplifiedNewton()), (1, dfc.SimplifiedNewton()))
+    found, info = dfc.project((radius, total), 1.01 * y, value=(1.29, 1.117), projection=staged)
+    assert info.ok
+    np.testing.assert_allclose([found @ found, jnp.sum(found**3)], [1.29, 1.117], rtol=4e-15)
+
+
+def test_saved_times_and_dense_output_are_on_both():
+    sol = solve(STAGED, t1=2.0, saveat=dfx.SaveAt(ts=jnp.linspace(0, 2, 41), dense=True))
+    between = jax.vmap(sol.evaluate)(jnp.linspace(0, 2, 33))
+    for q, v in (sol.ys, between):
+        np.testing.assert_allclose(jnp.sum(q**2, axis=1), 1, atol=4e-15)
+        np.testing.assert_allclose(jnp.sum(q * v, axis=1), 0, atol=1e-14)
+
+
+def test_derivatives_in_both_modes_agree_with_finite_differences():
+    def run(adjoint):
+        fixed = {"dt0": 0.05, "stepsize_controller": dfx.ConstantStepSize(), "t1": 0.3}
+        return lambda args: [x[-1] for x in solve(STAGED, Y0, args, adjoint=adjoint, **fixed).ys]
+
+    gravity = jnp.array(GRAVITY)
+    reverse, forward = run(dfx.RecursiveCheckpointAdjoint()), run(dfx.ForwardMode())
+    dct.assert_gradients(reverse, gravity, rtol=1e-6, forward=False)
+    dct.assert_gradients(forward, gravity, rtol=1e-6, reverse=False)
+
+
+def test_a_lane_of_a_batch_is_that_lane_alone():
+    gravities = jnp.array([9.81, 13.0, 1.6])
+    batch = jax.vmap(lambda g: solve(STAGED, args=g, t1=1.0).ys[0])(gravities)
+    np.testing.assert_allclose(batch[2], solve(STAGED, args=1.6, t1=1.0).ys[0], rtol=1e-11)
+
+
+def test_a_stage_that_cannot_hold_is_a_failure():
+    """Positions on the circle cannot be reached by moving velocities."""
+    wrong = dfc.Staged(("circle", SECOND), ("tangent", SECOND))
+    _, info = dfc.project(MANIFOLD, (jnp.array([1.1, 0.0]), jnp.ones(2)), projection=wrong)
+    assert not info.ok
+
+
+@pytest.mark.parametrize(
+    "stages", [(("circle", FIRST),), (("circle", FIRST), ("circle", SECOND)), (("no", FIRST),)]
+)
+def test_each_entry_has_one_stage(stages):
+    with pytest.raises(ValueError, match="Give each entry one stage"):
+        dfc.project(MANIFOLD, Y0, projection=dfc.Staged(*stages))
+
+
+def test_a_stage_is_a_pair():
+    with pytest.raises(TypeError, match="must be a pair"):
+        dfc.Staged(FIRST)
+    with pytest.raises(TypeError, match="not a projection of a state by itself"):
+        dfc.Staged(("circle", dfc.Directional()))

@@ -1,0 +1,142 @@
+"""What a projection of a user sees of the step, with relaxation in Ketcheson's sense."""
+
+from typing import ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
+
+
+def pendulum(t, y, args):
+    return jnp.stack([y[1], -args * jnp.sin(y[0])])
+
+
+def energy(t, y, args):
+    return y[1] ** 2 / 2 - args * jnp.cos(y[0])
+
+
+ENERGY, TERM = dfc.FirstIntegral(energy), dfx.ODETerm(pendulum)
+Y0, ONE = jnp.array([1.5, 0.0]), jnp.array(1.0)
+
+
+class Relaxation(dfc.AbstractProjection):
+    metric: None = None
+
+    def solve(self, problem, candidate):
+        y0 = problem.step.y0
+        gamma = jnp.ones(())
+        for _ in range(5):
+            g, slope = jax.jvp(
+                lambda x: problem.residual(y0 + x * (candidate - y0))[0], (gamma,), (1.0,)
+            )
+            gamma = gamma - jnp.where(slope == 0, 0, g / jnp.where(slope == 0, 1, slope))
+        y = y0 + gamma * (candidate - y0)
+        return y, problem.judge(candidate, y, num_steps=5)
+
+
+RELAXED = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=Relaxation())
+
+
+@eqx.filter_jit
+def solve(solver, y0=Y0, args=ONE, t1=2.0, dt0=0.1, **options):
+    return dfx.diffeqsolve(TERM, solver, 0.0, t1, dt0, y0, args, **options)
+
+
+def test_relaxation_keeps_the_energy_at_every_saved_time():
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 57), dense=True)
+    sol = solve(RELAXED, saveat=saveat)
+    assert jnp.max(jnp.abs(dfc.drift(sol, ENERGY, ONE))) < 4e-15
+    ys = jax.vmap(sol.evaluate)(jnp.linspace(0, 2, 91))
+    energies = jax.vmap(energy, (None, 0, None))(0, ys, ONE)
+    np.testing.assert_allclose(energies, energy(0, Y0, ONE), atol=4e-15)
+
+
+def test_relaxation_with_the_time_kept_loses_at_most_one_order():
+    dct.assert_order(RELAXED, TERM, Y0, t1=2.0, dt0=0.2, args=ONE, order=3)
+
+
+def test_the_derivative_of_relaxation_is_that_of_its_solve():
+    def run(adjoint):
+        return lambda y0, args: solve(RELAXED, y0, args, adjoint=adjoint).ys[-1]
+
+    reverse, forward = run(dfx.RecursiveCheckpointAdjoint()), run(dfx.ForwardMode())
+    dct.assert_gradients(reverse, Y0, ONE, rtol=1e-6, forward=False)
+    dct.assert_gradients(forward, Y0, ONE, rtol=1e-6, reverse=False)
+
+
+def test_a_lane_of_a_batch_is_that_lane_alone():
+    sizes = jnp.array([0.5, 1.0, 0.7])
+    batch = jax.vmap(lambda s: solve(RELAXED, s * Y0).ys[-1])(sizes)
+    np.testing.assert_allclose(batch[2], solve(RELAXED, 0.7 * Y0).ys[-1], rtol=1e-13)
+
+
+class Seen(dfc.AbstractProjection):
+    """Moves nothing, and checks what it sees against what the solver knows."""
+
+    metric: None = None
+
+    def solve(self, problem, candidate):
+        step = problem.step
+        inside = jnp.abs(problem.t - step.t0) <= jnp.abs(step.t1 - step.t0)
+        dense = jnp.max(jnp.abs(step.evaluate(problem.t) - candidate)) < 1e-14
+        start = jnp.max(jnp.abs(step.evaluate(step.t0) - step.y0)) < 1e-14
+        # The error estimate of a step of Bosh3, from the field alone.
+        h = step.t1 - step.t0
+        k1 = pendulum(0, step.y0, problem.args)
+        k2 = pendulum(0, step.y0 + h / 2 * k1, problem.args)
+        k3 = pendulum(0, step.y0 + 3 / 4 * h * k2, problem.args)
+        y1 = step.y0 + h * (2 / 9 * k1 + 1 / 3 * k2 + 4 / 9 * k3)
+        k4 = pendulum(0, y1, problem.args)
+        error = y1 - step.y0 - h * (7 / 24 * k1 + k2 / 4 + k3 / 3 + k4 / 8)
+        estimate = jnp.max(jnp.abs(jnp.abs(step.error) - jnp.abs(error))) < 1e-14
+        right = inside & dense & start & estimate & (step.t1 != step.t0)
+        y = jnp.where(right, candidate, jnp.nan)
+        return y, problem.judge(candidate, y, atol=1.0)
+
+
+@pytest.mark.parametrize("t1", [1.0, -1.0], ids=["forwards", "backwards"])
+def test_a_projection_sees_the_step_of_every_candidate(t1):
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 23), dense=True)
+    sol = solve(solver, t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
+    plain = solve(dfx.Bosh3(), t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
+    assert sol.result == dfx.RESULTS.successful
+    np.testing.assert_allclose(sol.ys, plain.ys, atol=1e-14)
+    np.testing.assert_allclose(sol.evaluate(0.33 * t1), plain.evaluate(0.33 * t1), atol=1e-14)
+
+
+class Unseeing(Seen):
+    sees_step: ClassVar[bool] = False
+
+    def solve(self, problem, candidate):
+        assert problem.step is None
+        return candidate, problem.judge(candidate, candidate, atol=1.0)
+
+
+@pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton(), Unseeing()])
+def test_what_asks_for_no_step_gets_none_and_saves_none(projection):
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=projection)
+    sol = solve(solver, saveat=dfx.SaveAt(dense=True))
+    assert sol.interpolation.infos["error"] is None
+
+
+def test_outside_a_solve_there_is_no_step():
+    with pytest.raises(AttributeError, match="y0"):
+        dfc.project(ENERGY, Y0, args=ONE, value=0.0, projection=Relaxation())
+
+
+def test_what_is_no_solution_is_a_failure():
+    class Lazy(dfc.AbstractProjection):
+        metric: None = None
+
+        def solve(self, problem, candidate):
+            return candidate, problem.judge(candidate, candidate)
+
+    solver = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=Lazy())
+    assert solve(solver, dt0=0.3, throw=False).result != dfx.RESULTS.successful
