@@ -33,7 +33,7 @@ from .._tree import (
 from .base import Outcome, ProjectionInfo, check_like, report
 from .certainty import certain
 from .elimination import Vector
-from .implicit import solve_linearised
+from .implicit import solve_linearised, units
 from .iteration import Equations
 from .jacobian import AbstractJacobian
 from .linearise import linearise
@@ -269,7 +269,9 @@ def _project_into_jvp(primals, tangents, *, frozen, max_steps):
         unknowns = y, multiplier
         _, right = eqx.filter_jvp(lambda p: optimality(unknowns, p), (given,), (t_given,))
         right = jtu.tree_map(jnp.negative, tree_tangents(unknowns, right))
-        t_y, t_multiplier = solve_linearised(lambda x: optimality(x, given), unknowns, right)
+        t_y, t_multiplier = solve_linearised(
+            lambda x: optimality(x, given), unknowns, right, units(at_y, equations.weights)
+        )
     inside = Equations(
         equations.residual, equations.candidate, active, equations.magnitude, equations.tolerance
     )

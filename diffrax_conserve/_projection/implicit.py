@@ -1,4 +1,4 @@
-"""The linear systems of the implicit function theorem, in all unknowns of a projection."""
+"""The linear systems of the implicit function theorem, in the state and the multipliers."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,38 +7,70 @@ import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import lineax as lx
 from jaxtyping import Array, PyTree
+
+from .._custom_types import Y
+from .elimination import Vector
+from .jacobian import AbstractJacobian
 
 # Above this many unknowns systems are solved iteratively, matrix-free.
 SYSTEM_DENSE_MAX = 256
 
 
+def units(jacobian: AbstractJacobian, weights: Y) -> tuple[Y, Vector]:
+    """What components of the state and residuals are to be measured in, so that the condition of a
+    system does not depend on their units: the roots of the weights, and the norms of the rows of
+    `G` in that metric."""
+    roots = jtu.tree_map(jnp.sqrt, weights)
+    return jtu.tree_map(lambda x: jnp.where(x > 0, x, 1), (roots, jacobian.scale(roots)))
+
+
 def solve_linearised(
-    fn: Callable[[Any], Any], unknowns: PyTree[Array], right: PyTree[Array]
-) -> PyTree[Array]:
-    """The shortest solution of `F' x = right` for the Jacobian `F'` of `fn` at `unknowns`."""
-    x, unravel = jfu.ravel_pytree(unknowns)
-    b, _ = jfu.ravel_pytree(right)
-    if x.size > SYSTEM_DENSE_MAX:
-        eps = float(jnp.finfo(x.dtype).eps)
+    fn: Callable[[Any], Any],
+    unknowns: tuple[Y, Vector],
+    right: tuple[Y, Vector],
+    measured_in: tuple[Y, Vector],
+) -> tuple[Y, Vector]:
+    """The shortest solution of `F' x = right` for the Jacobian `F'` of `fn` at `unknowns`, which
+    are a state and multipliers. The values of `fn` are shaped like them, a state and residuals."""
+    rows = lax.stop_gradient(measured_in)
+    columns = rows[0], jtu.tree_map(lambda x: 1 / x, rows[1])
+
+    def divided(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
+        return jtu.tree_map(jnp.divide, a, b)
+
+    def scaled(x: tuple[Y, Vector]) -> tuple[Y, Vector]:
+        return divided(fn(jtu.tree_map(jnp.multiply, x, columns)), rows)
+
+    x, b = divided(unknowns, columns), divided(right, rows)
+    flat, unravel = jfu.ravel_pytree(x)
+    eps = float(jnp.finfo(flat.dtype).eps)
+    if flat.size > SYSTEM_DENSE_MAX:
         tolerance = eps ** (2 / 3)
-        operator = lx.JacobianLinearOperator(lambda y, _: fn(y), unknowns)
+        operator = lx.JacobianLinearOperator(lambda y, _: scaled(y), x)
         solver = lx.GMRES(rtol=tolerance, atol=tolerance)
-        return lx.linear_solve(operator, right, solver, throw=False).value
-    matrix = jax.jacfwd(lambda x: jfu.ravel_pytree(fn(unravel(x)))[0])(x)
-    # Rows and columns of comparable size, so that the condition is that of the problem.
-    columns = lax.stop_gradient(_sizes(matrix, 0))
-    rows = lax.stop_gradient(_sizes(matrix / columns, 1))
-    scaled = matrix / columns / rows[:, None]
-    finite = jnp.all(jnp.isfinite(scaled))
-    operator = lx.MatrixLinearOperator(jnp.where(finite, scaled, jnp.eye(x.size, dtype=x.dtype)))
-    # Dependent constraints make the system singular but consistent.
-    solver = lx.SVD(rcond=64 * float(jnp.finfo(x.dtype).eps))
-    solution = lx.linear_solve(operator, jnp.where(finite, b / rows, 0), solver, throw=False).value
-    return unravel(jnp.where(finite, 1, jnp.nan) * solution / columns)
+        solution = lx.linear_solve(operator, b, solver, throw=False).value
+    else:
+        matrix = jax.jacfwd(lambda x: jfu.ravel_pytree(scaled(unravel(x)))[0])(flat)
+        solution = unravel(_shortest(matrix, jfu.ravel_pytree(b)[0], 64 * eps))
+    return jtu.tree_map(jnp.multiply, solution, columns)
 
 
-def _sizes(matrix: Array, axis: int) -> Array:
-    size = jnp.max(jnp.abs(matrix), axis=axis)
-    return jnp.where(size > 0, size, 1)
+def _shortest(matrix: Array, b: Array, rcond: float) -> Array:
+    """By singular values: dependent constraints make the system singular but consistent. Whatever
+    is not finite makes the solution NaN, in both directions of a derivative."""
+    finite = jnp.all(jnp.isfinite(matrix))
+    matrix = jnp.where(finite, matrix, jnp.eye(len(b), dtype=matrix.dtype))
+    u, s, vt = jnp.linalg.svd(lax.stop_gradient(matrix))
+    inverse = jnp.where(s > rcond * s[0], 1 / s, 0)
+
+    def solve(_: Any, b: Array) -> Array:
+        return vt.T @ (inverse * (u.T @ b))
+
+    def transposed(_: Any, b: Array) -> Array:
+        return u @ (inverse * (vt @ b))
+
+    solution = lax.custom_linear_solve(lambda x: matrix @ x, b, solve, transposed)
+    return jnp.where(finite, 1, jnp.nan) * solution

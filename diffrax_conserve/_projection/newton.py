@@ -33,7 +33,7 @@ from .base import (
 from .bounded import box_of, check_bounds, project_into
 from .certainty import certain
 from .elimination import Vector
-from .implicit import SYSTEM_DENSE_MAX, solve_linearised
+from .implicit import SYSTEM_DENSE_MAX, solve_linearised, units
 from .iteration import Equations, iterate
 from .linearise import Residual, linearise
 from .residual import ROUNDOFF_MULTIPLE, within
@@ -157,7 +157,7 @@ def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector,
     _, jacobian = linearise(residual, start)
     offset = jacobian.pushforward(tree_sub(start, candidate))
     # Rows of norm one, so that a linear solver sees the rank of the system.
-    norms = jnp.where(jacobian.scale(start) > 0, jacobian.scale(start), 1)
+    _, norms = units(jacobian, weights)
     multiplier = jacobian.gram_solver(weights).solve(offset) * norms
     eps = float(jnp.finfo(working_dtype(candidate)).eps)
     tolerance = eps ** (2 / 3)
@@ -196,8 +196,11 @@ def _project_jvp(primals, tangents, *, max_steps):
     )
     right = tree_tangents(unknowns, right)
     given = parameters(equations)
-    t_y, t_multiplier = solve_linearised(lambda x: _optimality(x, given), unknowns, right)
     _, jacobian = linearise(given[0], y)
+    measured_in = units(jacobian, given[2])
+    t_y, t_multiplier = solve_linearised(
+        lambda x: _optimality(x, given), unknowns, right, measured_in
+    )
     factor = jnp.where(info.ok, certain(equations, y, jacobian), 1)
     t_y = tree_scale(lax.stop_gradient(factor), t_y)
     minus = lambda x: jtu.tree_map(jnp.negative, x)  # noqa: E731
