@@ -16,6 +16,7 @@ from ..._manifold import is_entry
 from ...systems import AbstractSystem
 from .._networks import (
     PINN,
+    Box,
     Concatenated,
     ConservativeLayer,
     DeepONet,
@@ -59,6 +60,8 @@ def describe(model: Any) -> dict[str, Any]:
             raise ValueError(f"A file cannot hold a core of the user's own, `{core.__name__}`.")
         config |= {"latent": latent, "core": core.__name__, "max_step": model.max_step}
         config |= {"state": _describe_state(model.state)}
+        if model.args_domain is not None:
+            config |= {"args": _describe_state(model.args_domain.lower)}
     return {"kind": type(model).__name__, "config": config, **_describe_parts(model)}
 
 
@@ -165,7 +168,8 @@ _DTYPES = ("float64", "float32", "float16", "bfloat16")
 def check_header(header: Any) -> None:
     """Raises `ValueError` unless this is a header that `save` can write."""
     _check(header, "the header", _HEADER)
-    _check(header["config"], "`config`", _CONFIG[header["kind"]])
+    known = {"args": object} if "args" in header["config"] and header["kind"] == "DeepONet" else {}
+    _check(header["config"], "`config`", _CONFIG[header["kind"]] | known)
     for name in PARTS:
         if header[name] is not None:
             _check(header[name], f"`{name}`", _PART[name])
@@ -176,6 +180,7 @@ def check_header(header: Any) -> None:
 def check_sizes(header: dict[str, Any], size: int) -> None:
     """Raises `ValueError` unless all described arrays are arrays that `size` bytes can hold."""
     leaves = _state_leaves(header["config"]["state"])
+    leaves += _state_leaves(header["config"].get("args"))
     for name in PARTS:
         system = None if header[name] is None else header[name]["system"]
         if system is not None:
@@ -311,14 +316,16 @@ def network_struct(header: Any, make_frame: Callable[[Any], MakeFrame | None], s
     Nothing is computed, and nothing is allocated. `make_frame` is called with `system`.
     """
 
-    def build(state: Any, system: Any) -> PINN | DeepONet:
-        config = {k: v for k, v in header["config"].items() if k != "state"}
+    def build(state: Any, args: Any, system: Any) -> PINN | DeepONet:
+        config = {k: v for k, v in header["config"].items() if k not in ("state", "args")}
         key = jr.key(0)
         if header["kind"] == "PINN":
             return PINN(state, config.pop("t0"), config.pop("t1"), key=key, **config)
         states = jtu.tree_map(lambda x: x[None], state)
         max_step, core = config.pop("max_step"), _CORES[config.pop("core")]
         frame = make_frame(system)
+        config |= {} if args is None else {"args_domain": Box(args, args)}
         return DeepONet(states, max_step, frame=frame, core=core, key=key, **config)
 
-    return eqx.filter_eval_shape(build, _state_struct(header["config"]["state"]), system)
+    state, args = (_state_struct(header["config"].get(name)) for name in ("state", "args"))
+    return eqx.filter_eval_shape(build, state, args, system)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike, Y
 from .flat import flatten, stacked_vectors, unflatten
-from .flow_map import AbstractFlowMap, as_flow_map
+from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .trainable import LayerSchedule
 
 
@@ -115,11 +115,11 @@ class Transformed(AbstractFlowMap):
         self.flow_map = as_flow_map(flow_map)
         self.transformation = transformation
 
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`."""
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         y0 = jtu.tree_map(jnp.asarray, y0)
         z0 = self.transformation(y0)
-        z1 = self.flow_map(z0, h, schedule)
+        z1 = self.flow_map(z0, *step, schedule=schedule)
         there = self.transformation.inverse(z1)
 
         def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
@@ -144,6 +144,11 @@ class Transformed(AbstractFlowMap):
         """The states whose coordinates are in the domain of the inner flow map, or `None`."""
         inner = self.flow_map.domain
         return None if inner is None else TransformedDomain(inner, self.transformation)
+
+    @property
+    def args_domain(self) -> Any:
+        """That of the inner flow map, or `None`. `args` are not transformed."""
+        return args_domain_of(self.flow_map)
 
     @property
     def layer(self) -> None:
