@@ -1,6 +1,6 @@
 """A learned step of POLLU against stiff solvers: time for a step of two minutes at equal error.
 
-    python benchmarks/learned/worth_stiff.py            # writes ../results/worth_stiff.json
+    python benchmarks/learned/worth_stiff.py FILE       # a network of `pollu.py --out FILE`
     python benchmarks/learned/worth_stiff.py --smoke    # toy sizes, to see that it runs
 
 A batch of states from solves as in `pollu.py`. Kvaerno3 and Kvaerno5 are those of diffrax,
@@ -117,10 +117,20 @@ def contestants(network, smoke):
     return found
 
 
+def untrained(states):
+    boxcox = dfc.learned.BoxCox(0.125)
+    inner = dfc.DeepONet(boxcox(states), STEP, width=8, depth=1, key=jr.key(0))
+    return dfc.learned.Transformed(inner, boxcox)
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("network", type=Path, nargs="?", help="what `pollu.py --out` wrote")
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
-    smoke = parser.parse_args(argv).smoke
+    options = parser.parse_args(argv)
+    smoke = options.smoke
+    if not smoke and options.network is None:
+        parser.error("name the file of a network, from `pollu.py --out FILE`")
     count, steps, tolerance = (2, 2, 1e-4) if smoke else (50, 20, 1e-8)
     y0s = jax.vmap(SYSTEM.sample)(jr.split(jr.key(77), count))
     ts = FIRST + STEP * jnp.arange(steps + 1)
@@ -129,7 +139,8 @@ def main(argv=None):
     )
     starts, exact = (np.asarray(x).reshape(-1, 20) for x in (ys[:, :-1], ys[:, 1:]))
     rows = []
-    for (name, setting), step in contestants(dfc.load_pretrained("pollu"), smoke).items():
+    network = untrained(y0s) if smoke else dfc.load(options.network)
+    for (name, setting), step in contestants(network, smoke).items():
         run = jax.jit(step).lower(starts).compile()
         found, times = np.asarray(run(starts)), []
         for _ in range(1 if smoke else 7):

@@ -39,8 +39,9 @@ def describe(model: Any) -> dict[str, Any]:
     """The configuration of a network, without its weights."""
     if not isinstance(model, PINN | DeepONet):
         raise TypeError(
-            "`save` writes a `PINN` or a `DeepONet`, also in a `Repeated`, but was given a "
-            f"{type(model).__name__}. For other Modules use `equinox.tree_serialise_leaves`."
+            "`save` writes a `PINN` or a `DeepONet`, also `Transformed` by a `BoxCox`, and in a "
+            f"`Repeated`, but was given a {type(model).__name__}. For other Modules use "
+            "`equinox.tree_serialise_leaves`."
         )
     width, depth, latent, function = model.sizes
     activation = activation_name(function)
@@ -167,7 +168,8 @@ _DTYPES = ("float64", "float32", "float16", "bfloat16")
 
 def check_header(header: Any) -> None:
     """Raises `ValueError` unless this is a header that `save` can write."""
-    _check(header, "the header", _HEADER)
+    optional = {"boxcox": _is_exponent} if isinstance(header, dict) and "boxcox" in header else {}
+    _check(header, "the header", _HEADER | optional)
     known = {"args": object} if "args" in header["config"] and header["kind"] == "DeepONet" else {}
     _check(header["config"], "`config`", _CONFIG[header["kind"]] | known)
     for name in PARTS:
@@ -213,6 +215,10 @@ def _is_depth(x: Any) -> bool:
 
 def _is_number(x: Any) -> bool:
     return type(x) in (int, float) and abs(x) < 1e300
+
+
+def _is_exponent(x: Any) -> bool:
+    return _is_number(x) and 0 <= x <= 1
 
 
 def _is_windows(x: Any) -> bool:
