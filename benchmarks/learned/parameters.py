@@ -96,7 +96,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     smoke = parser.parse_args(argv).smoke
-    epochs, count, seeds = (4, 3, 1) if smoke else (1000, 200, 2)
+    epochs, count, seeds = (4, 3, 1) if smoke else (1000, 200, 1)
     drawn = jax.vmap(DOMAIN.sample)(jr.split(jr.key(98), count))
     middle = jax.tree.map(lambda x: jnp.full(count, x), MIDDLE)
     rows = []
