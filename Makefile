@@ -96,7 +96,8 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 COSTS := overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
   random_features
-TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures pollu
+TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures pollu worth \
+  parameters
 STUDIES := first_same_as_last max_correction project_error claims
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs

@@ -373,3 +373,54 @@ def test_a_smoke_run_of_the_balances():
     rows = found["pendulum"]["weak friction"]
     assert rows["Tsit5 kept"]["energy"] < 0.1 * rows["Tsit5 plain"]["energy"]
     assert all(row["kept"] <= 1.2 * row["plain"] for row in found["entropy"])
+
+
+# ---- What a learned step is worth ----
+
+
+def test_at_equal_error_a_method_has_a_fraction_of_its_pieces():
+    worth = benchmark("worth")
+    errors = {1: 1e-2, 2: 1e-3, 4: 1e-5}
+    assert worth.around(errors, 1e-2) == (1, 2, 0.0)
+    assert worth.around(errors, 1e-3) == (1, 2, 1.0)
+    first, second, weight = worth.around(errors, 1e-4)
+    assert (first, second) == (2, 4)
+    np.testing.assert_allclose(weight, 0.5)
+    np.testing.assert_allclose(worth.around(errors, 1e-7)[2], 2.0)
+
+
+def test_the_table_of_what_a_learned_step_is_worth_is_in_the_documentation():
+    worth = benchmark("worth")
+    page = (FOLDER.parent / "docs" / "zoo.md").read_text(encoding="utf-8")
+    lines = worth.table(json.loads(worth.RESULTS.read_text())).splitlines()
+    assert len(lines) == 2 + len(worth.FORCES)
+    assert [line for line in lines if line not in page] == []
+
+
+def test_the_elimination_of_the_rosenbrock_method():
+    stiff = benchmark("worth_stiff")
+    matrix = jnp.array([[4.0, 1.0], [2.0, 5.0]])[:, :, None] * jnp.ones(3)
+    b = jnp.array([1.0, 2.0])[:, None] * jnp.ones(3)
+    x = stiff.elimination(matrix)(b)
+    np.testing.assert_allclose(x[:, 0], np.linalg.solve(matrix[:, :, 0], b[:, 0]), rtol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_what_a_learned_step_is_worth():
+    cheap, dear = benchmark("worth").main(["--smoke"])
+    for row in (cheap, dear):
+        assert all(b["ratio"] > 0 for b in row["batches"].values())
+    assert dear["batches"]["4"]["ratio"] > cheap["batches"]["4"]["ratio"]
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_a_family_of_equations():
+    (row,) = benchmark("parameters").main(["--smoke"])
+    assert row["family"]["step_rms"] > 0 < row["fixed"]["step_rms"]
+
+
+@pytest.mark.slow
+def test_a_smoke_run_of_stiff_chemistry_from_data():
+    found = benchmark("pollu").main(["--smoke"])
+    assert found["balances"] < 1e-13
+    assert found["smallest"] >= 0

@@ -38,6 +38,8 @@ NETWORKS = {
     "conservative deeponet": flow_map(layer=dfc.learned.ConservativeLayer(LORENZ.manifold)),
     "framed": vortices(taylor=dfc.learned.Taylor(VORTICES.vector_field)),
     "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
+    "transformed": dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.125)),
+    "both": dfc.learned.Repeated(dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.0)), 2),
 }
 
 

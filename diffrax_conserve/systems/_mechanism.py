@@ -4,9 +4,10 @@ import functools as ft
 import re
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._projection import ClosedForm
+from .._projection.elimination import unrolled_solver
 from ._base import real
 
 State = Float[Array, " species"]
@@ -160,21 +162,58 @@ class _Entropic(eqx.Module):
     def __call__(self, t: RealScalarLike, y: State, args: Args, values: object) -> State:
         del t, args
         assert isinstance(values, Mapping)
-        weights = jnp.asarray(self.rows, y.dtype)
-        target = jnp.stack([values[name] for name in self.names])
-        y = jnp.maximum(y, 0)
+        return _balanced(self.rows, y, jnp.stack([values[name] for name in self.names]))
 
-        def update(y: State, _: None) -> tuple[State, None]:
-            missing = target - jnp.sum(weights * y, axis=1)
-            gram = (weights * y) @ weights.T
-            exponents = weights.T @ jnp.linalg.solve(gram, missing)
-            return y * jnp.exp(jnp.clip(exponents, -_LONGEST, _LONGEST)), None
 
-        return lax.scan(update, y, length=_UPDATES)[0]
+Rows = tuple[tuple[int, ...], ...]
+
+
+@ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
+    """The state `max(y, 0) exp(Wᵀ μ)` with the balances `target`, by Newton's method for `μ`."""
+    y = jnp.maximum(y, 0)
+    small = _ROUNDOFF * jnp.finfo(y.dtype).eps
+
+    def missing(y: State) -> Float[Array, " balances"]:
+        # Sums of products in a loop: a matrix product rounds differently in a batch.
+        return target - jnp.sum(jnp.asarray(rows, y.dtype) * y, axis=1)
+
+    def off(carry: tuple[Array, Array, Array]) -> Array:
+        _, left, count = carry
+        return (count < _UPDATES) & jnp.any(jnp.abs(left) > small * jnp.abs(target))
+
+    def update(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        y, left, count = carry
+        exponents = _exponents(rows, y, left)
+        y = y * jnp.exp(jnp.clip(exponents, -_LONGEST, _LONGEST))
+        return y, missing(y), count + 1
+
+    return lax.while_loop(off, update, (y, missing(y), jnp.asarray(0)))[0]
+
+
+@_balanced.defjvp
+def _(rows: Rows, primals: Any, tangents: Any) -> Any:
+    """By the implicit function theorem: an iteration has no reverse mode, and needs none."""
+    (y, target), (t_y, t_target) = primals, tangents
+    out = _balanced(rows, y, target)
+    # Where `y` is zero the factor is that of the first balances, which nothing else tells.
+    t_out = jnp.where(y > 0, out / jnp.where(y > 0, y, 1), 0) * t_y
+    left = t_target - jnp.sum(jnp.asarray(rows, y.dtype) * t_out, axis=1)
+    return out, t_out + out * _exponents(rows, out, left)
+
+
+def _exponents(rows: Rows, y: State, left: Float[Array, " balances"]) -> State:
+    """The `Wᵀ μ` by which the balances of `y` change by `left`, to first order."""
+    weights = jnp.asarray(rows, y.dtype)
+    gram = [[jnp.sum(a * b * y) for b in weights] for a in weights]
+    multipliers = unrolled_solver(gram, 0.0).solve(tuple(left))
+    return sum((m * row for m, row in zip(multipliers, weights, strict=True)), jnp.zeros_like(y))
 
 
 # From errors of ten per cent: 1e-1, 5e-3, 1e-5, 1e-10, roundoff. Larger ones need more.
 _UPDATES, _LONGEST = 8, 1.0
+# In units of that of one number; a balance is a sum of several.
+_ROUNDOFF = 4
 
 
 class _Tables(NamedTuple):

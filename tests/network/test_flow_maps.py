@@ -161,3 +161,16 @@ def test_a_solve_across_windows():
     np.testing.assert_allclose(solve(plain), jax.vmap(pinn)(ts), atol=1e-8)
     projected = solve(dfc.ManifoldProjection(plain, RADIUS, projection=dfc.Newton()))
     np.testing.assert_allclose(jnp.sum(projected**2, axis=1), 1, rtol=4e-15)
+
+
+# ---- Other coordinates ----
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.1, 0.125, 0.25, 0.3, 1.0])
+def test_box_cox_is_a_power_and_has_an_inverse(exponent):
+    y = jnp.logspace(-12, 1, 40)
+    boxcox = dfc.learned.BoxCox(exponent)
+    expected = (y**exponent - 1) / exponent if exponent else jnp.log(y)
+    np.testing.assert_allclose(boxcox(y), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(boxcox.inverse(boxcox(y)), y, rtol=1e-10, atol=1e-15)
+    assert jnp.all(boxcox.inverse(-20.0 * jnp.ones(2)) >= 0)

@@ -166,6 +166,20 @@ def test_it_is_the_nearest_state_in_relative_entropy():
     np.testing.assert_allclose(weights.T @ coefficients, gradient, atol=1e-12)
 
 
+def test_its_derivatives_are_those_of_what_it_computes():
+    y = jnp.array(POLLU_60)
+    noise = jnp.exp(0.1 * jr.normal(jr.key(6), (2, 20)))
+    pull = jr.normal(jr.key(7), (20,)) / y
+
+    def found(s):
+        candidate = noise[0] * (1 + s * (noise[1] - 1))
+        return jnp.sum(pull * moved_back(y[None], candidate[None])[0][0])
+
+    slope = (found(1e-4) - found(-1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.jvp(found, (0.0,), (1.0,))[1], slope, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(found)(0.0), slope, rtol=1e-6)
+
+
 def test_a_stiff_solve_keeps_signs_and_balances():
     system = STIFF["pollu"]
     solver = dfc.ManifoldProjection(dfx.Kvaerno3(), system.manifold, projection=PROJECTION)

@@ -16,6 +16,7 @@ from ..._manifold import is_entry
 from ...systems import AbstractSystem
 from .._networks import (
     PINN,
+    Box,
     Concatenated,
     ConservativeLayer,
     DeepONet,
@@ -38,8 +39,9 @@ def describe(model: Any) -> dict[str, Any]:
     """The configuration of a network, without its weights."""
     if not isinstance(model, PINN | DeepONet):
         raise TypeError(
-            "`save` writes a `PINN` or a `DeepONet`, also in a `Repeated`, but was given a "
-            f"{type(model).__name__}. For other Modules use `equinox.tree_serialise_leaves`."
+            "`save` writes a `PINN` or a `DeepONet`, also `Transformed` by a `BoxCox`, and in a "
+            f"`Repeated`, but was given a {type(model).__name__}. For other Modules use "
+            "`equinox.tree_serialise_leaves`."
         )
     width, depth, latent, function = model.sizes
     activation = activation_name(function)
@@ -59,6 +61,8 @@ def describe(model: Any) -> dict[str, Any]:
             raise ValueError(f"A file cannot hold a core of the user's own, `{core.__name__}`.")
         config |= {"latent": latent, "core": core.__name__, "max_step": model.max_step}
         config |= {"state": _describe_state(model.state)}
+        if model.args_domain is not None:
+            config |= {"args": _describe_state(model.args_domain.lower)}
     return {"kind": type(model).__name__, "config": config, **_describe_parts(model)}
 
 
@@ -164,8 +168,10 @@ _DTYPES = ("float64", "float32", "float16", "bfloat16")
 
 def check_header(header: Any) -> None:
     """Raises `ValueError` unless this is a header that `save` can write."""
-    _check(header, "the header", _HEADER)
-    _check(header["config"], "`config`", _CONFIG[header["kind"]])
+    optional = {"boxcox": _is_exponent} if isinstance(header, dict) and "boxcox" in header else {}
+    _check(header, "the header", _HEADER | optional)
+    known = {"args": object} if "args" in header["config"] and header["kind"] == "DeepONet" else {}
+    _check(header["config"], "`config`", _CONFIG[header["kind"]] | known)
     for name in PARTS:
         if header[name] is not None:
             _check(header[name], f"`{name}`", _PART[name])
@@ -176,6 +182,7 @@ def check_header(header: Any) -> None:
 def check_sizes(header: dict[str, Any], size: int) -> None:
     """Raises `ValueError` unless all described arrays are arrays that `size` bytes can hold."""
     leaves = _state_leaves(header["config"]["state"])
+    leaves += _state_leaves(header["config"].get("args"))
     for name in PARTS:
         system = None if header[name] is None else header[name]["system"]
         if system is not None:
@@ -208,6 +215,10 @@ def _is_depth(x: Any) -> bool:
 
 def _is_number(x: Any) -> bool:
     return type(x) in (int, float) and abs(x) < 1e300
+
+
+def _is_exponent(x: Any) -> bool:
+    return _is_number(x) and 0 <= x <= 1
 
 
 def _is_windows(x: Any) -> bool:
@@ -311,14 +322,16 @@ def network_struct(header: Any, make_frame: Callable[[Any], MakeFrame | None], s
     Nothing is computed, and nothing is allocated. `make_frame` is called with `system`.
     """
 
-    def build(state: Any, system: Any) -> PINN | DeepONet:
-        config = {k: v for k, v in header["config"].items() if k != "state"}
+    def build(state: Any, args: Any, system: Any) -> PINN | DeepONet:
+        config = {k: v for k, v in header["config"].items() if k not in ("state", "args")}
         key = jr.key(0)
         if header["kind"] == "PINN":
             return PINN(state, config.pop("t0"), config.pop("t1"), key=key, **config)
         states = jtu.tree_map(lambda x: x[None], state)
         max_step, core = config.pop("max_step"), _CORES[config.pop("core")]
         frame = make_frame(system)
+        config |= {} if args is None else {"args_domain": Box(args, args)}
         return DeepONet(states, max_step, frame=frame, core=core, key=key, **config)
 
-    return eqx.filter_eval_shape(build, _state_struct(header["config"]["state"]), system)
+    state, args = (_state_struct(header["config"].get(name)) for name in ("state", "args"))
+    return eqx.filter_eval_shape(build, state, args, system)

@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from .._networks import PINN, DeepONet, Repeated
+from .._networks import PINN, DeepONet, Repeated, Transformed
 from .save import load
 
 _SUFFIX = ".network"
@@ -29,7 +29,7 @@ def pretrained_path(name: str) -> Path:
     return folder / f"{name}{_SUFFIX}"
 
 
-def load_pretrained(name: str) -> PINN | DeepONet | Repeated:
+def load_pretrained(name: str) -> PINN | DeepONet | Transformed | Repeated:
     """A network that comes with the package.
 
     For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,

@@ -9,7 +9,16 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 
-from .._networks import PINN, ConservativeLayer, DeepONet, MakeFrame, Repeated, Taylor
+from .._networks import (
+    PINN,
+    BoxCox,
+    ConservativeLayer,
+    DeepONet,
+    MakeFrame,
+    Repeated,
+    Taylor,
+    Transformed,
+)
 from .configuration import (
     PARTS,
     check_header,
@@ -24,7 +33,10 @@ from .file import PathLike, read, read_leaf, refuse, unpack, unpacked_size, writ
 
 
 def save(
-    path: PathLike, model: PINN | DeepONet | Repeated, *, info: dict[str, Any] | None = None
+    path: PathLike,
+    model: PINN | DeepONet | Transformed | Repeated,
+    *,
+    info: dict[str, Any] | None = None,
 ) -> None:
     """Writes a network with its configuration into one file.
 
@@ -35,7 +47,9 @@ def save(
 
     - `path`: where to write.
     - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter
-        perhaps in a [`diffrax_conserve.learned.Repeated`][]. A conservative layer, a Taylor
+        perhaps in a [`diffrax_conserve.learned.Transformed`][] with a
+        [`diffrax_conserve.learned.BoxCox`][], and that in a
+        [`diffrax_conserve.learned.Repeated`][]. A conservative layer, a Taylor
         polynomial and a frame hold functions, which no file can hold. If they belong to a system of
         the catalogue, the file names it; if not, give them again to [`diffrax_conserve.load`][].
     - `info`: what else to note, such as the system, the sampling domain, the recipe and the
@@ -61,7 +75,11 @@ def save(
     """
     repeated = isinstance(model, Repeated)
     inner = model.flow_map if repeated else model
-    header = {**describe(inner), "repeats": model.count if repeated else 1}
+    boxcox = {}
+    if isinstance(inner, Transformed) and isinstance(inner.transformation, BoxCox):
+        boxcox = {"boxcox": inner.transformation.exponent}
+        inner = inner.flow_map
+    header = {**describe(inner), **boxcox, "repeats": model.count if repeated else 1}
     assert isinstance(inner, PINN | DeepONet)
     arrays = _Contents(eqx.filter(_without(inner), eqx.is_array), part_systems(inner))
     header["dtypes"] = [x.dtype.name for x in jtu.tree_leaves(arrays)]
@@ -84,7 +102,7 @@ def load(
     layer: ConservativeLayer | None = None,
     taylor: Taylor | None = None,
     frame: MakeFrame | None = None,
-) -> PINN | DeepONet | Repeated:
+) -> PINN | DeepONet | Transformed | Repeated:
     """Reads a network that [`diffrax_conserve.save`][] wrote.
 
     **Arguments:**
@@ -124,6 +142,8 @@ def load(
             part = _part(header[name], name, found.systems) if part is None else part
             where = operator.attrgetter(_PLACES[name])
             model = eqx.tree_at(where, model, part, is_leaf=lambda x: x is None)
+    if "boxcox" in header:
+        model = Transformed(model, BoxCox(header["boxcox"]))
     return model if header["repeats"] == 1 else Repeated(model, header["repeats"])
 
 

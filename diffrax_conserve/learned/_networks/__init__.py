@@ -7,6 +7,7 @@ from .domain import AbstractDomain as AbstractDomain
 from .domain import Box as Box
 from .flow_map import AbstractFlowMap as AbstractFlowMap
 from .flow_map import FlowMap as FlowMap
+from .flow_map import args_domain_of as args_domain_of
 from .flow_map import as_flow_map as as_flow_map
 from .flow_map import has_arrays as has_arrays
 from .flow_map import restored as restored
@@ -30,3 +31,7 @@ from .transformed import AbstractTransformation as AbstractTransformation
 from .transformed import BoxCox as BoxCox
 from .transformed import Scale as Scale
 from .transformed import Transformed as Transformed
+from .with_args import OfPairs as OfPairs
+from .with_args import PairField as PairField
+from .with_args import PairSampler as PairSampler
+from .with_args import at_args as at_args

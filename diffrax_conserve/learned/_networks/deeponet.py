@@ -1,5 +1,6 @@
 """A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
 
+import dataclasses
 from typing import Any, final
 
 import equinox as eqx
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..._custom_types import RealScalarLike, Y
+from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import working_dtype
 from .cores import AbstractCore, Product, Sizes
 from .domain import Box, FramedBox
 from .flat import as_state, flatten, stacked_vectors, unflatten
-from .flow_map import AbstractFlowMap
+from .flow_map import AbstractFlowMap, check_args_domain, checked_args
 from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer
 from .mlp import Activation, check_sizes, find_activation
@@ -70,6 +71,7 @@ class DeepONet(AbstractFlowMap):
     normalise: bool = eqx.field(static=True)
     taylor: Taylor | None
     domain: Box | FramedBox
+    args_domain: Box | None
 
     def __init__(
         self,
@@ -86,8 +88,10 @@ class DeepONet(AbstractFlowMap):
         taylor: Taylor | None = None,
         frame: MakeFrame | None = None,
         layer: ConservativeLayer | None = None,
+        args_domain: Box | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
+        _check_args_domain(args_domain, layer, taylor)
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
                 f"`core` is {core!r}, but it must be a class, such as "
@@ -102,7 +106,9 @@ class DeepONet(AbstractFlowMap):
             self.domain, seen, m = _framed(frame, states, layer)
         dtype, n = vectors.dtype, seen.shape[1]
         self.sizes = Sizes(width, depth, latent, find_activation(activation))
-        self.core = core.create(n, m, self.sizes, dtype, key)
+        known = 0 if args_domain is None else flatten(args_domain.lower).size
+        self.core = core.create(n + known, m, self.sizes, dtype, key)
+        self.args_domain = args_domain
         self.layer = layer
         self.taylor = taylor
         self.max_step = float(max_step)
@@ -114,16 +120,27 @@ class DeepONet(AbstractFlowMap):
         else:
             self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
 
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`."""
-        candidate = self.candidate(y0, h)
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`.
+
+        Called as `(y0, h)`, or with an `args_domain` as `(y0, args, h)`.
+        """
+        expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
+        if len(step) != expected.count(","):
+            raise TypeError(
+                f"This `DeepONet` is called as `{expected}`, but was given {len(step) + 1} "
+                "arguments."
+            )
+        candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate
+        h = step[-1]
         values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
         return self.layer(candidate, values, h, self.radius(), schedule)
 
-    def candidate(self, y0: Y, h: RealScalarLike) -> Y:
+    def candidate(self, y0: Y, *step: Any) -> Y:
         """The same before the conservative layer."""
+        *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
             raise ValueError(
@@ -131,28 +148,40 @@ class DeepONet(AbstractFlowMap):
                 f"{start.size}."
             )
         h = jnp.asarray(h).astype(start.dtype)
-        fraction, learned = self._learned(start, y0, h)
+        fraction, learned = self._learned(start, y0, h, self._known(args, start.dtype))
         if self.taylor is not None:
-            start = flatten(self.taylor(y0, h)).astype(start.dtype)
+            taylor = dataclasses.replace(self.taylor, args=args[0]) if args else self.taylor
+            start = flatten(taylor(y0, h)).astype(start.dtype)
         return unflatten(start + fraction ** (self.order + 1) * learned, y0)
 
+    def _known(self, args: list[Args], dtype: Any) -> Float[Array, " p"]:
+        """The `args` as the network sees them."""
+        if self.args_domain is None:
+            return jnp.zeros(0, dtype)
+        found = checked_args(self.args_domain, args[0])
+        return flatten(self.args_domain.centred(found) if self.normalise else found).astype(dtype)
+
     def _learned(
-        self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""]
+        self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""], known: Float[Array, " p"]
     ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
         """The fraction of the longest step, and what the network adds."""
         if isinstance(self.domain, Box):
             fraction = h / self.max_step
-            return fraction, self.scale * self._network(start, h, fraction)
+            return fraction, self.scale * self._network(start, known, h, fraction)
         frame = self.domain.frame(y0)
         inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
         own = (h * frame.clock).astype(start.dtype)
         fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
-        return fraction, basis @ self._network(inputs, own, fraction)
+        return fraction, basis @ self._network(inputs, known, own, fraction)
 
     def _network(
-        self, inputs: Float[Array, " k"], step: Float[Array, ""], fraction: Float[Array, ""]
+        self,
+        inputs: Float[Array, " k"],
+        known: Float[Array, " p"],
+        step: Float[Array, ""],
+        fraction: Float[Array, ""],
     ) -> Float[Array, " m"]:
-        inputs = (inputs - self.shift) / self.scale
+        inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
         return self.core(inputs, 2 * fraction - 1 if self.normalise else step)
 
     @property
@@ -209,12 +238,29 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
     sees the frame's inputs, and `normalise` is for these; the domain consists of all states whose
     inputs are in the box around those of `states` and whose clock is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
+- `args_domain`: the smallest and the largest `args` of the vector field, as a
+    [`diffrax_conserve.learned.Box`][]. The network takes them as inputs, and so does the
+    polynomial of `taylor`. Default: it is for one vector field.
 
 **Raises:**
 
-`ValueError` or `TypeError` if a size, the step, the states or the frame are not what they must be,
-or if there are both a frame and a layer.
+`ValueError` or `TypeError` if a size, the step, the states, the frame or `args_domain` are not what
+they must be, or if there is a layer beside a frame or an `args_domain`.
 """
+
+
+def _check_args_domain(domain: Any, layer: ConservativeLayer | None, taylor: Taylor | None) -> None:
+    check_args_domain(domain)
+    if domain is not None and layer is not None:
+        raise ValueError(
+            "A flow map with an `args_domain` cannot have a `layer`, whose manifold has its own "
+            "`args`. Leave it out, and wrap the solver in `diffrax_conserve.ManifoldProjection`."
+        )
+    if domain is not None and taylor is not None and taylor.args is not None:
+        raise ValueError(
+            "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
+            "`Taylor(vector_field, order)`."
+        )
 
 
 def _vectors(states: Y) -> Float[Array, "samples n"]:

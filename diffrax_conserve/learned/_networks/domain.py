@@ -7,8 +7,9 @@ from typing import final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, PyTree, Real, Shaped
+from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real, Shaped
 
 from ..._custom_types import Y
 from .flat import as_state
@@ -108,6 +109,20 @@ class Box(AbstractDomain):
     def can_include(self, y: Y) -> Bool[Array, ""]:
         del y
         return jnp.asarray(True)
+
+    def sample(self, key: PRNGKeyArray) -> Y:
+        """A point of the box, uniformly."""
+        lower, treedef = jtu.tree_flatten(self.lower)
+        corners = zip(jr.split(key, len(lower)), lower, jtu.tree_leaves(self.upper), strict=True)
+        return treedef.unflatten([jr.uniform(k, a.shape, a.dtype, a, b) for k, a, b in corners])
+
+    def centred(self, y: Y) -> Y:
+        """`y` in units in which the box reaches from -1 to 1."""
+
+        def leaf(x: Array, a: Array, b: Array) -> Array:
+            return (2 * x - a - b) / jnp.where(b > a, b - a, 1)
+
+        return jtu.tree_map(leaf, y, self.lower, self.upper)
 
 
 Box.__init__.__doc__ = """**Arguments:**

@@ -11,13 +11,18 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from ..._custom_types import RealScalarLike, Y
+from ..._custom_types import Args, RealScalarLike, Y
+from ..._tree import tree_shapes
+from .domain import Box
 from .flat import stacked_vectors
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
+
+    One that has learned a family of equations is called as `(y0, args, h)`, with the `args` of the
+    vector field, and has an attribute `args_domain`.
 
     [`diffrax_conserve.DeepONet`][] is one. [`diffrax_conserve.learned.FlowMap`][] makes one of any
     function; solvers and [`diffrax_conserve.fit`][] do that by themselves with a Module that is
@@ -29,6 +34,8 @@ class AbstractFlowMap(AbstractTrainable):
     - `order`: the error of one step falls as $h^{q+1}$ with $q$ = `order`, whatever the weights.
     - `domain`: the states that the flow map has learned, with a method `contains(y)`; or `None`.
     - `layer`: the conservative layer that the output has passed, or `None`.
+    - `args_domain`: the `args` that it has learned, a [`diffrax_conserve.learned.Box`][]. A
+        subclass that takes none need not have it.
     """
 
     # `Any`, so that a subclass may be more precise, or have a property.
@@ -37,8 +44,8 @@ class AbstractFlowMap(AbstractTrainable):
     domain: eqx.AbstractVar[Any]
 
     @abc.abstractmethod
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`.
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`.
 
         A training passes `schedule`, the iterations of the conservative layer and the weight of
         the last one.
@@ -63,7 +70,7 @@ class AbstractFlowMap(AbstractTrainable):
         self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
     ) -> PyTree[Array]:
         # The schedule is not batched: iterations that it leaves out are not computed.
-        return jax.vmap(self, in_axes=(0, 0, None))(points.y0s, ts, schedule)
+        return jax.vmap(lambda y0, t: self(y0, t, schedule=schedule))(points.y0s, ts)
 
     def starts(self, points: Points) -> Points:
         return Points(jnp.zeros_like(points.ts), points.y0s)
@@ -91,6 +98,7 @@ class FlowMap(AbstractFlowMap):
     max_step: RealScalarLike
     order: int = eqx.field(static=True)
     domain: Any
+    args_domain: Box | None
 
     # Written out, because type checkers take the abstract fields of the base class for arguments.
     def __init__(
@@ -100,11 +108,13 @@ class FlowMap(AbstractFlowMap):
         *,
         order: int = 0,
         domain: Any = None,
+        args_domain: Box | None = None,
     ):
         self.function = function
         self.max_step = max_step
         self.order = order
         self.domain = domain
+        self.args_domain = args_domain
 
     def __check_init__(self):
         if not callable(self.function):
@@ -115,11 +125,12 @@ class FlowMap(AbstractFlowMap):
                 "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
                 "method."
             )
+        check_args_domain(self.args_domain)
 
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`."""
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         del schedule
-        return self.function(y0, h)
+        return self.function(y0, *step)
 
     @property
     def layer(self) -> None:
@@ -138,15 +149,18 @@ class FlowMap(AbstractFlowMap):
 
 FlowMap.__init__.__doc__ = r"""**Arguments:**
 
-- `function`: called as `(y0, h) -> y`. [`diffrax_conserve.fit`][] trains all its arrays.
+- `function`: called as `(y0, h) -> y`, or with an `args_domain` as `(y0, args, h) -> y`.
+    [`diffrax_conserve.fit`][] trains all its arrays.
 - `max_step`: the longest step.
 - `order`: its error in one step falls as $h^{q+1}$ with $q$ = `order`. Default: 0.
 - `domain`: the states that it is for: a [`diffrax_conserve.learned.Box`][], or a Module with a
     method `contains(y)`.
+- `args_domain`: the `args` that it is for, a [`diffrax_conserve.learned.Box`][]. Default: it takes
+    none.
 
 **Raises:**
 
-`TypeError` if `function` or `domain` is not that.
+`TypeError` if `function`, `domain` or `args_domain` is not that.
 """
 
 
@@ -162,7 +176,32 @@ def as_flow_map(model: Any) -> AbstractFlowMap:
         )
     order, domain = getattr(model, "order", 0), getattr(model, "domain", None)
     longest = model.max_step  # pyright: ignore[reportFunctionMemberAccess]
-    return FlowMap(model, longest, order=order, domain=domain)
+    return FlowMap(model, longest, order=order, domain=domain, args_domain=args_domain_of(model))
+
+
+def args_domain_of(model: Any) -> Box | None:
+    """The `args` that a flow map takes as inputs, or `None`."""
+    return getattr(model, "args_domain", None)
+
+
+def check_args_domain(domain: Any) -> None:
+    """Raises unless `domain` is `None` or a box, from which a training can draw."""
+    if domain is not None and not isinstance(domain, Box):
+        raise TypeError(
+            f"`args_domain` is {domain!r}, but it must be the smallest and the largest `args`: "
+            "`diffrax_conserve.learned.Box(lower, upper)`."
+        )
+
+
+def checked_args(domain: Box, args: Args) -> Args:
+    """`args` as arrays; raises unless they are of the structure and shapes of the domain's."""
+    expected, got = (tree_shapes(x) for x in (domain.lower, args))
+    if got != expected:
+        raise ValueError(
+            f"This flow map takes `args` of the structure {expected}, but was given {got}. Pass "
+            "those of its `args_domain`, to `diffeqsolve` as `args=...`."
+        )
+    return jtu.tree_map(lambda x, a: jnp.asarray(x, a.dtype), args, domain.lower)
 
 
 def restored(flow_map: AbstractFlowMap, model: Any) -> Any:

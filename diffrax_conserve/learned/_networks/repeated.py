@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..._custom_types import RealScalarLike, Y
-from .flow_map import AbstractFlowMap, as_flow_map
+from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .mlp import check_sizes
 from .trainable import LayerSchedule
 
@@ -49,15 +49,16 @@ class Repeated(AbstractFlowMap):
     def __check_init__(self):
         check_sizes(count=self.count)
 
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`."""
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
+        *args, h = step
         y0 = jtu.tree_map(jnp.asarray, y0)
         each = jnp.asarray(h) / self.count
 
-        def step(y: Y, _: None) -> tuple[Y, None]:
-            return self.flow_map(y, each, schedule), None
+        def once(y: Y, _: None) -> tuple[Y, None]:
+            return self.flow_map(y, *args, each, schedule=schedule), None
 
-        return lax.scan(step, y0, length=self.count)[0]
+        return lax.scan(once, y0, length=self.count)[0]
 
     @property
     def max_step(self) -> RealScalarLike:
@@ -73,6 +74,11 @@ class Repeated(AbstractFlowMap):
     def domain(self) -> Any:
         """That of the inner flow map, or `None`. Only the start of a step is compared with it."""
         return self.flow_map.domain
+
+    @property
+    def args_domain(self) -> Any:
+        """That of the inner flow map, or `None`."""
+        return args_domain_of(self.flow_map)
 
     @property
     def layer(self) -> None:

@@ -1,6 +1,7 @@
 """A flow map in other coordinates: logarithms, powers, units."""
 
 import abc
+import math
 from collections.abc import Callable
 from typing import Any, final
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike, Y
 from .flat import flatten, stacked_vectors, unflatten
-from .flow_map import AbstractFlowMap, as_flow_map
+from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .trainable import LayerSchedule
 
 
@@ -34,7 +35,8 @@ class BoxCox(AbstractTransformation):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, and zero
-    is a number. With an exponent of 0 it is the logarithm, for positive states.
+    is a number. With an exponent of 0 it is the logarithm, for positive states. Exponents of 1/4
+    or 1/8 are square roots, which cost a tenth of other powers.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -45,11 +47,25 @@ class BoxCox(AbstractTransformation):
 
     def __call__(self, y: Y) -> Y:
         p = self.exponent
-        return jtu.tree_map(lambda x: (x**p - 1) / p if p else jnp.log(x), y)
+        return jtu.tree_map(lambda x: (_root(x, p) - 1) / p if p else jnp.log(x), y)
 
     def inverse(self, z: Y) -> Y:
         p = self.exponent
-        return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** (1 / p) if p else jnp.exp(x), z)
+        if p == 0:
+            return jtu.tree_map(jnp.exp, z)
+        # A whole number is a product of a few factors.
+        power = round(1 / p) if 1 / p == round(1 / p) else 1 / p
+        return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** power, z)
+
+
+def _root(x: Array, exponent: float) -> Array:
+    """`x` to a positive power, by square roots where that is possible."""
+    halvings = -math.log2(exponent)
+    if halvings != round(halvings):
+        return x**exponent
+    for _ in range(round(halvings)):
+        x = jnp.sqrt(x)
+    return x
 
 
 BoxCox.__init__.__doc__ = r"""**Arguments:**
@@ -115,11 +131,11 @@ class Transformed(AbstractFlowMap):
         self.flow_map = as_flow_map(flow_map)
         self.transformation = transformation
 
-    def __call__(self, y0: Y, h: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`."""
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         y0 = jtu.tree_map(jnp.asarray, y0)
         z0 = self.transformation(y0)
-        z1 = self.flow_map(z0, h, schedule)
+        z1 = self.flow_map(z0, *step, schedule=schedule)
         there = self.transformation.inverse(z1)
 
         def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
@@ -144,6 +160,11 @@ class Transformed(AbstractFlowMap):
         """The states whose coordinates are in the domain of the inner flow map, or `None`."""
         inner = self.flow_map.domain
         return None if inner is None else TransformedDomain(inner, self.transformation)
+
+    @property
+    def args_domain(self) -> Any:
+        """That of the inner flow map, or `None`. `args` are not transformed."""
+        return args_domain_of(self.flow_map)
 
     @property
     def layer(self) -> None:

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._networks import AbstractFlowMap, as_flow_map
+from .._networks import AbstractFlowMap, args_domain_of, as_flow_map, at_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import check_learned_terms, check_nodes, check_output
 from .error_estimate import estimate
@@ -70,8 +70,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     times or an event ask for them. The weights are not copied.
 
     Derivatives with respect to the initial state and the weights are those of what is computed. The
-    `args` of the solve are seen by the sweeps, the error estimate and the solver `outside`, not by
-    the flow map; inside [`diffrax_conserve.ManifoldProjection`][] by the manifold too.
+    `args` of the solve are seen by the sweeps, the error estimate and the solver `outside`, and by
+    a flow map that has an `args_domain`; other flow maps have learned one vector field. With `args`
+    outside that domain every step is outside. Inside [`diffrax_conserve.ManifoldProjection`][] the
+    manifold sees them too.
 
     !!! example
 
@@ -132,7 +134,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     def __check_init__(self):
         check_nodes(self.nodes)
-        check_policy(self.outside, self.max_error, self.flow_map.domain)
+        domains = self.flow_map.domain, args_domain_of(self.flow_map)
+        check_policy(
+            self.outside, self.max_error, next((d for d in domains if d is not None), None)
+        )
         if not isinstance(self.corrections, int) or self.corrections < 0:
             raise ValueError(
                 f"`corrections` is {self.corrections!r}, but it must be a number of sweeps: zero "
@@ -171,9 +176,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         args: Args,
     ) -> DomainStatistics | None:
         check_learned_terms(terms, "FlowMapSolver")
-        check_output(self.flow_map, (y0, t1 - t0), y0, "flow_map")
+        flow_map = at_args(self.flow_map, args)
+        check_output(flow_map, (y0, t1 - t0), y0, "flow_map")
         if self.check_field:
-            refuse_another_field(self.flow_map, terms, t0, t1, y0, args)
+            refuse_another_field(flow_map, terms, t0, t1, y0, args)
         return None if self.outside is None else DomainStatistics.zero(t0)
 
     def step(
@@ -187,26 +193,30 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
         del made_jump
-        h = refuse_backwards(jnp.asarray(t1 - t0), terms, self.flow_map.max_step)
-        step = self._learned(h, y0, increment(terms, t0, t1, y0, args))
+        flow_map = at_args(self.flow_map, args)
+        h = refuse_backwards(jnp.asarray(t1 - t0), terms, flow_map.max_step)
+        step = self._learned(flow_map, h, y0, increment(terms, t0, t1, y0, args))
         if self.outside is not None and solver_state is not None:
-            inside, accurate = self._inside(y0), self._accurate(step.error)
+            inside = _inside(flow_map.domain, y0)
+            accurate = self._accurate(step.error)
             solver_state = solver_state.add(t0, inside & accurate)
             inputs = StepInputs(terms, t0, t1, y0, args)
             step = self.outside(step, inside, accurate, inputs, self.nodes)
-        step = reject_too_long(step, h, t1, self.flow_map.max_step)
+        step = reject_too_long(step, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, solver_state, step.result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
-    def _learned(self, h: Array, y0: Y, increment: Increment) -> StepResult:
+    def _learned(
+        self, flow_map: AbstractFlowMap, h: Array, y0: Y, increment: Increment
+    ) -> StepResult:
         """The step of the flow map, corrected."""
         _, unravel = ravel_pytree(y0)
-        path = self._path(h, y0)
+        path = _path(flow_map, self.nodes, h, y0)
         if self.corrections == 0:
-            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.flow_map(y0, h), y0)
+            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), flow_map(y0, h), y0)
             error = estimate(increment, path)
         else:
             path, error = correct(self.sweep, increment, path, self.corrections)
@@ -214,22 +224,23 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         states = jax.vmap(unravel)(path)
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
-    def _path(self, h: Array, y0: Y) -> Path:
-        """The states of the flow map at the nodes; the first is the initial state."""
-        start, _ = ravel_pytree(y0)
-
-        def state(fraction: Array) -> Array:
-            return ravel_pytree(self.flow_map(y0, fraction * h))[0].astype(start.dtype)
-
-        rows = jax.vmap(state)(fractions(self.nodes, h.dtype)[1:])
-        return jnp.concatenate([start[None], rows])
-
-    def _inside(self, y0: Y) -> Array:
-        domain = self.flow_map.domain
-        return jnp.asarray(True if domain is None else domain.contains(y0))
-
     def _accurate(self, error: Y) -> Array:
         return jnp.asarray(True if self.max_error is None else small_enough(error, self.max_error))
+
+
+def _path(flow_map: AbstractFlowMap, nodes: int, h: Array, y0: Y) -> Path:
+    """The states of the flow map at the nodes; the first is the initial state."""
+    start, _ = ravel_pytree(y0)
+
+    def state(fraction: Array) -> Array:
+        return ravel_pytree(flow_map(y0, fraction * h))[0].astype(start.dtype)
+
+    rows = jax.vmap(state)(fractions(nodes, h.dtype)[1:])
+    return jnp.concatenate([start[None], rows])
+
+
+def _inside(domain: Any, y0: Y) -> Array:
+    return jnp.asarray(True if domain is None else domain.contains(y0))
 
 
 FlowMapSolver.__init__.__doc__ = r"""**Arguments:**

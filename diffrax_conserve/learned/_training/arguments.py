@@ -89,6 +89,21 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
         )
 
 
+def check_family(sample: Any, args: Args) -> None:
+    """Raises unless states and `args` of a flow map that takes `args` can be drawn."""
+    if args is not None:
+        raise ValueError(
+            "`args` were given, but this flow map takes them as inputs: a training draws them "
+            "from its `args_domain`. Leave `args` out."
+        )
+    if isinstance(sample, Pool):
+        raise ValueError(
+            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Draw "
+            "states along solutions by `diffrax_conserve.learned.reachable_states`, and pass "
+            "`sample=diffrax_conserve.learned.FromStates(states)`."
+        )
+
+
 def check_limits(state: Any, target: Any, seconds: Any) -> None:
     """Raises unless what a training begins and ends with makes sense."""
     if state is not None and not isinstance(state, FitState):

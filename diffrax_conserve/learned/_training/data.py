@@ -97,5 +97,5 @@ def mismatch(
     model: AbstractFlowMap, pairs: Pairs, deviation: Array, schedule: LayerSchedule | None
 ) -> Float[Array, "points n"]:
     """What the flow map makes of the states of the pairs less what they became."""
-    found = jax.vmap(model, in_axes=(0, 0, None))(pairs.y0s, pairs.hs, schedule)
+    found = jax.vmap(lambda y0, h: model(y0, h, schedule=schedule))(pairs.y0s, pairs.hs)
     return model.compared(found, pairs.y1s) / deviation

@@ -15,8 +15,24 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks import PINN, Sampler, as_flow_map, restored
-from .arguments import check_arguments, check_field, check_limits, check_pool, check_types
+from .._networks import (
+    PINN,
+    OfPairs,
+    PairField,
+    PairSampler,
+    Sampler,
+    args_domain_of,
+    as_flow_map,
+    restored,
+)
+from .arguments import (
+    check_arguments,
+    check_family,
+    check_field,
+    check_limits,
+    check_pool,
+    check_types,
+)
 from .data import as_data
 from .defect import VectorField
 from .log import FitLog
@@ -89,7 +105,8 @@ def fit(
         each trajectory and perhaps unequal, and states with leading axes `(n, k)`.
         [`diffrax_conserve.learned.trajectories`][] makes some. With a vector field and without
         `sample` its states are those of the collocation points too.
-    - `args`: passed to `vector_field`.
+    - `args`: passed to `vector_field`. Left out for a flow map that takes `args` itself: they are
+        drawn from its `args_domain`, and the states of `data` are then pairs `(y, args)`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
         [`diffrax_conserve.learned.second_order`][]`(model)`.
     - `manifold`: for a `PINN` of several windows, where the ends of the windows are moved to: the
@@ -140,7 +157,13 @@ def fit(
     check_arguments(model, sample, data, manifold)
     check_limits(state, target, seconds)
     recipe = second_order(model) if recipe is None else recipe
-    found = None if data is None else as_data(data, as_flow_map(model))
+    flow_map = None if isinstance(model, PINN) else as_flow_map(model)
+    if flow_map is not None and (domain := args_domain_of(flow_map)) is not None:
+        check_family(sample, args)
+        flow_map = OfPairs(flow_map)
+        vector_field = None if vector_field is None else PairField(vector_field)
+        sample = None if sample is None else PairSampler(sample, domain)
+    found = None if data is None or flow_map is None else as_data(data, flow_map)
     if found is not None and vector_field is not None and sample is None:
         sample = found.sample
     trainer = Trainer(
@@ -158,10 +181,11 @@ def fit(
     )
     if isinstance(model, PINN):
         return _fit_windows(trainer, model, manifold, state)
-    flow_map = as_flow_map(model)
+    assert flow_map is not None
     if isinstance(sample, Pool):
         check_pool(sample, flow_map, args, recipe)
     trained, log = _fit_flow_map(trainer, flow_map, state)
+    trained = trained.flow_map if isinstance(trained, OfPairs) else trained
     return restored(trained, model), log
 
 

@@ -1,0 +1,264 @@
+"""Flow maps of a family of equations, which take `args` as inputs."""
+
+import dataclasses
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+import pytest
+
+import diffrax_conserve as dfc
+
+BOX = dfc.learned.Box(
+    {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
+)
+ARGS = {"w": jnp.array(0.8), "b": jnp.array([0.1, 0.2])}
+OUTSIDE = {**ARGS, "w": jnp.array(1.6)}
+STATES = jr.uniform(jr.key(0), (50, 2), minval=-1, maxval=1)
+Y0 = jnp.array([0.5, -0.3])
+
+
+def spring(t, y, args):
+    force = -args["w"] * y[0] - args["b"][0] * y[1] - args["b"][1] * y[0] ** 3
+    return jnp.stack([y[1], force])
+
+
+TERM = dfx.ODETerm(spring)
+
+
+def family(order=0, args_domain=BOX, **options):
+    taylor = dfc.learned.Taylor(spring, order) if order else None
+    options = dict(width=16, depth=2, core=dfc.learned.Concatenated) | options
+    return dfc.DeepONet(
+        STATES, 0.5, taylor=taylor, args_domain=args_domain, key=jr.key(1), **options
+    )
+
+
+def sample(key):
+    return jr.uniform(key, (2,), minval=-1, maxval=1)
+
+
+def solve(flow_map, args, check_field=False, **options):
+    solver = dfc.DeepONetSolver(flow_map, check_field=check_field, **options)
+    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8, throw=False)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    recipe = dfc.learned.second_order(family(), epochs=300)
+    recipe = dataclasses.replace(recipe, points=100)
+    return dfc.fit(family(1), spring, sample=sample, recipe=recipe, key=jr.key(2))
+
+
+# ---- The network ----
+
+
+@pytest.mark.parametrize("order", [0, 1])
+@pytest.mark.parametrize("core", [dfc.learned.Product, dfc.learned.Concatenated, dfc.learned.Gated])
+def test_it_starts_at_its_state_and_sees_all_args(core, order):
+    flow_map = family(order, core=core)
+    np.testing.assert_array_equal(flow_map(Y0, ARGS, 0.0), Y0)
+    slopes = jax.jacfwd(lambda args: flow_map(Y0, args, 0.3))(ARGS)
+    assert all(jnp.all(jnp.abs(leaf) > 0) for leaf in jax.tree.leaves(slopes))
+
+
+def test_its_polynomial_has_the_args_of_the_call():
+    slope = jax.jacfwd(lambda h: family(1)(Y0, ARGS, h))(0.0)
+    np.testing.assert_allclose(slope, spring(0.0, Y0, ARGS), rtol=1e-14)
+
+
+@pytest.mark.parametrize("wrap", ["repeated", "transformed", "function"])
+def test_what_wraps_a_flow_map_hands_args_on(wrap):
+    inner = family()
+    match wrap:
+        case "repeated":
+            outer = dfc.learned.Repeated(inner, 2)
+            expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
+        case "transformed":
+            outer = dfc.learned.Transformed(inner, dfc.learned.Scale(jnp.array([2.0, 4.0])))
+            expected = inner(Y0 / jnp.array([2.0, 4.0]), ARGS, 0.4) * jnp.array([2.0, 4.0])
+        case "function":
+            function = lambda y0, args, h: inner(y0, args, h)  # noqa: E731
+            outer = dfc.learned.FlowMap(function, 0.5, args_domain=BOX)
+            expected = inner(Y0, ARGS, 0.4)
+    np.testing.assert_allclose(outer(Y0, ARGS, 0.4), expected, rtol=1e-13)
+    assert outer.args_domain is not None
+    one = solve(outer, ARGS).ys[0]
+    y = Y0
+    for _ in range(4):
+        y = outer(y, ARGS, 0.5)
+    np.testing.assert_allclose(one, y, rtol=1e-12)
+
+
+def test_draws_are_in_the_box_and_everywhere():
+    drawn = jax.vmap(BOX.sample)(jr.split(jr.key(3), 1000))
+    assert jnp.all(jax.vmap(BOX.contains)(drawn))
+    unit = jax.vmap(BOX.centred)(drawn)
+    for leaf in jax.tree.leaves(unit):
+        np.testing.assert_allclose(jnp.std(leaf, axis=0), 1 / np.sqrt(3), rtol=0.1)
+        np.testing.assert_allclose(jnp.mean(leaf, axis=0), 0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: family(args_domain=(0, 1)), "args_domain"),
+        (lambda: dfc.learned.FlowMap(spring, 0.5, args_domain=1.0), "args_domain"),
+        (lambda: family()(Y0, 0.1), r"called as `\(y0, args, h\)`"),
+        (lambda: family(args_domain=None)(Y0, ARGS, 0.1), r"called as `\(y0, h\)`"),
+        (lambda: family()(Y0, jnp.ones(3), 0.1), "takes `args` of the structure"),
+        (lambda: solve(family(), ARGS | {"b": jnp.ones(3)}), "takes `args` of the structure"),
+    ],
+)
+def test_wrong_uses_are_named(make, match):
+    with pytest.raises((TypeError, ValueError), match=match):
+        make()
+
+
+def test_a_layer_or_args_of_the_polynomial_are_refused():
+    layer = dfc.learned.ConservativeLayer(dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)))
+    with pytest.raises(ValueError, match="cannot have a `layer`"):
+        family(layer=layer)
+    with pytest.raises(ValueError, match="`taylor` has `args` of its own"):
+        dfc.DeepONet(
+            STATES, 0.5, taylor=dfc.learned.Taylor(spring, args=ARGS), args_domain=BOX,
+            key=jr.key(0),
+        )  # fmt: skip
+
+
+# ---- Training ----
+
+
+def test_a_training_draws_args_and_leaves_the_domain(trained):
+    flow_map, log = trained
+    assert isinstance(flow_map, dfc.DeepONet)
+    assert eqx.tree_equal(flow_map.args_domain, BOX)
+    assert log.error < 1e-3
+    worst = 0.0
+    for key in jr.split(jr.key(4), 8):
+        args, y0 = BOX.sample(key), sample(jr.fold_in(key, 1))
+        exact = dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 0.5, 0.05, y0, args).ys[0]
+        worst = max(worst, float(jnp.max(jnp.abs(flow_map(y0, args, 0.5) - exact))))
+    assert worst < 2e-3
+
+
+def test_derivatives_by_args_are_those_of_the_solve_and_of_the_equation(trained):
+    flow_map, _ = trained
+
+    def last(args, solver):
+        return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8).ys[0]
+
+    learned = dfc.DeepONetSolver(flow_map)
+    forward = jax.jacfwd(lambda args: _forward(args, learned))(ARGS)
+    reverse = jax.jacrev(last)(ARGS, learned)
+    exact = jax.jacrev(lambda args: _fine(args))(ARGS)
+    for name in ARGS:
+        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9)
+        np.testing.assert_allclose(reverse[name], exact[name], atol=2e-2)
+    step = 1e-5
+    for name, direction in (("w", 1.0), ("b", jnp.array([0.0, 1.0]))):
+        ends = [last({**ARGS, name: ARGS[name] + s * direction}, learned) for s in (step, -step)]
+        slope = jnp.sum(reverse[name] * direction, axis=tuple(range(1, reverse[name].ndim)))
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=1e-7, atol=1e-9)
+
+
+def _forward(args, solver):
+    adjoint = dfx.ForwardMode()
+    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, adjoint=adjoint).ys[0]
+
+
+def _fine(args):
+    return dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 2.0, 0.05, Y0, args).ys[0]
+
+
+def test_it_learns_from_data_of_many_args():
+    args = jax.vmap(BOX.sample)(jr.split(jr.key(5), 40))
+    field = lambda t, y, _: (spring(t, *y), jax.tree.map(jnp.zeros_like, y[1]))  # noqa: E731
+    data = dfc.learned.trajectories(field, (STATES[:40], args), jnp.linspace(0, 2, 9))
+    recipe = dfc.learned.Recipe(epochs=400, points=200, optimiser=optax.adam(1e-2), refresh=1)
+    trained, log = dfc.fit(family(), data=data, recipe=recipe, key=jr.key(6))
+    assert log.losses[-1] < 0.05 * log.losses[0]
+    _, (ys, args) = data
+    found = jax.vmap(trained, in_axes=(0, 0, None))(
+        ys[:, 0], jax.tree.map(lambda x: x[:, 0], args), 0.5
+    )
+    moved = jnp.sqrt(jnp.mean((ys[:, 2] - ys[:, 0]) ** 2))
+    assert jnp.sqrt(jnp.mean((found - ys[:, 2]) ** 2)) < 0.3 * moved
+
+
+def test_a_training_goes_on_bit_for_bit():
+    recipe = dataclasses.replace(dfc.learned.second_order(family(), epochs=4), points=20)
+    train = lambda recipe, **options: dfc.fit(  # noqa: E731
+        family(), spring, sample=sample, recipe=recipe, key=jr.key(2), **options
+    )
+    whole, _ = train(recipe)
+    _, log = train(recipe, seconds=1e-9)
+    assert log.ended == "seconds"
+    assert eqx.tree_equal(train(recipe, state=log.state)[0], whole)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (dict(args=ARGS), "draws them from its `args_domain`"),
+        (dict(sample=dfc.learned.Pool(sample)), "`Pool` is for a flow map of one vector field"),
+    ],
+)
+def test_wrong_trainings_are_named(options, match):
+    with pytest.raises(ValueError, match=match):
+        dfc.fit(family(), spring, key=jr.key(0), **(dict(sample=sample) | options))
+
+
+# ---- The solver ----
+
+
+def test_args_outside_their_domain_are_steps_outside():
+    statistics = dfx.SaveAt(t1=True, solver_state=True)
+
+    def run(args, outside):
+        solver = dfc.DeepONetSolver(family(), check_field=False, outside=outside)
+        return dfx.diffeqsolve(
+            TERM, solver, 0.0, 2.0, 0.5, Y0, args, saveat=statistics, throw=False
+        )
+
+    report = dfc.learned.Report()
+    assert dfc.learned.domain_statistics(run(ARGS, report)).num_outside < 4
+    assert dfc.learned.domain_statistics(run(OUTSIDE, report)).num_outside == 4
+    refused = run(OUTSIDE, dfc.learned.Refuse())
+    assert "starts outside the domain" in dfx.RESULTS[refused.result]
+    replaced = run(OUTSIDE, dfx.Tsit5())
+    exact = dfx.diffeqsolve(TERM, dfx.Tsit5(), 0.0, 2.0, 0.5, Y0, OUTSIDE).ys
+    np.testing.assert_allclose(replaced.ys, exact, rtol=1e-12)
+
+
+def test_args_may_differ_in_a_batch():
+    args = jax.vmap(BOX.sample)(jr.split(jr.key(7), 5))
+    flow_map = family()
+    batch = eqx.filter_jit(jax.vmap(lambda a: solve(flow_map, a).ys[0]))(args)
+    for i in range(5):
+        one = solve(flow_map, jax.tree.map(lambda x, i=i: x[i], args)).ys[0]
+        np.testing.assert_allclose(batch[i], one, rtol=1e-12)
+
+
+def test_the_slope_is_compared_for_the_args_of_the_solve():
+    solve(family(1), ARGS, check_field=True)
+    other = dfx.ODETerm(lambda t, y, args: 1.2 * spring(t, y, args))
+    solver = dfc.DeepONetSolver(family(1))
+    with pytest.raises(Exception, match="not trained for this vector field"):
+        jax.block_until_ready(dfx.diffeqsolve(other, solver, 0.0, 1.0, 0.5, Y0, ARGS).ys)
+
+
+def test_a_file_holds_its_args_domain(tmp_path):
+    flow_map = family()
+    dfc.save(tmp_path / "family", flow_map)
+    again = dfc.load(tmp_path / "family")
+    assert eqx.tree_equal(again, flow_map)
+    dfc.save(tmp_path / "repeated", dfc.learned.Repeated(flow_map, 2))
+    again = dfc.load(tmp_path / "repeated")
+    np.testing.assert_array_equal(
+        again(Y0, ARGS, 1.0), dfc.learned.Repeated(flow_map, 2)(Y0, ARGS, 1.0)
+    )
