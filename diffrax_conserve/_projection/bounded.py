@@ -7,6 +7,7 @@ from anywhere (L. Qi and D. Sun, "A nonsmooth version of Newton's method", 1993)
 repeated with constraints that are linear about the last state.
 """
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,10 +56,12 @@ class Box(eqx.Module):
     upper: Y
 
     def clip(self, y: Y) -> Y:
-        # At a bound the derivative is that of the inside.
-        return jtu.tree_map(
-            lambda x, a, b: jnp.where(x < a, a, jnp.where(x > b, b, x)), y, self.lower, self.upper
-        )
+        def clip(x: Array, a: Array, b: Array) -> Array:
+            # At a bound the derivative is that of the inside.
+            inside = jnp.where(x < a, a, jnp.where(x > b, b, x))
+            return jnp.where(jnp.isnan(a) | jnp.isnan(b), jnp.nan, inside)
+
+        return jtu.tree_map(clip, y, self.lower, self.upper)
 
     def inside(self, y: Y) -> Y:
         """One where a component is within its bounds, and zero where it is beyond."""
@@ -85,8 +88,13 @@ def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, y: Y) -> 
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
-    """Raises if both are known and a lower bound is above its upper one."""
+    """Raises if a known bound is NaN, or if a lower one is above its upper one."""
     leaves = [jtu.tree_leaves(x) for x in (lower, upper)]
+    for name, bound in zip(("lower", "upper"), leaves, strict=True):
+        for x in bound:
+            known = eqx.is_array_like(x) and not isinstance(x, jax.core.Tracer)
+            if known and np.any(np.isnan(np.asarray(x))):
+                raise ValueError(f"`{name}` is {x}. A bound must be a number, or infinite.")
     if len(leaves[0]) != len(leaves[1]) or any(
         isinstance(x, jax.core.Tracer) or not eqx.is_array_like(x) for x in [*leaves[0], *leaves[1]]
     ):
@@ -107,12 +115,19 @@ class _Carry(NamedTuple):
     num_steps: Int[Array, ""]
 
 
+Unbounded = Callable[[Equations], tuple[Y, Vector, ProjectionInfo]]
+
+
 @eqx.filter_custom_jvp
 def project_into(
-    equations: Equations, box: Box, *, frozen: bool, max_steps: int
+    equations: Equations, box: Box, *, unbounded: Unbounded, frozen: bool, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    """The state, its multipliers, and how it went."""
+    """The state, its multipliers, and how it went. Where the `unbounded` projection ends within the
+    box that is the answer."""
     candidate = equations.candidate
+    free, free_multiplier, free_info = unbounded(equations)
+    within_box = ft.reduce(jnp.logical_and, map(jnp.all, jtu.tree_leaves(box.inside(free))))
+    settled = free_info.ok & within_box
     before, at_candidate = linearise(equations.residual, candidate)
     eps, tiny = (float(getattr(jnp.finfo(working_dtype(candidate)), x)) for x in ("eps", "tiny"))
 
@@ -135,18 +150,22 @@ def project_into(
 
     zeros = jtu.tree_map(jnp.zeros_like, before)
     infinite = jnp.asarray(jnp.inf, working_dtype(candidate))
-    start = _Carry(jnp.asarray(True), infinite, box.clip(candidate), zeros, jnp.asarray(0))
+    start = _Carry(~settled, infinite, box.clip(candidate), zeros, jnp.asarray(0))
     end = lax.while_loop(lambda carry: carry.unfinished, body, start)
-    y = end.y
+
+    def choose(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
+        return jtu.tree_map(lambda a, b: jnp.where(settled, a, b), a, b)
+
+    y, count = choose((free, free_info.num_steps), (end.y, end.num_steps))
     after, at_y = linearise(equations.residual, y)
     scale = equations.scale(at_y, y)
     outcome = Outcome.of(before, after, scale, equations.tolerance)
     rank = at_candidate.gram_solver(equations.weights).rank
-    info = report(outcome, end.num_steps, candidate, y, before, after, scale, rank)
+    info = report(outcome, count, candidate, y, before, after, scale, rank)
     # Only the nearest point has a derivative.
     moving = jnp.asarray(False) if frozen else end.last > eps**0.5
     multiplier = jtu.tree_map(lambda x: jnp.where(moving, jnp.nan, x), end.multiplier)
-    return y, multiplier, info
+    return y, choose(free_multiplier, multiplier), info
 
 
 def _polished(
@@ -228,10 +247,12 @@ def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
 
 
 @project_into.def_jvp
-def _project_into_jvp(primals, tangents, *, frozen, max_steps):
+def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
     """The implicit function theorem, with the components that are at their bounds held there."""
     (equations, box), (t_equations, t_box) = primals, tangents
-    y, multiplier, info = project_into(equations, box, frozen=frozen, max_steps=max_steps)
+    y, multiplier, info = project_into(
+        equations, box, unbounded=unbounded, frozen=frozen, max_steps=max_steps
+    )
     _, at_y = linearise(equations.residual, y)
 
     def pulled(base: Y, parameters: Any) -> tuple[Y, Y]:

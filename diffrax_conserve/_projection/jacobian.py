@@ -55,6 +55,11 @@ class AbstractJacobian(eqx.Module):
         """
 
     @abc.abstractmethod
+    def unit_rows(self) -> tuple["AbstractJacobian", Vector]:
+        """The same with rows whose largest elements are one, where rows are formed, and what each
+        was divided by."""
+
+    @abc.abstractmethod
     def sines(self, weights: Y) -> Real[Array, " m"] | None:
         """The sine of the angle between each row and the span of those before it, in the norm of
         `W`; `None` where rows are never formed."""
@@ -115,9 +120,14 @@ class Unrolled(AbstractJacobian):
             sines.append(jnp.where(norms[1] > 0, norms[0] / whole, 1))
         return jnp.stack(sines)
 
-    def _normalised(self) -> tuple[tuple[Y, ...], Vector]:
+    def unit_rows(self) -> tuple["Unrolled", Vector]:
+        rows, sizes = self._normalised(always=True)
+        return Unrolled(rows), sizes
+
+    def _normalised(self, always: bool = False) -> tuple[tuple[Y, ...], Vector]:
         sizes = tuple(
-            _size([jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(r)]) for r in self.rows
+            _size([jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(r)], always)
+            for r in self.rows
         )
         inverses = [1 / size for size in sizes]
         rows = tuple(
@@ -178,12 +188,17 @@ class Dense(AbstractJacobian):
         lengths = jnp.abs(jnp.diagonal(triangle))
         return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(dtype)
 
-    def _normalised(self) -> tuple[PyTree[Array], Vector]:
+    def unit_rows(self) -> tuple["Dense", Vector]:
+        rows, size = self._normalised(always=True)
+        return Dense(rows), size
+
+    def _normalised(self, always: bool = False) -> tuple[PyTree[Array], Vector]:
         size = _size(
             [
                 jnp.max(jnp.abs(x.reshape(len(x), -1)), axis=1, initial=0)
                 for x in jtu.tree_leaves(self.rows)
-            ]
+            ],
+            always,
         )
         rows = jtu.tree_map(
             lambda x: x / size.astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1)), self.rows
@@ -191,11 +206,11 @@ class Dense(AbstractJacobian):
         return rows, size
 
 
-def _size(maxima: list[Array]) -> Array:
+def _size(maxima: list[Array], always: bool) -> Array:
     """The largest element of a row, or one if all are zero. In float64 products of elements
-    neither overflow nor vanish in any units, so there it is one."""
+    neither overflow nor vanish in usual units, so there it is one, unless `always`."""
     dtype = working_dtype(maxima)
-    if dtype == jnp.float64:
+    if dtype == jnp.float64 and not always:
         return jnp.ones_like(maxima[0])
     size = ft.reduce(jnp.maximum, [x.astype(dtype) for x in maxima])
     return jnp.where(size > 0, size, jnp.ones_like(size))
@@ -241,6 +256,9 @@ class MatrixFree(AbstractJacobian):
 
     def scale(self, y: Y) -> Vector:
         return estimated_norms(self.forward, y)
+
+    def unit_rows(self) -> tuple["MatrixFree", Vector]:
+        return self, jnp.ones(())
 
     def sines(self, weights: Y) -> None:
         del weights

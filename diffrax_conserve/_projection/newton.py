@@ -1,5 +1,6 @@
 """Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
 
+import functools as ft
 from typing import Any, ClassVar, final
 
 import equinox as eqx
@@ -103,10 +104,14 @@ class Newton(AbstractProjection):
             )
         equations = Equations.of(problem, candidate, self.rtol, self.atol)
         box = box_of(self.lower, self.upper, candidate)
-        if box is not None:
-            y, _, info = project_into(equations, box, frozen=False, max_steps=self.max_steps)
-            return y, info
-        y, _, info = _project(equations, max_steps=self.max_steps)
+        steps = self.max_steps
+        unbounded = ft.partial(_project, max_steps=steps)
+        if box is None:
+            y, _, info = unbounded(equations)
+        else:
+            y, _, info = project_into(
+                equations, box, unbounded=unbounded, frozen=False, max_steps=steps
+            )
         return y, info
 
 

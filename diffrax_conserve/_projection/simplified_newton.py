@@ -96,14 +96,22 @@ class SimplifiedNewton(AbstractProjection):
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         equations = Equations.of(problem, candidate, self.rtol, self.atol)
         box = box_of(self.lower, self.upper, candidate)
-        if box is not None:
-            y, _, info = project_into(equations, box, frozen=True, max_steps=self.max_steps)
-            return y, info
-        y, _, info = _project(equations, problem.anchor, max_steps=self.max_steps)
+        steps = self.max_steps
+        if box is None:
+            y, _, info = _project(equations, problem.anchor, max_steps=steps)
+        else:
+            unbounded = ft.partial(_project_alone, max_steps=steps)
+            y, _, info = project_into(
+                equations, box, unbounded=unbounded, frozen=True, max_steps=steps
+            )
         return y, info
 
 
 SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS
+
+
+def _project_alone(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, ProjectionInfo]:
+    return _project(equations, None, max_steps=max_steps)
 
 
 # The state, the multipliers, the number of iterations and the verdict.

@@ -166,8 +166,11 @@ class TangentField(eqx.Module):
         g, jacobian = linearise(inline, split(view))
         weights = split(inverse_metric(self.metric, view))
         wrong = tuple(wrong) if isinstance(g, tuple) else wrong
-        multiplier = jacobian.gram_solver(weights).solve(wrong)
-        correction = from_view(join(tree_mul(jacobian.pullback(multiplier), weights)), y)
+        # Nobody judges the result, so no product may leave the range of the dtype.
+        rows, sizes = jacobian.unit_rows()
+        solution = rows.gram_solver(weights).solve(jtu.tree_map(jnp.divide, wrong, sizes))
+        correction = from_view(join(tree_mul(rows.pullback(solution), weights)), y)
+        multiplier = jtu.tree_map(jnp.divide, solution, sizes)
         return slope, correction, shaped(as_array(multiplier), values)
 
     def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
