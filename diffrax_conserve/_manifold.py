@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from ._along import Along
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
+from ._options import check_numbers, check_vector_field, dtype_of, is_real
 from ._tree import tree_shapes
 from ._with_jacobian import WithJacobian
 
@@ -65,6 +67,7 @@ class FirstIntegral(AbstractConserved):
     ):
         self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
         self.rate = rate
+        check_numbers("value", value)
         # Arrays, so that another value does not compile again.
         self.value = jtu.tree_map(
             lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
@@ -133,6 +136,10 @@ class Constraint(AbstractConserved):
 
         A [`diffrax_conserve.Constraint`][].
 
+        **Raises:**
+
+        `TypeError` if `vector_field` is not callable.
+
         !!! example
 
             ```python
@@ -147,7 +154,8 @@ class Constraint(AbstractConserved):
             along_the_circle = rod.derivative(free_fall)
             ```
         """
-        return Constraint(_Along(self.fn, vector_field))
+        check_vector_field(vector_field, "constraint.derivative(vector_field)")
+        return Constraint(Along(self.fn, vector_field))
 
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
@@ -162,25 +170,6 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
     `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
     `jax.pure_callback`. What more a derivative needs is taken by autodiff of both, or is an error.
 """
-
-
-class _Along(eqx.Module):
-    """The derivative of a function along a vector field."""
-
-    fn: ConstraintFn
-    vector_field: Callable[[RealScalarLike, Any, Args], Any]
-
-    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        t = jnp.asarray(t, jnp.result_type(float, t))
-        y = jtu.tree_map(jnp.asarray, y)
-        slope = slope_like(y, self.vector_field(t, y, args))
-        _, along = jax.jvp(lambda t, y: self.fn(t, y, args), (t, y), (jnp.ones_like(t), slope))
-        return along
-
-
-def slope_like(y: Y, slope: Y) -> Y:
-    """What a vector field returned, in the shapes and dtypes of the state."""
-    return jtu.tree_map(lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope)
 
 
 def _check_callable(entry: AbstractConserved) -> None:
@@ -306,6 +295,12 @@ def _check_rate(name: str, entry: Any, t: RealScalarLike, y: Y, args: Args) -> N
     if rate_of(entry) is None:
         return
     rates, outputs = (eqx.filter_eval_shape(fn, t, y, args) for fn in (entry.rate, entry.fn))
+    for leaf in jtu.tree_leaves(rates):
+        if not is_real(leaf):
+            raise TypeError(
+                f"`rate` of `{name}` returns {dtype_of(leaf)}, but it must return real numbers, as "
+                "`fn` does. Return their real part."
+            )
     if tree_shapes(rates) != tree_shapes(outputs):
         raise ValueError(
             f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "
@@ -326,6 +321,7 @@ def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, ar
             "and `None` in the place of each `Constraint`."
         ) from error
     for (name, entry), value in zip(entries, flat, strict=True):
+        check_numbers("value", value)
         output = eqx.filter_eval_shape(entry.fn, t, y, args)
         if isinstance(entry, FirstIntegral) and tree_shapes(output) != tree_shapes(value):
             raise ValueError(

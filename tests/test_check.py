@@ -219,6 +219,12 @@ def test_times_that_do_not_match_the_states_are_refused():
         )
 
 
+def test_one_state_is_no_batch():
+    pendulum, energy = lambda t, y, a: jnp.stack([y[1], -y[0]]), lambda t, y, a: jnp.sum(y**2)
+    with pytest.raises(ValueError, match=r"For one state `y` write `jax.tree.map"):
+        check_invariance(pendulum, dfc.FirstIntegral(energy), jnp.ones(2))
+
+
 def test_a_bare_function_is_refused():
     with pytest.raises(TypeError, match="FirstIntegral"):
         check_invariance(lambda t, y, a: y, lambda t, y, a: y, jnp.ones(4))

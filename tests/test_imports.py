@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _PRINTING = {"_printing"}
 _TREE = _TYPES | {"_tree"}
-_MANIFOLD = _TREE | {"_with_jacobian", "_manifold"}
+_ENTRIES = _TREE | {"_options", "_with_jacobian", "_along"}
+_MANIFOLD = _ENTRIES | {"_manifold"}
 _BALANCE = _MANIFOLD | {"_balance"}
 _PROJECTION = _BALANCE | _PRINTING | {"_projection"}
 _CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
@@ -29,10 +30,12 @@ MAY_IMPORT = {
     "_custom_types": set(),
     "_printing": set(),
     "_replace_file": set(),
+    "_options": set(),
     "_tree": _TYPES,
+    "_along": _TREE,
     "_fast_cpu": set(),
     "_with_jacobian": _TREE,
-    "_manifold": _TREE | {"_with_jacobian"},
+    "_manifold": _ENTRIES,
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,
     "_interpolation": _PROJECTION,

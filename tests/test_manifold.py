@@ -1,7 +1,11 @@
 """Wrong input is refused with an error that names the argument and the remedy."""
 
+import dataclasses
+import functools as ft
+
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
@@ -26,6 +30,10 @@ def wrap(manifold, **kwargs):
 
 def run(manifold, y0=OMEGA0, **kwargs):
     return solve(rigid_body, wrap(manifold, **kwargs), y0)
+
+
+NO_TOLERANCES = (-1.0, ValueError), (np.nan, ValueError), ("a", TypeError), (True, TypeError)
+NO_COUNTS = (0, ValueError), (1.5, TypeError), ("2", TypeError), (True, TypeError)
 
 
 def test_bare_function():
@@ -166,10 +174,81 @@ def test_a_closed_form_needs_a_function():
         dfc.ClosedForm(3.0)  # pyright: ignore
 
 
-@pytest.mark.parametrize("bad", [1.5, "2"])
-def test_every_is_an_integer(bad):
-    with pytest.raises(ValueError, match="`every`"):
-        wrap(dfc.FirstIntegral(lambda t, y, args: y), every=bad)
+ENERGY = dfc.FirstIntegral(rotational_energy)
+NEWTONS = dfc.SimplifiedNewton, dfc.Newton, dfc.Directional
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "wrong", "error"),
+    [
+        *((kind, "rtol", wrong, error) for kind in NEWTONS for wrong, error in NO_TOLERANCES),
+        *((kind, "max_steps", wrong, error) for kind in NEWTONS for wrong, error in NO_COUNTS),
+        *((kind, "lower", "a", TypeError) for kind in NEWTONS[:2]),
+        (dfc.SimplifiedNewton, "atol", -1.0, ValueError),
+        (dfc.SimplifiedNewton, "upper", {"q": np.nan}, ValueError),
+        (dfc.SimplifiedNewton, "metric", "mass", TypeError),
+        (ft.partial(dfc.ClosedForm, print), "rtol", "a", TypeError),
+        *((ft.partial(wrap, ENERGY), "every", wrong, error) for wrong, error in NO_COUNTS),
+        (ft.partial(wrap, ENERGY), "threshold", "x", TypeError),
+        (ft.partial(wrap, ENERGY), "threshold", 0.0, ValueError),
+        (ft.partial(wrap, ENERGY), "max_correction", "x", TypeError),
+        (ft.partial(wrap, ENERGY), "max_correction", np.nan, ValueError),
+        (ft.partial(dfc.FirstIntegral, jnp.sum), "value", "a", TypeError),
+        (ft.partial(dfc.FirstIntegral, jnp.sum), "value", [1.0, 1j], TypeError),
+        (ft.partial(dfc.project, ENERGY, OMEGA0), "value", "a", TypeError),
+        (ft.partial(dfc.project, ENERGY, value=1.0), "y", "y", TypeError),
+        (ft.partial(dfc.project, ENERGY, OMEGA0), "projection", dfc.Newton, TypeError),
+        (ft.partial(dfc.tangent, rigid_body, ENERGY), "gain", "a", TypeError),
+        (ft.partial(dfc.tangent, rigid_body, ENERGY), "gain", None, TypeError),
+        (ft.partial(dfc.tangent, rigid_body, ENERGY), "gain", np.nan, ValueError),
+        (dfc.Constraint(jnp.sum).derivative, "vector_field", 3, TypeError),
+        (dfc.Constraint(jnp.sum).derivative, "vector_field", dfx.ODETerm(rigid_body), TypeError),
+        (ft.partial(dfc.drift, manifold=ENERGY), "sol", OMEGA0, TypeError),
+        (dfc.statistics, "sol", [1], TypeError),
+    ],
+)
+def test_an_argument_that_is_wrong_by_itself(make, name, wrong, error):
+    says = "The state has the leaf 'y'" if name == "y" else rf"`{name}(\[.*\])?` (is|has) "
+    with pytest.raises(error, match=says):
+        make(**{name: wrong})
+
+
+def test_options_that_are_right():
+    kinds = None, 0, 1e-3, np.float32(0.5), np.int64(1), jnp.asarray(0.5, jnp.bfloat16)
+    for rtol in kinds:
+        dfc.Newton(rtol=rtol, atol=rtol)
+    jax.eval_shape(lambda x: dfc.Newton(rtol=x, lower=x).rtol, -1.0)
+
+
+def test_a_metric_is_no_matrix():
+    with pytest.raises(ValueError, match="not a matrix"):
+        dfc.Newton(metric=jnp.eye(2))
+
+
+def test_a_rate_is_real():
+    gain = dfc.FirstIntegral(rotational_energy, value=1.0, rate=lambda t, y, args: 1j * y[0])
+    with pytest.raises(TypeError, match="`rate` of `manifold` returns complex128"):
+        dfc.project(gain, OMEGA0)
+
+
+def saved(saveat, convert=lambda sol: sol):
+    """The drift of a solve that is traced only."""
+    sol = ft.partial(solve, rigid_body, wrap(ENERGY), OMEGA0, saveat=saveat)
+    return jax.eval_shape(lambda: dfc.drift(convert(sol()), ENERGY))
+
+
+def test_drift_of_several_saved_paths():
+    saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=[0.0, 1.0]), dfx.SubSaveAt(t1=True)])
+    with pytest.raises(ValueError, match=r"`SaveAt\(subs=...\)`.*dataclasses.replace"):
+        saved(saveat)
+    one = saved(saveat, lambda s: dataclasses.replace(s, ts=s.ts[0], ys=s.ys[0]))
+    assert one.shape == (2,)
+
+
+def test_drift_of_what_is_no_state():
+    saveat = dfx.SaveAt(ts=[0.0, 1.0], fn=lambda t, y, args: y[:2], dense=True)
+    with pytest.raises(ValueError, match=r"saved \(2,\) at each time, but the states are \(3,\)"):
+        saved(saveat)
 
 
 def test_rejections_are_counted_for_adaptive_controllers():

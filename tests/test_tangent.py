@@ -300,3 +300,14 @@ def test_mistakes_are_named():
         dfc.tangent(FALLING, balance, gain=1.0)
     with pytest.raises(ValueError, match="`metric` has the structure"):
         dfc.tangent(FALLING, constraint, metric=1.0)(0.0, PENDULUM.y0, None)
+
+
+@pytest.mark.parametrize(
+    "bad", [lambda t, y, args: y[:2], lambda t, y, args: (y,), lambda t, y, args: None]
+)
+def test_a_field_unlike_the_state_is_named(bad):
+    integral = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    constraint = dfc.Constraint(integral.fn).derivative(bad)
+    for fn in (dfc.tangent(bad, integral), constraint.fn):
+        with pytest.raises(ValueError, match=r"`vector_field` returns the structure .* \(3,\)"):
+            fn(0.0, jnp.ones(3), None)

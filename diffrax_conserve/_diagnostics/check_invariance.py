@@ -145,6 +145,9 @@ def check_invariance(
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
 
+_ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
+
+
 def _batch(states: Any, key: PRNGKeyArray, num_states: int) -> PyTree[Array]:
     if callable(states):
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
@@ -154,8 +157,8 @@ def _batch(states: Any, key: PRNGKeyArray, num_states: int) -> PyTree[Array]:
     if len(sizes) != 1 or sizes & {None, 0} or not all(map(eqx.is_inexact_array, leaves)):
         raise ValueError(
             "`states` must be a sampler `key -> y`, or a PyTree of floating point arrays with the "
-            f"same leading axis over the states, but it is {eqx.tree_pformat(states)}. For one "
-            "state `y` write `jax.tree.map(lambda x: x[None], y)`."
+            f"same leading axis over the states, but it is {eqx.tree_pformat(states)}. "
+            + _ONE_STATE
         )
     return states
 
@@ -173,7 +176,15 @@ def _times(t: Real[ArrayLike, "*states"], ys: PyTree[Array]) -> Float[Array, " s
 
 
 def _check_like_y(vector_field: Callable, t: RealScalarLike, y: Any, args: Args) -> None:
-    out = eqx.filter_eval_shape(vector_field, t, y, args)
+    try:
+        out = eqx.filter_eval_shape(vector_field, t, y, args)
+    except (IndexError, TypeError, ValueError) as error:
+        if any(jnp.ndim(x) for x in jtu.tree_leaves(y)):
+            raise
+        raise ValueError(
+            "`vector_field` cannot be called with one of the `states`, which is "
+            f"{eqx.tree_pformat(y)}. " + _ONE_STATE
+        ) from error
     same_structure = jtu.tree_structure(out) == jtu.tree_structure(y)
     if not same_structure or not all(
         getattr(a, "shape", ()) == b.shape

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -17,8 +18,9 @@ from .._manifold import (
     evaluate,
     named_entries,
 )
+from .._options import check_solution
 from .._projection import measure, relative
-from .._tree import tree_add
+from .._tree import tree_add, tree_shapes
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -42,7 +44,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     - `sol`: what `diffrax.diffeqsolve` returned. It needs saved times; save `t0` too (as in
         `SaveAt(t0=True, steps=True)`) if the drift from the initial state is wanted. For a batch
-        of solutions use `jax.vmap`.
+        of solutions use `jax.vmap`. What a `SaveAt(fn=...)` saved is taken for states.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
@@ -53,8 +55,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     **Raises:**
 
-    `ValueError` if the solution holds no saved states, only one with nothing to compare it with, or
-    is a batch; or, of a balance law, no dense output.
+    `ValueError` if the solution holds no saved states, only one with nothing to compare it with,
+    those of several `SaveAt(subs=...)`, or, where dense output tells, something else than states,
+    or is a batch; or, of a balance law, no dense output. `TypeError` if `sol` is no solution.
 
     !!! example
 
@@ -81,11 +84,17 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         4e-08
         ```
     """
+    check_solution(sol, "drift")
     check_manifold(manifold)
     if sol.ts is None or sol.ys is None:
         raise ValueError(
             "`drift` needs saved states, but `sol` holds none. Save some, for example with "
             "`saveat=SaveAt(t0=True, steps=True)`."
+        )
+    if not eqx.is_array(sol.ts):
+        raise ValueError(
+            "`sol` was saved by `SaveAt(subs=...)`, but `drift` takes the times and states of one "
+            "of them: write `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
         )
     if sol.ts.ndim != 1:
         raise ValueError(
@@ -104,6 +113,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             "`FirstIntegral(fn, value=...)`."
         )
     t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
+    _check_states(sol, y0)
     values = conserved_values(manifold, t0, y0, args)
     _, scale = measure(manifold, values, t0, y0, args)
 
@@ -118,6 +128,18 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         return relative(residual, scale)
 
     return jax.vmap(at)(sol.ts, sol.ys)
+
+
+def _check_states(sol: dfx.Solution, y0: Y) -> None:
+    """Raises if what was saved is known not to be states."""
+    if sol.interpolation is None:
+        return
+    states = tree_shapes(eqx.filter_eval_shape(sol.evaluate, sol.t0))
+    if tree_shapes(y0) != states:
+        raise ValueError(
+            f"`sol` has saved {tree_shapes(y0)} at each time, but the states are {states}. Save "
+            "the states themselves, without `SaveAt(fn=...)`."
+        )
 
 
 def _gained(

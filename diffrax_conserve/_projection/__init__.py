@@ -1,6 +1,7 @@
 from .base import AbstractProjection as AbstractProjection
 from .base import Problem as Problem
 from .base import ProjectionInfo as ProjectionInfo
+from .base import check_projection as check_projection
 from .base import option as option
 from .closed_form import ClosedForm as ClosedForm
 from .directional import Directional as Directional

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
+from .._options import check_count, check_number, check_numbers
 from .._printing import is_traced, printed
 from .._tree import from_view, tree_all_finite, tree_norm, tree_stop_gradient, tree_sub
 from .elimination import Vector
@@ -178,6 +179,25 @@ def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
             )
 
 
+def check_options(projection: Any) -> None:
+    """Raises unless those that the projections share are numbers that make sense."""
+    for name in ("rtol", "atol"):
+        check_number(name, getattr(projection, name), least=0.0)
+    if hasattr(projection, "max_steps"):
+        check_count("max_steps", projection.max_steps)
+    for name in ("lower", "upper"):
+        check_numbers(name, getattr(projection, name, None), least=-np.inf)
+
+
+def check_projection(projection: Any) -> None:
+    """Raises unless `projection` is a projection, and not the class of one."""
+    if not isinstance(projection, AbstractProjection):
+        raise TypeError(
+            f"`projection` is {projection!r}, which is not a projection. Pass an instance, for "
+            "example `projection=SimplifiedNewton()`."
+        )
+
+
 # The options that the Newton iterations share.
 NEWTON_OPTIONS = r"""**Arguments:**
 
@@ -199,16 +219,21 @@ NEWTON_OPTIONS = r"""**Arguments:**
 
 **Raises:**
 
-`ValueError` if a weight is not positive, if a lower bound is above its upper one, or, when they are
+`TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
+less than 1, a weight is not positive, if a lower bound is above its upper one, or, when they are
 used, if the bounds are not shaped like the state.
 """
 
 
 def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
     """`metric`, checked at once where its values are known, and otherwise when they are."""
-    message = "`metric` has a weight that is not positive. Every weight must be greater than 0."
+    message = (
+        "`metric` has a weight that is not positive. Every weight must be greater than 0; they are "
+        "per component, not a matrix."
+    )
 
     def check(weight: ArrayLike) -> ArrayLike:
+        check_number("metric", weight)
         if isinstance(weight, jax.core.Tracer):
             return eqx.error_if(weight, ~jnp.all(weight > 0), message)
         if not np.all(np.asarray(weight) > 0):

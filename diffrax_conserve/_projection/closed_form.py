@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._custom_types import RealScalarLike, Values, Y
 from .._tree import real_view
-from .base import AbstractProjection, Problem, ProjectionInfo, option
+from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
 
 
 @final
@@ -52,6 +52,7 @@ class ClosedForm(AbstractProjection):
                 f"`fn` of a `ClosedForm` is {self.fn!r}, which is not callable. Pass a function "
                 "`fn(t, y, args, values)` that returns the projected state."
             )
+        check_options(self)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         state = problem.state(candidate)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Int, Real
 
 from .._custom_types import Y
 from .._tree import tree_add, tree_dot, tree_max, tree_norm, tree_scale, tree_tangents
-from .base import AbstractProjection, Problem, ProjectionInfo, option
+from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
 from .iteration import SAFELY
 from .linearise import Joined, linearise
 from .residual import Tolerance, within
@@ -63,6 +63,9 @@ class Directional(AbstractProjection):
     max_steps: int = option(20, static=True)
     metric: None = eqx.field(default=None, init=False)
     sees_step: ClassVar[bool] = True
+
+    def __check_init__(self):
+        check_options(self)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
         direction = _direction(problem)

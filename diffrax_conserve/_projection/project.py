@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -17,8 +18,9 @@ from .._manifold import (
     conserved_values,
     is_entry,
 )
+from .._options import dtype_of
 from .._tree import from_view, real_view, tree_mul, tree_stop_gradient, tree_sub
-from .base import AbstractProjection, Problem, ProjectionInfo, check_like
+from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
 from .linearise import linearise
 from .newton import Newton
 from .residual import largest, measure, relative, residual_of
@@ -71,8 +73,9 @@ def project(
     """
     check_manifold(manifold)
     projection = Newton() if projection is None else projection
-    y = jtu.tree_map(jnp.asarray, y)
+    check_projection(projection)
     check_state(y, kind=jnp.inexact)
+    y = jtu.tree_map(jnp.asarray, y)
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
     if value is None:
@@ -159,7 +162,8 @@ def _problem(
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
     """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
     for leaf in jtu.tree_leaves(y):
-        if not jnp.issubdtype(jnp.result_type(leaf), kind):
+        dtype = dtype_of(leaf)
+        if not jnp.issubdtype(dtype, kind):
             remedy = (
                 "floating-point states, real or complex. Convert it, for example by "
                 "`jnp.asarray(..., dtype=float)`."
@@ -167,9 +171,8 @@ def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> N
                 else "real floating-point states. Split a complex leaf into its real and its "
                 "imaginary part."
             )
-            raise TypeError(
-                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but {user} needs {remedy}"
-            )
+            got = f"a leaf of dtype {dtype}" if eqx.is_array_like(leaf) else f"the leaf {leaf!r}"
+            raise TypeError(f"The state has {got}, but {user} needs {remedy}")
 
 
 def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:

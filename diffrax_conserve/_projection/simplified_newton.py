@@ -30,6 +30,7 @@ from .base import (
     Outcome,
     Problem,
     ProjectionInfo,
+    check_options,
     option,
     positive_weights,
     report,
@@ -91,6 +92,7 @@ class SimplifiedNewton(AbstractProjection):
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
+        check_options(self)
         check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:

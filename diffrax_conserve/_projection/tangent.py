@@ -1,5 +1,6 @@
 """Vector fields made tangent to a manifold, and with them the forces of constraints."""
 
+import math
 from collections.abc import Callable
 from typing import Any, final
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
+from .._along import slope_like
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
@@ -20,8 +22,8 @@ from .._manifold import (
     evaluate,
     named_entries,
     rate_of,
-    slope_like,
 )
+from .._options import check_number, check_vector_field
 from .._tree import from_view, real_view, tree_add, tree_mul
 from .base import positive_weights
 from .linearise import as_array, linearise, written_out
@@ -61,7 +63,8 @@ def tangent(
         arguments. A `FirstIntegral` with a `rate` gets that.
     - `metric`: a PyTree like the state of positive weights, scalars or arrays shaped like the
         leaves. An infinite weight leaves its component of the field alone. Default: Euclidean.
-    - `gain`: how fast the residual decays, in units of one over time.
+    - `gain`: how fast the residual decays, in units of one over time; for a solve backward in time
+        negative.
 
     **Returns:**
 
@@ -69,8 +72,8 @@ def tangent(
 
     **Raises:**
 
-    `TypeError` or `ValueError` if the manifold or the metric does not fit, or if a `gain` is given
-    for a `FirstIntegral` without a `value`.
+    `TypeError` or `ValueError` if an argument does not fit, or if a `gain` is given for a
+    `FirstIntegral` without a `value`; and, when it is called, if the field is not like the state.
 
     !!! example
 
@@ -99,12 +102,9 @@ def tangent(
         al., "Stabilized neural differential equations for learning dynamics with explicit
         constraints", NeurIPS 2023.
     """
-    if not callable(vector_field):
-        raise TypeError(
-            f"`vector_field` is {vector_field!r}, which is not callable. Pass the function, not a "
-            "`diffrax.ODETerm` of it: `tangent(vector_field, manifold)`."
-        )
+    check_vector_field(vector_field, "tangent(vector_field, manifold)")
     check_manifold(manifold)
+    check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
         if damped and isinstance(entry, FirstIntegral) and entry.value is None:

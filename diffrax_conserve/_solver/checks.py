@@ -2,18 +2,8 @@
 
 import diffrax as dfx
 import equinox as eqx
-import jax.core
-import numpy as np
 
-from .._custom_types import RealScalarLike
 from .._projection import AbstractProjection, Directional
-
-
-def check_positive(name: str, option: RealScalarLike | None) -> None:
-    if option is None or isinstance(option, jax.core.Tracer) or not eqx.is_array_like(option):
-        return
-    if not np.all(np.asarray(option) > 0):
-        raise ValueError(f"`{name}` is {option}, but it must be positive, or `None`.")
 
 
 def check_nested(solver: dfx.AbstractSolver) -> None:

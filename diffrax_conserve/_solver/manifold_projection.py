@@ -20,17 +20,19 @@ from .._custom_types import (
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import check_manifold, check_outputs, check_values, conserved_values
+from .._options import check_count, check_number
 from .._projection import (
     AbstractProjection,
     SimplifiedNewton,
     Target,
     check_metric,
+    check_projection,
     check_state,
     option,
     tangential,
 )
 from .._tree import tree_norm, tree_sub, working_dtype
-from .checks import check_direction, check_nested, check_positive, innermost
+from .checks import check_direction, check_nested, innermost
 from .count_rejections import FAILED_PROJECTION
 from .failure import failure
 from .initial import FINE, Initial, judge
@@ -122,19 +124,11 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             )
         check_nested(self.solver)
         check_manifold(self.manifold)
-        if not isinstance(self.projection, AbstractProjection):
-            raise TypeError(
-                f"`projection` is {self.projection!r}, which is not a projection. Pass an "
-                "instance, for example `projection=SimplifiedNewton()`."
-            )
+        check_projection(self.projection)
         check_direction(self.solver, self.projection)
-        check_positive("max_correction", self.max_correction)
-        check_positive("threshold", self.threshold)
-        if not isinstance(self.every, int) or self.every < 1:
-            raise ValueError(
-                f"`every` is {self.every!r}, but it must be a positive integer: every how many "
-                "steps the state is projected."
-            )
+        check_number("max_correction", self.max_correction, above=0.0)
+        check_number("threshold", self.threshold, above=0.0)
+        check_count("every", self.every)
         bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
         if bounds != [None, None] and (self.threshold is not None or self.every > 1):
             raise ValueError(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
 
+from .._options import check_solution
 from .._printing import is_traced, printed
 from .._projection import ProjectionInfo
 from .count_rejections import RejectionCount
@@ -87,7 +88,8 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Raises:**
 
-    `ValueError` if `sol` holds no state of a `ManifoldProjection`.
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`; `TypeError` if `sol` is no
+    solution.
 
     !!! example
 
@@ -122,6 +124,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
           num_rejected     not counted; CountRejections counts them
         ```
     """
+    check_solution(sol, "statistics")
     found = _instances(sol.solver_state, ProjectionStatistics)
     counts = _instances(sol.controller_state, RejectionCount)
     if not found:

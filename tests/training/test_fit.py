@@ -284,6 +284,8 @@ def test_arguments_that_are_refused():
         ("key", 0),
         ("sample", np.zeros((5, 2))),
         ("progress", "yes"),
+        ("seconds", "a"),
+        ("target", [1e-3]),
     ],
 )
 def test_arguments_of_a_wrong_type_are_named(name, wrong):

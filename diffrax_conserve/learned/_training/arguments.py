@@ -13,6 +13,7 @@ from jaxtyping import Array
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_outputs
+from ..._options import check_number
 from ..._projection import check_state
 from ..._tree import tree_shapes
 from .._networks import PINN, AbstractFlowMap, AbstractTrainable, Points, as_flow_map, has_arrays
@@ -109,8 +110,7 @@ def check_limits(state: Any, target: Any, seconds: Any) -> None:
     if state is not None and not isinstance(state, FitState):
         raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
     for name, value in (("target", target), ("seconds", seconds)):
-        if value is not None and not value > 0:
-            raise ValueError(f"`{name}` must be positive, or `None`, but is {value}.")
+        check_number(name, value, above=0.0)
 
 
 def check_field(

@@ -1,0 +1,80 @@
+"""What numbers and functions that a user passes must be."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+
+def dtype_of(x: Any) -> Any:
+    """The dtype of a number or an array; of anything else `object`."""
+    if hasattr(x, "dtype"):
+        return x.dtype
+    return np.asarray(x).dtype if eqx.is_array_like(x) else np.dtype(object)
+
+
+def is_real(x: Any) -> bool:
+    """Whether `x` is a real number or an array of them, and not a string or a boolean."""
+    return any(jnp.issubdtype(dtype_of(x), kind) for kind in (jnp.floating, jnp.integer))
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    optional: bool = True,
+) -> None:
+    """Raises unless `value` is a real number, an array of them (for a `vmap`), a tracer, or, where
+    it is `optional`, `None`. It must be at least `least` and greater than `above`; NaN is neither.
+    """
+    if isinstance(value, jax.core.Tracer) or (optional and value is None):
+        return
+    ending = ", or `None`." if optional else "."
+    if not is_real(value):
+        raise TypeError(f"`{name}` is {value!r}, but it must be a real number{ending}")
+    number = np.asarray(value)
+    if above is not None and not np.all(number > above):
+        wanted = "positive" if above == 0 else f"greater than {above:g}"
+        raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
+    if least is not None and not np.all(number >= least):
+        wanted = f"at least {least:g}" if np.isfinite(least) else "a number"
+        raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
+
+
+def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
+    """`check_number` of every leaf of `tree`."""
+    for path, leaf in jtu.tree_leaves_with_path(tree):
+        check_number(name + jtu.keystr(path), leaf, least=least)
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raises unless `value` is an integer of at least one."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
+    if value < 1:
+        raise ValueError(f"`{name}` is {value}, but it must be at least 1.")
+
+
+def check_vector_field(vector_field: Callable, example: str) -> None:
+    """Raises unless a vector field, as it is passed in `example`, is a function."""
+    if not callable(vector_field):
+        raise TypeError(
+            f"`vector_field` is {vector_field!r}, which is not callable. Pass the function, not a "
+            f"`diffrax.ODETerm` of it: `{example}`."
+        )
+
+
+def check_solution(sol: Any, user: str) -> None:
+    """Raises unless `sol` is what a solve returned."""
+    if not isinstance(sol, dfx.Solution):
+        raise TypeError(
+            f"`sol` is of type `{type(sol).__name__}`, but `{user}` takes the `diffrax.Solution` "
+            "that `diffrax.diffeqsolve` returned."
+        )
