@@ -149,10 +149,14 @@ def main(argv=None):
     begun = time.process_time()
     data = solve(4 if smoke else 1200, ts, jr.key(0), 1e-3 if smoke else 1e-6)
     solved = time.process_time()
-    network, log = train(data, 20 if smoke else 40_000, 20 if smoke else 1000)
+    network, log = train(data, 20 if smoke else 100_000, 20 if smoke else 1000)
     trained = time.process_time()
     if options.out is not None:
-        dfc.save(options.out, network)
+        info = {
+            "system": "pollu",
+            "command": f"python benchmarks/learned/pollu.py --out {options.out}",
+        }
+        dfc.save(options.out, network, info=info)
     ts = FIRST + STEP * jnp.arange(steps + 1)
     fresh = solve(2 if smoke else 60, ts, jr.key(9), 1e-3 if smoke else 1e-7)
     batch = fresh[1][:, :17].reshape(-1, 20)[:1000]

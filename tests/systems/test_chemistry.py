@@ -199,3 +199,24 @@ def test_a_mechanism_whose_balances_have_signs_has_none():
     assert list(mechanism.balances) == ["-A + B"] or list(mechanism.balances) == ["- A + B"]
     with pytest.raises(ValueError, match="SimplifiedNewton"):
         mechanism.positive_projection()
+
+
+def test_the_flow_map_of_pollu_keeps_signs_and_balances():
+    system = STIFF["pollu"]
+    solver = dfc.ManifoldProjection(
+        dfc.DeepONetSolver(dfc.load_pretrained("pollu")),
+        system.manifold,
+        projection=system.mechanism.positive_projection(),
+    )
+    ts = np.arange(2.0, 61.0, 2.0)
+    exact = np.asarray(system.reference(ts))
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field), solver, ts[0], ts[-1], 2.0, exact[0],
+        saveat=dfx.SaveAt(ts=ts),
+    )  # fmt: skip
+    error = np.abs(sol.ys / exact - 1)[exact > 1e-10]
+    assert np.median(error) < 1e-3
+    assert np.max(error) < 2e-2
+    assert np.min(sol.ys) > 0
+    kept = dfc.drift(sol, system.manifold)
+    assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(kept)) < 4e-15
