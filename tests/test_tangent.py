@@ -311,3 +311,19 @@ def test_a_field_unlike_the_state_is_named(bad):
     for fn in (dfc.tangent(bad, integral), constraint.fn):
         with pytest.raises(ValueError, match=r"`vector_field` returns the structure .* \(3,\)"):
             fn(0.0, jnp.ones(3), None)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_units_of_a_constraint_do_not_count(dtype):
+    """The circle of a radius whose square leaves the range of the dtype."""
+    far = 1e20 if dtype == jnp.float32 else 1e160
+
+    def along(radius, unit):
+        circle = dfc.Constraint(lambda t, y, args: unit * (jnp.sum((y / radius) ** 2) - 1))
+        field = dfc.tangent(lambda t, y, args: radius * jnp.array([1.0, 2.0], dtype), circle)
+        return field(0.0, radius * jnp.array([0.6, 0.8], dtype), None) / radius
+
+    one = jnp.ones((), dtype)
+    found = jax.vmap(along)(*jnp.array([[one, far], [one, 1 / far], [far, one], [1 / far, one]]).T)
+    tolerance = 16 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(found, [[-0.32, 0.24]] * 4, rtol=tolerance)

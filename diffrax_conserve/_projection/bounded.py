@@ -88,13 +88,8 @@ def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, y: Y) -> 
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
-    """Raises if a known bound is NaN, or if a lower one is above its upper one."""
+    """Raises if both are known and a lower bound is above its upper one."""
     leaves = [jtu.tree_leaves(x) for x in (lower, upper)]
-    for name, bound in zip(("lower", "upper"), leaves, strict=True):
-        for x in bound:
-            known = eqx.is_array_like(x) and not isinstance(x, jax.core.Tracer)
-            if known and np.any(np.isnan(np.asarray(x))):
-                raise ValueError(f"`{name}` is {x}. A bound must be a number, or infinite.")
     if len(leaves[0]) != len(leaves[1]) or any(
         isinstance(x, jax.core.Tracer) or not eqx.is_array_like(x) for x in [*leaves[0], *leaves[1]]
     ):

@@ -163,29 +163,37 @@ def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector,
     residual, candidate, weights = equations.residual, equations.candidate, equations.weights
     _, jacobian = linearise(residual, start)
     offset = jacobian.pushforward(tree_sub(start, candidate))
-    # Rows of norm one, so that a linear solver sees the rank of the system.
-    _, norms = units(jacobian, weights)
+    # In units in which a linear solver sees the rank of the system.
+    roots, norms = units(jacobian, weights)
     multiplier = jacobian.gram_solver(weights).solve(offset) * norms
+
+    def scaled(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
+        (y, multiplier), (residual, candidate, weights, roots, norms) = unknowns, parameters
+        given = (lambda y: residual(y) / norms), candidate, weights
+        off, g = _optimality((tree_mul(y, roots), multiplier), given)
+        return jtu.tree_map(jnp.divide, off, roots), g
+
     eps = float(jnp.finfo(working_dtype(candidate)).eps)
     tolerance = eps ** (2 / 3)
+    sizes = jtu.tree_map(lambda x, w, r: jnp.where(w > 0, x / r, 0), candidate, weights, roots)
     # The multipliers of nearly parallel gradients are large and cancel, up to their roundoff.
-    atol = tolerance + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
-    size = tree_size((candidate, multiplier))
-    if size <= SYSTEM_DENSE_MAX:
+    roundoff = ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
+    atol = tolerance * optx.max_norm(sizes) + roundoff
+    if tree_size((candidate, multiplier)) <= SYSTEM_DENSE_MAX:
         # Dependent constraints make the system singular but consistent.
         linear_solver = lx.AutoLinearSolver(well_posed=False)
     else:
         linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
     solution = optx.root_find(
-        lambda x, p: _optimality(x, (lambda y: p[0](y) / p[3], p[1], p[2])),
+        scaled,
         optx.Newton(rtol=tolerance, atol=atol, norm=_state_norm, linear_solver=linear_solver),
-        (start, multiplier),
-        (residual, candidate, weights, norms),
+        (jtu.tree_map(jnp.divide, start, roots), multiplier),
+        (residual, candidate, weights, roots, norms),
         max_steps=max_steps,
         throw=False,
     )
     y, multiplier = solution.value
-    return y, multiplier / norms, solution
+    return tree_mul(y, roots), multiplier / norms, solution
 
 
 @_project.def_jvp

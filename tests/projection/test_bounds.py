@@ -112,6 +112,39 @@ def test_a_candidate_within_the_bounds_is_projected_as_without():
     assert largest((y - expected)[untouched]) < 1e-13
 
 
+@BOTH
+def test_bounds_that_are_far_away_change_nothing(kind):
+    """Also for candidates from which a bounded iteration alone would not arrive."""
+
+    def fn(t, y, args):
+        a, b, c = y
+        return jnp.stack([a**2 + 2 * b**2 + c**2 - 4, jnp.exp(0.3 * a) * c + b * a - 0.5])
+
+    candidates = 3 * jax.random.normal(jax.random.key(5), (200, 3))
+
+    def projected(**bounds):
+        def one(candidate):
+            y, info = dfc.project(dfc.Constraint(fn), candidate, projection=kind(**bounds))
+            return y, info.ok
+
+        return jax.jit(jax.vmap(one))(candidates)
+
+    (free, ok), (y, okay) = projected(), projected(lower=-100.0, upper=100.0)
+    assert jnp.all(okay | ~ok)
+    within = ok & (jnp.max(jnp.abs(free), axis=1) < 100)
+    np.testing.assert_allclose(y[within], free[within], rtol=1e-12)
+
+
+def test_a_bound_that_is_nan_is_never_ignored():
+    with pytest.raises(ValueError, match="`lower` is"):
+        dfc.Newton(lower=jnp.array([0.0, jnp.nan]))
+    lanes = jnp.array([0.0, jnp.nan])
+    ok = jax.vmap(lambda a: dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=a))[1].ok)(
+        lanes
+    )
+    assert ok.tolist() == [True, False]
+
+
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
 

@@ -175,3 +175,54 @@ def test_many_constraints_agree_with_finite_differences():
         (value(q + h * d, 1.0 + h) - value(q - h * d, 1.0 - h)) / (2 * h),
         rtol=1e-7,
     )
+
+
+UNITS = jnp.array([1e-20, 1.0, 1e5, 1e13, 1e24])
+
+
+@pytest.mark.parametrize("kind", [dfc.SimplifiedNewton, dfc.Newton])
+@pytest.mark.parametrize("bounds", [{}, {"lower": -9.0}], ids=["free", "bounded"])
+def test_the_units_of_a_constraint_do_not_count(kind, bounds):
+    """Nor do those of the state, if the metric follows."""
+
+    def fn(t, y, args):
+        a, b, c = y / args["metre"]
+        both = jnp.stack([a**2 + 2 * b**2 + c**2 - 4, jnp.exp(0.3 * a) * c + b * a - 0.5])
+        return args["unit"] * both
+
+    candidate = jnp.array([1.1, 0.9, 0.4])
+
+    @jax.jit
+    @jax.vmap
+    def found(unit, metre):
+        def state(x):
+            projection = kind(**jax.tree.map(lambda x: x * metre, bounds))
+            args = {"unit": unit, "metre": metre}
+            y, info = dfc.project(dfc.Constraint(fn), x * metre, args=args, projection=projection)
+            return y / metre, info.ok
+
+        _, vjp, ok = jax.vjp(state, candidate, has_aux=True)
+        return vjp(jnp.array([0.3, -0.7, 0.5]))[0], ok
+
+    slopes, ok = found(UNITS, jnp.ones(5))
+    others, okay = found(jnp.ones(5), jnp.array([1e-9, 1e-3, 1.0, 1e3, 1e9]))
+    assert jnp.all(ok & okay)
+    np.testing.assert_allclose(slopes, jnp.stack([slopes[1]] * 5), rtol=1e-9)
+    np.testing.assert_allclose(others, jnp.stack([slopes[1]] * 5), rtol=1e-9)
+
+
+@each_projection
+def test_a_lane_that_failed_spoils_no_other(projection):
+    """In reverse mode as in forward mode, its derivative is NaN or unused, and nothing raises."""
+
+    def one(x):
+        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        y, info = dfc.project(sphere, x, projection=projection)
+        return jnp.sum(y * jnp.array([1.0, 2.0])), info.ok
+
+    lanes = jnp.array([[1.0, 0.3], [jnp.nan, 1.0], [jnp.inf, 1.0], [0.2, 1.4]])
+    _, gradients = jax.jit(jax.vmap(jax.value_and_grad(one, has_aux=True)))(lanes)
+    direction = lanes / jnp.linalg.norm(lanes, axis=1, keepdims=True)
+    across = jnp.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    exact = across * (across @ jnp.array([1.0, 2.0]) / jnp.linalg.norm(lanes, axis=1))[:, None]
+    np.testing.assert_allclose(gradients[::3], exact[::3], rtol=1e-9)
