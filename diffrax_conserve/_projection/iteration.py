@@ -154,20 +154,29 @@ def iterate(
         damping, merit = choose((less, merit), (10.0 * damping, last))
         return _Carry(unfinished, ~stays, damping, merit, y, multiplier, best)
 
+    carry = _begin(equations, before, first, start, jnp.asarray(enabled))
+    return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
+
+
+def _begin(
+    equations: Equations,
+    before: Vector,
+    scale: Vector,
+    start: Start | None,
+    enabled: Bool[Array, ""],
+) -> _Carry:
     # All that a batch carries is batched from the start: else jax traces the body again to see it.
-    enabled = jnp.asarray(enabled)
     zero = jnp.where(enabled, 0, 0)
     zeros = jtu.tree_map(lambda x: jnp.zeros_like(x) + zero.astype(x.dtype), before)
     one = 1 + zero.astype(jtu.tree_leaves(before)[0].dtype)
     damping, merit = one, one * jnp.inf
-    best = Iterate(equations.candidate, zeros, before, first, zero)
+    best = Iterate(equations.candidate, zeros, before, scale, zero)
     y, multiplier = best.y, zeros
     if start is not None:
         y, multiplier, count = start
-        required = _WELL_STARTED * equations.merit(before, first)
+        required = _WELL_STARTED * equations.merit(before, scale)
         known = (count > 0) & (required < jnp.inf)
         damping = jnp.where(known, 0.1 * damping, damping)  # so that it is one after a return
         merit = jnp.where(known, required, merit)
         best = best._replace(num_steps=zero + jnp.maximum(count - 1, 0))
-    carry = _Carry(enabled, zero > 0, damping, merit, y, multiplier, best)
-    return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
+    return _Carry(enabled, zero > 0, damping, merit, y, multiplier, best)
