@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import (
@@ -123,14 +123,14 @@ Newton.__init__.__doc__ = NEWTON_OPTIONS
 @eqx.filter_custom_jvp
 def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, ProjectionInfo]:
     before, reached = iterate(equations, frozen=False, max_steps=max_steps)
-    nearest, multiplier, along = _nearest(equations, reached.y, max_steps)
+    nearest, multiplier, num_steps, arrived = _nearest(equations, reached.y, max_steps)
 
     def residuals(y: Y) -> tuple[Vector, Vector]:
         g, jacobian = linearise(equations.residual, y)
         return g, equations.scale(jacobian, y)
 
     g, scale = residuals(nearest)
-    found = within(g, equations.tolerance(scale)) & (along.result == optx.RESULTS.successful)
+    found = within(g, equations.tolerance(scale)) & arrived
     y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
     after, scale = residuals(y)
     outcome = Outcome.of(before, after, scale, equations.tolerance)
@@ -138,7 +138,7 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     reached_only = (outcome.result == optx.RESULTS.successful) & ~found
     multiplier = jnp.where(reached_only, jnp.nan, multiplier)
     rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
-    count = reached.num_steps + along.stats["num_steps"]
+    count = reached.num_steps + num_steps
     return y, multiplier, report(outcome, count, equations.candidate, y, before, after, scale, rank)
 
 
@@ -157,9 +157,12 @@ def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -
     return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
 
 
-def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector, optx.Solution]:
+def _nearest(
+    equations: Equations, start: Y, max_steps: int
+) -> tuple[Y, Vector, Int[Array, ""], Bool[Array, ""]]:
     """Newton's method on the optimality system, from a point of the manifold and the multipliers
-    that suit the candidate best there."""
+    that suit the candidate best there: the state, its multipliers, the number of steps, and whether
+    it arrived."""
     residual, candidate, weights = equations.residual, equations.candidate, equations.weights
     _, jacobian = linearise(residual, start)
     offset = jacobian.pushforward(tree_sub(start, candidate))
@@ -173,27 +176,35 @@ def _nearest(equations: Equations, start: Y, max_steps: int) -> tuple[Y, Vector,
         off, g = _optimality((tree_mul(y, roots), multiplier), given)
         return jtu.tree_map(jnp.divide, off, roots), g
 
+    def tolerance(y: Y, multiplier: Vector) -> Array:
+        """How far off may be what is to be the nearest point. Multipliers of nearly parallel
+        gradients are large and cancel, up to their roundoff."""
+        free = jtu.tree_map(lambda x, w: jnp.where(w > 0, x, 0), y, weights)
+        return rtol * optx.max_norm(free) + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
+
     eps = float(jnp.finfo(working_dtype(candidate)).eps)
-    tolerance = eps ** (2 / 3)
-    sizes = jtu.tree_map(lambda x, w, r: jnp.where(w > 0, x / r, 0), candidate, weights, roots)
-    # The multipliers of nearly parallel gradients are large and cancel, up to their roundoff.
-    roundoff = ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
-    atol = tolerance * optx.max_norm(sizes) + roundoff
+    rtol = eps ** (2 / 3)
     if tree_size((candidate, multiplier)) <= SYSTEM_DENSE_MAX:
         # Dependent constraints make the system singular but consistent.
         linear_solver = lx.AutoLinearSolver(well_posed=False)
     else:
-        linear_solver = lx.GMRES(rtol=tolerance, atol=tolerance)
+        linear_solver = lx.GMRES(rtol=rtol, atol=rtol)
+    y = jtu.tree_map(jnp.divide, start, roots)
+    atol: Any = tolerance(y, multiplier)
+    parameters = residual, candidate, weights, roots, norms
     solution = optx.root_find(
         scaled,
-        optx.Newton(rtol=tolerance, atol=atol, norm=_state_norm, linear_solver=linear_solver),
-        (jtu.tree_map(jnp.divide, start, roots), multiplier),
-        (residual, candidate, weights, roots, norms),
+        optx.Newton(rtol=rtol, atol=atol, norm=_state_norm, linear_solver=linear_solver),
+        (y, multiplier),
+        parameters,
         max_steps=max_steps,
         throw=False,
     )
     y, multiplier = solution.value
-    return tree_mul(y, roots), multiplier / norms, solution
+    # Judged there: at the start multipliers may be much smaller.
+    off, _ = scaled((y, multiplier), parameters)
+    arrived = optx.max_norm(off) <= tolerance(y, multiplier)
+    return tree_mul(y, roots), multiplier / norms, solution.stats["num_steps"], arrived
 
 
 @_project.def_jvp
