@@ -22,8 +22,35 @@ def at_args(flow_map: AbstractFlowMap, args: Args) -> AbstractFlowMap:
     return flow_map if domain is None else AtArgs(flow_map, checked_args(domain, args))
 
 
+class _AbstractOfFamily(AbstractFlowMap):
+    """What a flow map made of a family has from that."""
+
+    flow_map: eqx.AbstractVar[AbstractFlowMap]
+
+    @property
+    def max_step(self) -> RealScalarLike:
+        """The longest step."""
+        return self.flow_map.max_step
+
+    @property
+    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the family."""
+        return self.flow_map.order
+
+    @property
+    def layer(self) -> Any:
+        """That of the family."""
+        return self.flow_map.layer
+
+    def weights(self) -> Any:
+        return self.flow_map.weights()
+
+    def linear_weights(self) -> Any:
+        return self.flow_map.linear_weights()
+
+
 @final
-class AtArgs(AbstractFlowMap):
+class AtArgs(_AbstractOfFamily):
     """One member of a family of flow maps."""
 
     flow_map: AbstractFlowMap
@@ -39,35 +66,14 @@ class AtArgs(AbstractFlowMap):
         return self.flow_map(y0, self.args, *step, schedule=schedule)
 
     @property
-    def max_step(self) -> RealScalarLike:
-        """The longest step."""
-        return self.flow_map.max_step
-
-    @property
-    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the family."""
-        return self.flow_map.order
-
-    @property
     def domain(self) -> "ArgsDomain":
         """The states of the family's domain, or none if `args` are outside theirs."""
         known = args_domain_of(self.flow_map)
         assert known is not None
         return ArgsDomain(self.flow_map.domain, known, self.args)
 
-    @property
-    def layer(self) -> Any:
-        """That of the family."""
-        return self.flow_map.layer
-
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         return self.flow_map.measure(y0, rate)
-
-    def weights(self) -> Any:
-        return self.flow_map.weights()
-
-    def linear_weights(self) -> Any:
-        return self.flow_map.linear_weights()
 
 
 @final
@@ -85,7 +91,7 @@ class ArgsDomain(eqx.Module):
 
 
 @final
-class OfPairs(AbstractFlowMap):
+class OfPairs(_AbstractOfFamily):
     """A family of flow maps as one flow map of the pairs `(y, args)`, whose `args` stay.
 
     So a training need not know of `args`: they are a part of the state.
@@ -102,23 +108,8 @@ class OfPairs(AbstractFlowMap):
         return self.flow_map(y0, args, *step, schedule=schedule), args
 
     @property
-    def max_step(self) -> RealScalarLike:
-        """The longest step."""
-        return self.flow_map.max_step
-
-    @property
-    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the family."""
-        return self.flow_map.order
-
-    @property
     def domain(self) -> None:
         """None: a training does not extend it."""
-
-    @property
-    def layer(self) -> Any:
-        """That of the family."""
-        return self.flow_map.layer
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         # That of `args` is zero, and the last part.
@@ -126,12 +117,6 @@ class OfPairs(AbstractFlowMap):
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
         return self.flow_map.compared(ys[0], others[0])
-
-    def weights(self) -> Any:
-        return self.flow_map.weights()
-
-    def linear_weights(self) -> Any:
-        return self.flow_map.linear_weights()
 
 
 @final
