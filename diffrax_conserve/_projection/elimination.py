@@ -11,7 +11,6 @@ which they differ is the one that is needed.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -97,10 +96,20 @@ def dense_solver(gram: Real[Array, "m m"], damping: Real[Array, ""] | float) -> 
     identity = jnp.eye(m, dtype=gram.dtype)
     lower, upper = lax.fori_loop(0, m, eliminate, (identity, scaled + damping * identity))
     kept = jnp.abs(jnp.diagonal(upper)) > least
-    upper = jnp.where(kept[:, None], upper, identity)
+
+    # By columns, in loops: a triangular solve of the library would be a call, and XLA compiles no
+    # loop that holds one, as the solve around this, into one kernel.
+    def forward(k: Array, x: Array) -> Array:
+        return x - jnp.where(index > k, lower[:, k] * x[k], 0)
+
+    def backward(i: Array, x: Array) -> Array:
+        k = m - 1 - i
+        value = jnp.where(kept[k], x[k] / jnp.where(kept[k], upper[k, k], 1), 0)
+        x = x - jnp.where(index < k, upper[:, k] * value, 0)
+        return x.at[k].set(value)
 
     def solve(b: Vector) -> Vector:
-        x = jax.scipy.linalg.solve_triangular(lower, b * inverse, lower=True, unit_diagonal=True)
-        return jax.scipy.linalg.solve_triangular(upper, jnp.where(kept, x, 0))
+        x = lax.fori_loop(0, m, forward, b * inverse)
+        return lax.fori_loop(0, m, backward, x)
 
     return GramSolver(solve, jnp.sum(kept))

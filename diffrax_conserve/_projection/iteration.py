@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_cancel, tree_mul, tree_scale, tree_sub
+from .._tree import tree_cancel, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
 from .base import Problem
 from .elimination import Vector
 from .jacobian import AbstractJacobian
@@ -120,7 +120,7 @@ def iterate(
     the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
-    first = equations.scale(at_candidate, equations.candidate)
+    first = _first_scale(equations, at_candidate)
 
     # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
     # and then never ends: so the condition is evaluated once, and carried.
@@ -140,7 +140,7 @@ def iterate(
         unfinished = ~lost & ~(stays & (ended | (count >= max_steps)))
 
         base = at_candidate if frozen else jacobian
-        # Near a state of which all terms vanish the residual is never small beside them.
+        # Near a state of which all terms vanish the residual is never small beside them there.
         vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
         change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
@@ -156,6 +156,17 @@ def iterate(
 
     carry = _begin(equations, before, first, start, jnp.asarray(enabled))
     return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
+
+
+def _first_scale(equations: Equations, at_candidate: AbstractJacobian) -> Vector:
+    """The scale at the candidate. A term may vanish there, and not in the next state: so that scale
+    is at least roundoff of what it would be if all components were as large as the largest."""
+    candidate = equations.candidate
+    eps = float(jnp.finfo(working_dtype(candidate)).eps)
+    roundoff = eps * tree_max(candidate)
+    uniform = jtu.tree_map(lambda x: jnp.full_like(x, roundoff.astype(x.dtype)), candidate)
+    scale = equations.scale(at_candidate, candidate)
+    return jtu.tree_map(jnp.maximum, scale, at_candidate.scale(uniform))
 
 
 def _begin(

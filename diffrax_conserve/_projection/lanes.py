@@ -92,21 +92,31 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
     order = jax.vmap(lambda f: _positions(f, width * rounds))(flags)
     most = jnp.max(jnp.sum(flags, axis=1))
 
+    def taken(x: Array, index: Array) -> Array:
+        return x.at[index].get(mode="clip")
+
+    def put(x: Array, index: Array, y: Array) -> Array:
+        return x.at[index].set(y, mode="drop")
+
+    def finished(flag: Array, state: Any, batch: Any) -> Any:
+        return lane(flag, state, eqx.combine(batch, shared))
+
     def body(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         start, states = carry
         index = lax.dynamic_slice_in_dim(order, start, width, axis=1)
 
-        def of_block(states: Any, batch: Any, index: Array) -> Any:
-            def taken(x: Array) -> Array:
-                return x.at[index].get(mode="clip")
+        # All blocks together, in one row: loops over short rows are slow.
+        def row_of(x: Array) -> Array:
+            return jax.vmap(taken)(x, index).reshape(blocks * width, *x.shape[2:])
 
-            def finished(flag: Array, state: Any, batch: Any) -> Any:
-                return lane(flag, state, eqx.combine(batch, shared))
-
-            out = jax.vmap(finished)(index < length, *jtu.tree_map(taken, (states, batch)))
-            return jtu.tree_map(lambda x, y: x.at[index].set(y, mode="drop"), states, out)
-
-        return start + width, jax.vmap(of_block)(states, batch, index)
+        flags = (index < length).reshape(-1)
+        out = jax.vmap(finished)(flags, *jtu.tree_map(row_of, (states, batch)))
+        states = jtu.tree_map(
+            lambda x, y: jax.vmap(put)(x, index, y.reshape(blocks, width, *y.shape[1:])),
+            states,
+            out,
+        )
+        return start + width, states
 
     _, states = lax.while_loop(lambda carry: carry[0] < most, body, (jnp.zeros_like(most), states))
     return jtu.tree_map(lambda x: x.reshape(lanes, *x.shape[2:]), states)

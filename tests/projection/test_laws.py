@@ -121,6 +121,12 @@ def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
 
 @given(y=vectors(4, 10.0), matrix=vectors((2, 4), 1.0), b=vectors(2, 10.0), weights=vectors(4, 1.0))
 @example(
+    y=np.array([0.0, 0.0, 1.0, 0.0]),
+    matrix=np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 1.0]]),
+    b=np.zeros(2),
+    weights=np.zeros(4),
+)
+@example(
     y=np.zeros(4),
     matrix=np.array([[1, 0, 2**-9, 0], [1, 0, 0, 2**-9]]),
     b=np.array([0.0, 2.0]),
