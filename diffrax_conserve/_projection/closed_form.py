@@ -1,4 +1,4 @@
-"""A projection that the user knows how to write down."""
+"""A projection by a formula that the user gives."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, final
@@ -18,8 +18,8 @@ class ClosedForm(AbstractProjection):
     r"""Projects by a formula: $y = \mathrm{fn}(t, \hat y, args, values)$.
 
     For manifolds with a known projection, such as spheres, unit quaternions and rotation matrices.
-    The residual of what the formula returns is checked like that of every other projection: where
-    it does not lie on the manifold, the projection has failed.
+    The residual at the returned state is checked as in every projection: if the state is not on the
+    manifold, the projection has failed.
 
     !!! example
 
@@ -71,8 +71,8 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` if `fn` is not callable; `ValueError`, when it is used, if what it returns is not shaped
-like the state.
+`TypeError` if `fn` is not callable; `ValueError`, when the projection is used, if the value of `fn`
+is not shaped like the state.
 """
 
 

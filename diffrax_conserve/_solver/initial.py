@@ -1,4 +1,4 @@
-"""What is wrong with an initial state: the solve then ends with its first step."""
+"""The check of the initial state: if it fails, the solve ends with its first step."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,9 +15,9 @@ FINE, NOT_FINITE, VIOLATED, UNREACHABLE = range(4)
 
 
 class Initial(eqx.Module):
-    """The verdict on an initial state: one of the causes above, the position of the entry of the
-    manifold that is to blame, and how far the first step may move the state because a `value` is
-    not that of the initial state."""
+    """The verdict on an initial state: one of the causes above, the position of the responsible
+    entry of the manifold, and how far the first projection must move the state to a `value` that
+    differs from that of the initial state."""
 
     cause: Int[Array, ""]
     position: Int[Array, ""]
@@ -35,7 +35,7 @@ def judge(
     """A `Constraint` is violated if its residual is larger than the square root of roundoff,
     relative to the size of its terms; smaller ones are removed by the first step. A first integral
     with a `value` of its own may start elsewhere, if that value can be reached from there."""
-    # A verdict has no derivative, and that of a Jacobian may not exist.
+    # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
     manifold, values, t, y, args = tree_stop_gradient((manifold, values, t, y, args))
     dtype = working_dtype(y)
     limit = jnp.finfo(dtype).eps ** 0.5
@@ -56,7 +56,7 @@ def judge(
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)
     if any(given):
-        if projection.sees_step:  # of which there is none yet
+        if projection.sees_step:  # there is no step yet
             projection = SimplifiedNewton(metric=projection.metric)
         _, info = apply(projection, manifold, values, t, y, args)
         unreachable = (cause == FINE) & ~info.ok
