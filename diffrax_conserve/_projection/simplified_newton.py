@@ -201,9 +201,10 @@ def _finish(
     state: _State,
     operands: tuple[Equations, Y | None],
 ) -> _State:
-    """Further iterations, from `state`; none unless `unfinished`.
+    """Further iterations from `state`, if `unfinished`.
 
-    With an anchor, a state near the manifold, they start again halfway to it where they fail.
+    With an anchor, a state near the manifold, iterations that fail are restarted halfway to the
+    anchor.
     """
     equations, anchor = operands
 

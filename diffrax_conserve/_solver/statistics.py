@@ -67,7 +67,7 @@ class ProjectionStatistics(eqx.Module):
 
 
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:
-    """What the projections of a solve did.
+    """The statistics of the projections of a solve.
 
     They are part of the state of a `ManifoldProjection`, so `diffeqsolve` must return it, by
     `SaveAt(solver_state=True)`. Otherwise they are not computed.
