@@ -35,12 +35,12 @@ class _AbstractOfFamily(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the family."""
+        """The order of the family."""
         return self.flow_map.order
 
     @property
     def layer(self) -> Any:
-        """That of the family."""
+        """The layer of the family."""
         return self.flow_map.layer
 
     def weights(self) -> Any:
