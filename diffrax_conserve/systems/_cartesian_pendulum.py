@@ -25,7 +25,7 @@ class CartesianPendulum(AbstractSystem):
 
     This is a differential-algebraic equation of index 3. Differentiating its position constraint
     once gives the hidden velocity constraint $q \cdot v = 0$, and once more the multiplier
-    $\lambda = (|v|^2 - g q_2) / |q|^2$, With this $\lambda$ it is an ordinary differential equation
+    $\lambda = (|v|^2 - g q_2) / |q|^2$. With this $\lambda$ it is an ordinary differential equation
     that conserves both constraints, but a numerical solution drifts away from them.
 
     **Manifold**: rod length and velocity constraint (both constraints), energy
