@@ -1,9 +1,9 @@
 """Dense output on the manifold: the inner solver's interpolant, projected at each evaluation.
 
 Between the ends of a step the interpolant is off the manifold by its own error, so it does not
-suffice to replace its end values. At the ends the interpolant is projected too, instead of
-returning the stored state: that would make the time derivative zero there, and the root finder of
-an event needs it.
+suffice to replace its end values. At the ends of a step the interpolant is projected too, because
+replacing it by the stored states would make its time derivative zero there, which the root finder
+of an event needs.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
+"""First integrals, constraints, and the PyTrees of them that define a manifold."""
 
 import abc
 import math
@@ -18,7 +18,7 @@ from ._with_jacobian import WithJacobian
 
 
 class AbstractConserved(eqx.Module):
-    """One entry of a manifold: a function of `(t, y, args)` and what its value must be."""
+    """One entry of a manifold: a function of `(t, y, args)` and its conserved value."""
 
     fn: eqx.AbstractVar[ConstraintFn]
 

@@ -19,7 +19,7 @@ from .._tree import from_view, real_view
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceEntry:
-    """What `check_invariance` found for one entry of the manifold.
+    """The result of `check_invariance` for one entry of the manifold.
 
     `defect` is the largest relative defect over all states and elements, and `state` the index of
     the state where it was found.

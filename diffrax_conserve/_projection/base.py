@@ -1,4 +1,4 @@
-"""What every projection takes and returns."""
+"""The interface of projections: the problem, the report, and the checks of options."""
 
 import abc
 from typing import Any, ClassVar
@@ -22,7 +22,7 @@ from .step import Step
 
 
 class ProjectionInfo(eqx.Module):
-    """How a projection went.
+    """The report on a projection.
 
     **Attributes:**
 
@@ -68,7 +68,7 @@ class ProjectionInfo(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What a projection solves.
+    """The problem that a projection solves.
 
     **Attributes:**
 
@@ -105,7 +105,7 @@ class Problem(eqx.Module):
 
         **Returns:**
 
-        A state, complex where that of the solve is.
+        The state, complex where the state of the solve is.
         """
         return from_view(y, self.like)
 

@@ -66,7 +66,8 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a function `fn(t, y, args, values)` of the time, the candidate, the parameters and the
     conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
-    which returns the state on the manifold, shaped like `y`. It is differentiated as it is written.
+    which returns the state on the manifold, shaped like `y`. Derivatives of the projection are
+    those of `fn`.
 - `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
 
 **Raises:**

@@ -1,4 +1,4 @@
-"""Projection along the embedded error estimate, which keeps every linear invariant."""
+"""Projection along the embedded error estimate, which conserves every linear integral."""
 
 from typing import ClassVar, NamedTuple, final
 

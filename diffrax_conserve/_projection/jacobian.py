@@ -50,8 +50,8 @@ class AbstractJacobian(eqx.Module):
         """Solves with `G W Hᵀ`, where `H` is `other`, a Jacobian of the same kind, or `G`.
 
         Rows are divided by their largest element before they are multiplied, so that no product
-        overflows or vanishes whatever the units. `damping` is relative to the diagonal, to which it
-        is added.
+        overflows or underflows for any units. `damping` is relative to the diagonal, to which it is
+        added.
         """
 
     @abc.abstractmethod

@@ -37,7 +37,7 @@ def residual_of(
         residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
         return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
 
-    # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
+    # Arrays over which `fn` closes become part of `residual`'s PyTree, and can be differentiated.
     residual = Joined(eqx.filter_closure_convert(parts, real_view(y)))
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), y)
     magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)

@@ -55,7 +55,7 @@ class SimplifiedNewton(AbstractProjection):
     $$\lambda \leftarrow \lambda - (G M^{-1} G^\top)^{-1} g(\hat y + M^{-1} G^\top \lambda),$$
 
     each of which gains as many digits as the step of the integrator has. This is enough for nearly
-    every step. Otherwise each further iteration computes the Gram matrix anew from the Jacobian at
+    every step. Otherwise each further iteration computes the Gram matrix again from the Jacobian at
     the last state, and damps a step that does not reduce the residual. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
@@ -255,7 +255,7 @@ def _from_between(
         y, multiplier, count, outcome = attempt(
             dataclasses.replace(equations, candidate=candidate), start, unfinished
         )
-        # The derivative is that of the projection of the candidate, which this is not.
+        # Only the projection of the original candidate has a derivative.
         multiplier = jnp.where(index == 0, multiplier, jnp.nan)
         failed = outcome.result != optx.RESULTS.successful
         state = y, multiplier, count, outcome
@@ -295,7 +295,7 @@ def _project_jvp(primals, tangents, *, max_steps):
     gram_solver = at_y.gram_solver(equations.weights, at_candidate)
     t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
     t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
-    # Of a projection that failed nobody asks for the derivative: its step is rejected, or ends all.
+    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
     factor = jnp.where(info.ok, certain(equations, y, at_y), 1)
     t_y = tree_scale(lax.stop_gradient(factor), t_y)
     return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

@@ -52,7 +52,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     for the first integrals $I$ and the constraints $g$ of `manifold`. Dense output, saved times and
     events are projected in the same way. The conserved values are computed once, at the start of
     the solve, and carried in the solver state, so that the drift does not grow with the number of
-    steps; a solve that continues from a `solver_state` keeps the first values.
+    steps; a solve that continues from a `solver_state` keeps the original values.
 
     The projected method has the order of the wrapped one. A wrapped solver that reuses its last
     stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the stage at the

@@ -31,7 +31,7 @@ def real(x: Any) -> Array:
 
 
 class AbstractSystem(eqx.Module):
-    r"""A differential equation $y' = f(t, y, args)$ together with what it conserves.
+    r"""A differential equation $y' = f(t, y, args)$ with its manifold.
 
     The parameters of the equation are the fields of the Module, so they can be changed
     (`Kepler(mu=2.0)`) and differentiated; `args` is not used by any system of the catalogue.
@@ -85,7 +85,8 @@ class AbstractSystem(eqx.Module):
     @property
     @abc.abstractmethod
     def metric(self) -> Y | None:
-        """Weights, like `y`, in which a projection on the energy alone keeps linear integrals.
+        """Weights, shaped like `y`, with which a projection on the energy alone conserves linear
+        integrals.
 
         `None` if the system has no such metric or does not need one.
         """
@@ -142,7 +143,8 @@ class AbstractSystem(eqx.Module):
         return _solution(self, ts - t0, y0)
 
     def like(self: _System, y: Any) -> _System:
-        """This system with its parameters in the precision of `y`, so that `f` keeps it."""
+        """This system with its parameters in the precision of `y`, so that `f` has that precision
+        too."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         return jtu.tree_map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self)
 

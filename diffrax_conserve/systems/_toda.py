@@ -125,6 +125,6 @@ class TodaLattice(AbstractIntegratedSystem):
 
 TodaLattice.__init__.__doc__ = r"""**Arguments:**
 
-- `a`, `b`: strength and steepness of the springs.
+- `a`, `b`: the strength and steepness of the springs.
 - `particles`: the number $N \ge 3$ of particles.
 """

@@ -26,7 +26,7 @@ from .._manifold import (
 from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
 
-# Twice what a projection accepts by default: the residual is evaluated here once more.
+# Twice the default tolerance of a projection, because the residual is evaluated again here.
 ULPS = 32
 
 

@@ -69,8 +69,8 @@ def quadratic_systems(dimension: int, *, integrals: int = 1) -> st.SearchStrateg
 
     **Arguments:**
 
-    - `dimension`: of the state; greater than `integrals`.
-    - `integrals`: 1 or 2.
+    - `dimension`: the dimension of the state; greater than `integrals`.
+    - `integrals`: the number of integrals, 1 or 2.
 
     **Returns:**
 

@@ -18,7 +18,8 @@ from .._manifold import Constraint, FirstIntegral, is_entry
 
 @final
 class Restructuring(eqx.Module):
-    """The components of a state in another PyTree: other nesting, other shapes, the same numbers.
+    """The components of a state in another PyTree, with other nesting and shapes and the same
+    numbers.
 
     Code that handles any PyTree must give the same numbers for a state and the repacked one.
 

@@ -21,8 +21,8 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
-    One that has learned a family of equations is called as `(y0, args, h)`, with the `args` of the
-    vector field, and has an attribute `args_domain`.
+    A flow map of a family of equations is called as `(y0, args, h)`, with the `args` of the vector
+    field, and has an attribute `args_domain`.
 
     [`diffrax_conserve.DeepONet`][] is a flow map. [`diffrax_conserve.learned.FlowMap`][] makes one
     from any function; solvers and [`diffrax_conserve.fit`][] do this automatically for a Module

@@ -22,7 +22,8 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 @final
 class Window(AbstractTrainable):
-    """A network for the solution through one state, from the time `start` on, for a time `length`.
+    """A network for the solution through one state, on the interval from `start` to `start +
+    length`.
 
     A `PINN` consists of one or several consecutive windows.
     """

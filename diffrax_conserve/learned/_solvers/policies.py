@@ -41,8 +41,8 @@ class DomainStatistics(eqx.Module):
 
     **Attributes:**
 
-    - `num_steps`: how many steps were taken.
-    - `num_outside`: how many of them were outside.
+    - `num_steps`: the number of steps.
+    - `num_outside`: the number of them that were outside.
     - `first_outside`: the time at which the first of them started; infinity if there is none.
     """
 

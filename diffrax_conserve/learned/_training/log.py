@@ -8,7 +8,7 @@ import numpy as np
 
 @final
 class FitLog(eqx.Module):
-    """How a training went.
+    """The record of a training.
 
     **Attributes:**
 

@@ -6,7 +6,7 @@ $$e' = f(t, u + e) - u', \qquad e(t_0) = e_0.$$
 
 This equation is exact, so the truncation error of an RK4 solve for $e$ is relative to $e$: with the
 same steps, the estimate has two correct digits both for a solution with ten correct digits and for
-a wrong one. The steps evaluate the defect at four times as many times as the training, so a large
+a wrong one. The steps evaluate the defect at four times as many points as the training, so a large
 defect between the collocation points is detected.
 """
 
