@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         parser.error(str(error))
     if not options.train and (options.seed is not None or options.epochs is not None):
-        parser.error("--seed and --epochs are those of a training: give --train too")
+        parser.error("--seed and --epochs are options of --train: give --train too")
     t1 = system.t1 if options.t1 is None else options.t1
     dt = system.dt if options.dt is None else options.dt
     out = Path("out", options.name) if options.out is None else options.out
@@ -95,14 +95,14 @@ def _parser() -> argparse.ArgumentParser:
         "systems with learned solvers too; prints a table of errors and drifts, and writes figures "
         "and metrics.json.",
     )
-    reproduce.add_argument("name", metavar="NAME", help="a system, as `list` names it")
+    reproduce.add_argument("name", metavar="NAME", help="the name of a system, see `list`")
     reproduce.add_argument(
         "--out", type=Path, metavar="DIR", help="where to write (default: out/NAME)"
     )
     reproduce.add_argument("--t1", type=_positive, metavar="T", help="final time; the first is 0")
     reproduce.add_argument("--dt", type=_positive, metavar="H", help="length of a step")
     reproduce.add_argument(
-        "--train", action="store_true", help="train the networks anew, for some minutes"
+        "--train", action="store_true", help="train the networks again, which takes minutes"
     )
     reproduce.add_argument("--seed", type=int, metavar="N", help="seed of --train (default: 0)")
     reproduce.add_argument(

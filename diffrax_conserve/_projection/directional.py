@@ -103,12 +103,12 @@ def _direction(problem: Problem) -> Y:
         )
     if problem.step is None:
         raise ValueError(
-            "`Directional` moves along the error estimate of a step, but here is none: it is for "
-            "`ManifoldProjection` only. Elsewhere pass `projection=Newton()`."
+            "`Directional` moves along the error estimate of a step, but there is no step here: use "
+            "it in a `ManifoldProjection` only. Elsewhere pass `projection=Newton()`."
         )
     if problem.step.error is None:
         raise ValueError(
-            "`Directional` moves along the error estimate of the wrapped solver, but that has "
+            "`Directional` moves along the error estimate of the wrapped solver, but this has "
             "none. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, or pass "
             "`projection=SimplifiedNewton()`."
         )

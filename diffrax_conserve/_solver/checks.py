@@ -16,7 +16,7 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
         raise ValueError(
             f"`ManifoldProjection` is given a {type(solver).__name__} of the implicit solver "
             f"{type(inner).__name__}, whose root finder takes its tolerances from the step-size "
-            "controller; diffrax hands those through one wrapper only. Give them explicitly, for "
+            "controller; diffrax passes these through one wrapper only. Give them explicitly, for "
             f"example `{type(inner).__name__}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
             "norm=optimistix.max_norm))`."
         )

@@ -132,7 +132,7 @@ def load(
         file = io.BytesIO(unpack(header, body))
         found = eqx.tree_deserialise_leaves(file, like, read_leaf)
         if file.read(1):
-            raise ValueError("it goes on after the last array")
+            raise ValueError("it has data after the last array")
     except Exception as error:
         refuse(path, error)
     model = eqx.combine(found.network, static)

@@ -285,8 +285,8 @@ def _framed(
     """The domain, the inputs for all states, and the number of functions to be learned."""
     if layer is not None:
         raise ValueError(
-            "A flow map with a `frame` cannot have a `layer`, which measures how far it may go in "
-            "the units of a whole state. Leave it out, and wrap the solver in "
+            "A flow map with a `frame` cannot have a `layer`, whose largest correction is in the "
+            "units of a whole state. Leave it out, and wrap the solver in "
             "`diffrax_conserve.ManifoldProjection`."
         )
     states = as_state(states)

@@ -156,7 +156,7 @@ class Replace(AbstractPolicy):
         if root_finder is not None and not eqx.is_array_like(getattr(root_finder, "rtol", 0.0)):
             raise ValueError(
                 f"`solver` is a {name}, whose root finder takes its tolerances from the step-size "
-                "controller; diffrax does not hand them to a solver within a solver. Give them, "
+                "controller; diffrax does not pass these to a nested solver. Give them explicitly, "
                 f"for example `{name}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
                 "norm=optimistix.max_norm))`."
             )

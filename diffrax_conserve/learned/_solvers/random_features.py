@@ -110,8 +110,8 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
             )
         if not (isinstance(self.seed, int) and self.seed >= 0):
             raise ValueError(
-                f"`seed` must be an integer of at least 0, which numpy draws the features from, "
-                f"but is {self.seed!r}."
+                f"`seed` must be an integer of at least 0, the seed of the random features, but is "
+                f"{self.seed!r}."
             )
 
     def order(self, terms: dfx.AbstractTerm) -> int:

@@ -31,7 +31,7 @@ def check_types(
     """Raises unless the arguments of `fit` besides the model have the right types."""
     if vector_field is None and (data is None or sample is not None):
         raise TypeError(
-            "`fit` needs a `vector_field`, or `data` without `sample`, which is about the field."
+            "`fit` needs a `vector_field`, or `data` without `sample`, which only a field uses."
         )
     if vector_field is not None and not callable(vector_field):
         raise TypeError(f"`vector_field` is {vector_field!r}, not a function `(t, y, args)`.")
@@ -80,8 +80,8 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
         )
     if not has_arrays(as_flow_map(model).weights()):
         raise ValueError(
-            f"`fit` was given a {type(model).__name__}, which has no weights of its own. If it "
-            "repeats another flow map: Train its inner `flow_map`, and repeat that."
+            f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
+            "Train its inner `flow_map` if it has one, and repeat that."
         )
     if sample is None and data is None:
         raise ValueError(
