@@ -103,8 +103,8 @@ def _direction(problem: Problem) -> Y:
         )
     if problem.step is None:
         raise ValueError(
-            "`Directional` moves along the error estimate of a step, but there is no step here: use "
-            "it in a `ManifoldProjection` only. Elsewhere pass `projection=Newton()`."
+            "`Directional` moves along the error estimate of a step, but there is no step here. "
+            "Use it in a `ManifoldProjection`. Elsewhere pass `projection=Newton()`."
         )
     if problem.step.error is None:
         raise ValueError(
