@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.command == "list":
         _list()
         return 0
-    # Drift is measured in units of roundoff, and the references need float64.
+    # The references need float64, and drifts are compared with its roundoff.
     jax.config.update("jax_enable_x64", True)
     try:
         system = systems.get(options.name)
@@ -63,7 +63,7 @@ def _run() -> int:
     except OSError as error:
         # Python flushes standard output once more at exit, and that must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):  # a reader that has seen enough
+        if not isinstance(error, BrokenPipeError):  # a closed pipe is not an error
             _complain(error)
         return 1
     return status

@@ -82,7 +82,7 @@ class Problem(eqx.Module):
         new first axis; `state` combines them.
     - `anchor`: a state near the manifold, from which an iteration can start if it fails from the
         candidate: in dense output the nearer end of the step, in a step `None`.
-    - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` where there is none, as in
+    - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
         [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
     """
 
@@ -123,8 +123,8 @@ class Problem(eqx.Module):
         **Arguments:**
 
         - `candidate`, `y`: the states before and after.
-        - `num_steps`: how many iterations were made.
-        - `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
+        - `num_steps`: the number of iterations.
+        - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
 
         **Returns:**
 
@@ -208,7 +208,8 @@ NEWTON_OPTIONS = r"""**Arguments:**
     every projection ends well below it.
 - `atol`: an absolute tolerance, added to the relative one. Default: 0. Set it where the functions
     of the manifold are less accurate than roundoff.
-- `max_steps`: the largest number of iterations; after that the projection has failed.
+- `max_steps`: the largest number of iterations (in `Newton`, of each phase). A projection that is
+    not within its tolerance by then has failed.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.

@@ -68,7 +68,7 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
     conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
     which returns the state on the manifold, shaped like `y`. Derivatives of the projection are
     those of `fn`.
-- `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
+- `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
 
 **Raises:**
 

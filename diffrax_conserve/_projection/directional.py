@@ -84,7 +84,7 @@ class Directional(AbstractProjection):
 
 Directional.__init__.__doc__ = """**Arguments:**
 
-- `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
+- `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
 - `max_steps`: the largest number of iterations.
 
 **Raises:**

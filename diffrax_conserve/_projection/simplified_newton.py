@@ -272,7 +272,7 @@ def _from_between(
 def _project_jvp(primals, tangents, *, max_steps):
     """The implicit function theorem for `λ` in `g(ŷ + M⁻¹ G(ŷ)ᵀ λ) = 0`.
 
-    With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
+    Let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at constant `λ`. Then
     `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`.
     """
     y, multiplier, info = _project(*primals, max_steps=max_steps)

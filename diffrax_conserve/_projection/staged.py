@@ -16,7 +16,7 @@ from .project import check_metric, inverse_metric
 
 @final
 class Staged(AbstractProjection):
-    r"""Projects to the parts of a manifold in a given order, later ones with the earlier ones held.
+    r"""Projects to the parts of a manifold in a given order, keeping the earlier ones satisfied.
 
     Stage $k$ projects the result of the previous stage to the set where the parts $1, \dots, k$
     hold, by its own projection in its own metric. An infinite weight freezes its component in that
@@ -106,7 +106,7 @@ the keys are not those of the manifold.
 
 
 def _owners(problem: Problem) -> list[Any]:
-    """For each leaf of the values, the key of the manifold that it belongs to."""
+    """For each leaf of the values, the key of the manifold to which it belongs."""
     leaves = jtu.tree_flatten_with_path(problem.values)[0]
     return [_key(path[0]) if path else None for path, _ in leaves]
 

@@ -25,7 +25,7 @@ class Target(eqx.Module):
 
     **Attributes:**
 
-    - `direction`: -1 where the solver's time is the negative of the manifold's.
+    - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
     - `gained`: the integrals of the rates of the manifold since the start of the solve.
     - `limit`: a larger correction is a failure.
     - `threshold`: a candidate whose relative residual is at most this is not projected.

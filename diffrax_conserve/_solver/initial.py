@@ -33,8 +33,8 @@ def judge(
     args: Args,
 ) -> Initial:
     """A `Constraint` is violated if its residual is larger than the square root of roundoff,
-    relative to the size of its terms; smaller ones are removed by the first step. A first integral
-    with a `value` of its own may start elsewhere, if that value can be reached from there."""
+    relative to the size of its terms; the first step removes smaller ones. A first integral with
+    its own `value` may start at another value if a projection from the initial state succeeds."""
     # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
     manifold, values, t, y, args = tree_stop_gradient((manifold, values, t, y, args))
     dtype = working_dtype(y)

@@ -61,10 +61,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     within a factor of 2.3 at 1e-5, some larger, some smaller
     (`benchmarks/studies/first_same_as_last.py`).
 
-    A solve ends with its first step, unsuccessfully, if the initial state violates a `Constraint`
-    by more than the square root of roundoff, relative to the size of its terms (see
-    [`diffrax_conserve.project`][]), if a function is not finite there, or if a `value` cannot be
-    reached from there.
+    A solve fails at its first step if the initial state violates a `Constraint` by more than the
+    square root of roundoff, relative to the size of its terms (find a consistent state by
+    [`diffrax_conserve.project`][]), if a function is not finite there, or if the projection to a
+    `value` fails there.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve rejects the step and tries a smaller one, until the candidate is very close to
@@ -299,15 +299,15 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
 - `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
-    `Directional`, or your own.
+    `Directional`, a `Staged`, or your own.
 - `max_correction`: a projection fails if it moves the candidate by more than this times the
     distance covered by the step, $\|\hat y - y_n\|$ (plus $\sqrt\varepsilon \|\hat y\|$), in the
-    Euclidean norm. It guards against landing on another component of the manifold, and against
-    quantities that are not conserved: 0.5 is a sensible value, since corrections are as short as
-    the local error of the wrapped solver. Default: no limit. The first projection may also move the
-    state to a `value` that is not that of the initial state. With `every`, the limit is multiplied
-    by it. Stochastic equations have no limit, because noise may move the state off the manifold as
-    fast as it moves the state.
+    Euclidean norm. It protects against a jump to another component of the manifold, and against
+    quantities that are not conserved. 0.5 is a sensible value, because corrections are of the size
+    of the local error of the wrapped solver. Default: no limit. The first projection may also move
+    the state to a `value` that is not that of the initial state. With `every`, the limit is
+    multiplied by it. Stochastic equations have no limit, because noise may move the state off the
+    manifold as fast as it moves the state.
 - `threshold`: do not project a step whose largest residual, relative to the scale of its
     constraint, is at most this. Dense output is treated in the same way. Default: project every
     step.

@@ -17,12 +17,14 @@ from .count_rejections import RejectionCount
 
 @final
 class ProjectionStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve, including those that it was continued from.
+    """Totals over the accepted steps of a solve, including those of earlier solves that it
+    continues.
 
     **Attributes:**
 
     - `num_projections`: the number of projected steps.
-    - `num_iterations`, `max_iterations`: the iterations of all projections, and of the longest.
+    - `num_iterations`, `max_iterations`: the number of iterations of all projections, and the
+        largest number of a single one.
     - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.

@@ -1,4 +1,4 @@
-"""The figures of `reproduce` and of the zoo, for print. The one place that imports matplotlib."""
+"""The figures of `reproduce` and of the zoo, for print. Only this module imports matplotlib."""
 
 from pathlib import Path
 from typing import Any

@@ -164,6 +164,6 @@ def learned_solvers(
 
 
 def _separations(ys: Array) -> Array:
-    """The smallest distance of two vortices, in each of many states."""
+    """The smallest distance between two vortices, for each state."""
     squares = jnp.sum((ys[:, :, None] - ys[:, None, :]) ** 2, axis=-1)
     return jnp.sqrt(jnp.min(squares + 1e9 * jnp.eye(ys.shape[1]), axis=(1, 2)))

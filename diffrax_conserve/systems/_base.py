@@ -125,7 +125,9 @@ class AbstractSystem(eqx.Module):
 
         **Raises:**
 
-        `RuntimeError` unless `jax_enable_x64` is on: a reference needs float64.
+        `RuntimeError` unless `jax_enable_x64` is on, because a reference needs float64;
+        `ValueError` if `ts` is not one-dimensional or empty; at run time an error if `ts` decreases
+        or starts before `t0`.
         """
         if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             raise RuntimeError(

@@ -38,7 +38,7 @@ def assert_order(
 
     **Arguments:**
 
-    - `solver`: a diffrax solver, wrapped or not, for which fixed steps make sense.
+    - `solver`: a diffrax solver, wrapped or not, that can take fixed steps.
     - `terms`, `y0`, `t0`, `t1`, `dt0`, `args`: as for `diffrax.diffeqsolve`. Choose a smooth
         problem, an interval of at least a few steps, and a `dt0` in the asymptotic range of the
         method.

@@ -38,7 +38,7 @@ class Sample:
         return ~good
 
     def place(self, lane: int, k: int) -> str:
-        """Where row `k` of a lane is, in words."""
+        """A description of the place of row `k` in a lane."""
         if self.kind == "given":
             return f"at time {self.ts[lane, k]:.6g}"
         rows = np.sum(~np.isinf(self.ts[lane]))

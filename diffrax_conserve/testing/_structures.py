@@ -99,7 +99,7 @@ def _fill(shapes: Any, y: Any) -> Any:
 def restructurings(
     like: PyTree[ArrayLike], *, max_depth: int = 2
 ) -> st.SearchStrategy[Restructuring]:
-    """Ways to repack a state as another PyTree.
+    """Repackings of a state as another PyTree.
 
     Each structure triggers a compilation, so draw few: `@settings(max_examples=5)`.
 

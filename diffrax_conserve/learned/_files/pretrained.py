@@ -18,7 +18,7 @@ def pretrained_path(name: str) -> Path:
 
     **Raises:**
 
-    `ValueError` for an unknown name, naming those that there are.
+    `ValueError` for an unknown name; the message lists the known names.
     """
     folder = Path(str(resources.files("diffrax_conserve"))) / "pretrained"
     known = sorted(file.stem for file in folder.glob(f"*{_SUFFIX}"))
@@ -45,7 +45,7 @@ def load_pretrained(name: str) -> PINN | DeepONet | Transformed | Repeated:
 
     **Raises:**
 
-    `ValueError` for an unknown name, naming those that there are.
+    `ValueError` for an unknown name; the message lists the known names.
 
     !!! example
 

@@ -1,4 +1,4 @@
-"""`save`, `load` and `read_info`."""
+"""Saving and loading networks: `save`, `load` and `read_info`."""
 
 import io
 import math
@@ -117,8 +117,8 @@ def load(
 
     **Raises:**
 
-    `ValueError` if the file is not one of ours, is truncated or damaged, was written by another
-    version, or needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
+    `ValueError` if the file was not written by `save`, is truncated or damaged, was written by
+    another version, or needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
     """
     header, body = _read(path)
     given = {"layer": layer, "taylor": taylor, "frame": frame}
@@ -155,8 +155,9 @@ def read_info(path: PathLike) -> dict[str, Any]:
 
     **Returns:**
 
-    A dictionary: `kind` and `config` of the network, its `layer`, the `versions` that wrote it, and
-    the `info` that was given to [`diffrax_conserve.save`][].
+    A dictionary with the `kind` and `config` of the network, its parts (`layer`, `taylor`,
+    `frame`), the `versions` of the packages that wrote it, the `info` that was given to
+    [`diffrax_conserve.save`][], and the entries that describe its arrays.
 
     **Raises:**
 
@@ -193,7 +194,7 @@ class _Contents(NamedTuple):
     """The arrays of a file, in this order."""
 
     network: Any
-    systems: dict[str, Any]  # those that the parts of the network belong to
+    systems: dict[str, Any]  # to which the parts of the network belong
 
 
 def _like(header: Any, frame: MakeFrame | None) -> tuple[_Contents, Any]:

@@ -32,7 +32,7 @@ class AbstractCore(eqx.Module):
     def create(
         cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray
     ) -> "AbstractCore":
-        """A core with random weights, from `n` numbers and a step to `m` numbers."""
+        """A core with random weights, which maps `n` numbers and a step to `m` numbers."""
 
     @abc.abstractmethod
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:

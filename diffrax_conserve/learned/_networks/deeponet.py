@@ -1,4 +1,4 @@
-"""A deep operator network: the flow map of an autonomous system, for steps up to a largest one."""
+"""A deep operator network: the flow map of an autonomous system, for steps up to a given length."""
 
 import dataclasses
 from typing import Any, final
@@ -228,7 +228,7 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers, in both
     networks.
 - `latent`: the number $L$ of products in each component.
-- `core`: the kind of network: [`diffrax_conserve.learned.Product`][],
+- `core`: the architecture of the network: [`diffrax_conserve.learned.Product`][],
     [`diffrax_conserve.learned.Concatenated`][] or [`diffrax_conserve.learned.Gated`][]; the last
     two do not use `latent`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function

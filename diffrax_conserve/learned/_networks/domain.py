@@ -1,4 +1,4 @@
-"""The states that a flow map was trained for."""
+"""The states for which a flow map was trained."""
 
 import abc
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from .frame import Frame, MakeFrame, frame_at
 
 
 class AbstractDomain(eqx.Module):
-    """A set of states that a training can extend."""
+    """A set of states that `fit` can extend."""
 
     @abc.abstractmethod
     def contains(self, y: Y) -> Bool[Array, ""]:
@@ -25,7 +25,7 @@ class AbstractDomain(eqx.Module):
 
     @abc.abstractmethod
     def extended(self, states: Y) -> "AbstractDomain":
-        """The set with `states`, which are stacked along a leading axis."""
+        """The set extended to include `states`, which are stacked along a leading axis."""
 
     @abc.abstractmethod
     def can_include(self, y: Y) -> Bool[Array, ""]:
@@ -148,7 +148,7 @@ class FramedBox(AbstractDomain):
 
     @classmethod
     def around(cls, make: MakeFrame, states: Y) -> "FramedBox":
-        """The smallest one around `states`, which are stacked along a leading axis."""
+        """The smallest framed box around `states`, which are stacked along a leading axis."""
         frames = jax.vmap(lambda y: frame_at(make, y))(states)
         clocks = jnp.broadcast_to(frames.clock, frames.inputs.shape[:1])
         box = Box.around((frames.inputs, clocks))

@@ -165,7 +165,7 @@ FlowMap.__init__.__doc__ = r"""**Arguments:**
 
 
 def as_flow_map(model: Any) -> AbstractFlowMap:
-    """`model`, or the flow map of a function with an attribute `max_step`."""
+    """`model` as a flow map, also for a function with an attribute `max_step`."""
     if isinstance(model, AbstractFlowMap):
         return model
     if not (callable(model) and hasattr(model, "max_step")):

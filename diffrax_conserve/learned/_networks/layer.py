@@ -118,7 +118,7 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if `manifold` or `steps` has a wrong type or value.
+`TypeError` or `ValueError` if `manifold` or `steps` is invalid.
 """
 
 # The magnitude of the conserved values, the radius, p and s.
@@ -156,9 +156,9 @@ def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) ->
 def _conserve_jvp(primals, tangents, *, steps):
     """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = r` with the remaining residual `r`.
 
-    With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
-    `λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`. Where the first iteration is not complete (`p = 0`, or `p = 1` with
-    `s < 1`) the multipliers are `s` times those of a complete one, and so is their tangent.
+    Let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at constant `λ`. Then
+    `λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`. Where the first iteration is not complete (`p = 0`, or `p = 1` with `s
+    < 1`) the multipliers are `s` times those of a complete one, and so is their tangent.
 
     The linear solve is differentiated implicitly too. Second derivatives, which every loss with a
     time derivative needs, then cost products with `G` instead of derivatives of its rows.

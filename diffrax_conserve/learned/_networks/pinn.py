@@ -221,7 +221,7 @@ class PINN(eqx.Module):
                 key=jr.key(0),
             )
 
-        # Only its structure is needed.
+        # Only the structure of the network is needed.
         other = eqx.filter_eval_shape(build)
         other = eqx.tree_at(lambda m: (m.nets, m.y0s, m.scale), other, found)
         return eqx.tree_at(lambda m: m.layer, other, self.layer, is_leaf=lambda x: x is None)

@@ -1,4 +1,4 @@
-"""A long step of a flow map made of several short ones."""
+"""A flow map whose steps consist of several shorter ones."""
 
 from collections.abc import Callable
 from typing import Any, final

@@ -189,7 +189,7 @@ Transformed.__init__.__doc__ = """**Arguments:**
 
 - `flow_map`: the flow map of the coordinates.
 - `transformation`: [`diffrax_conserve.learned.BoxCox`][], [`diffrax_conserve.learned.Scale`][], or
-    a Module of your own.
+    your own Module.
 """
 
 

@@ -81,7 +81,7 @@ class AtArgs(_AbstractOfFamily):
 class ArgsDomain(eqx.Module):
     """The states of a domain if `args` are in their domain, otherwise no states."""
 
-    states: Any  # or None
+    states: Any  # a domain, or None
     known: Box
     args: Args
 

@@ -57,7 +57,7 @@ def coefficients(values: PyTree[Array]) -> PyTree[Array]:
 
 
 def integrals(values: Array) -> Array:
-    """The integrals from the first point to each, of the polynomial through `values`."""
+    """The integrals of the polynomial through `values`, from the first point to each point."""
     return _apply(_integration(values.shape[0]), values)
 
 

@@ -26,7 +26,7 @@ _SUBSTEPS = 4
 
 
 def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
-    """The exact state minus the path's, at the end of the step."""
+    """The exact state minus that of the path, at the end of the step."""
     real = jnp.finfo(path.dtype).dtype
     values = vmap(increment)(fractions(path.shape[0], real), path)
     rho = path[0] + integrals(values) - path

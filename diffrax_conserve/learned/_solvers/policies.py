@@ -128,14 +128,15 @@ class Refuse(AbstractPolicy):
         del inputs, nodes
         index = jnp.where(inside, _INACCURATE, _OUTSIDE)
         result = dfx.RESULTS.where(inside & accurate, step.result, member(index))
-        # A smaller step starts at the same state, but it may be more accurate.
+        # The error is infinite only for an inaccurate step: a smaller step may be more accurate,
+        # but it starts at the same state.
         error = jtu.tree_map(lambda e: jnp.where(accurate, e, jnp.inf), step.error)
         return StepResult(step.y1, error, step.coefficients, result)
 
 
 @final
 class Replace(AbstractPolicy):
-    """Lets another solver take such steps.
+    """Takes such steps with another solver.
 
     In a batch (`jax.vmap`) both solvers compute every step. Adaptive steps need a solver with an
     error estimate.

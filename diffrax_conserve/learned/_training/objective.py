@@ -79,7 +79,7 @@ class Objective(eqx.Module):
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def complete(self) -> LayerSchedule:
-        """All iterations of the conservative layer."""
+        """The schedule with all iterations of the conservative layer."""
         return jnp.asarray(self.steps()), jnp.ones(())
 
     def steps(self) -> int:

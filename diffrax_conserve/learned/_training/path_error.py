@@ -1,6 +1,6 @@
 r"""The error of a network's solution, computed from its defect.
 
-The exact solution is $u + e$ with the network $u$, its defect in the right-hand side, and
+The exact solution is $u + e$ with the network $u$ and
 
 $$e' = f(t, u + e) - u', \qquad e(t_0) = e_0.$$
 

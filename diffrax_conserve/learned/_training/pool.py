@@ -92,7 +92,7 @@ class Pool(eqx.Module):
             raise ValueError(f"`max_defect` must be positive, but is {self.max_defect}.")
 
     def __call__(self, key: PRNGKeyArray) -> Y:
-        """A state to start from."""
+        """A new initial state."""
         return self.sample(key)
 
 

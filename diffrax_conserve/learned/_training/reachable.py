@@ -54,7 +54,7 @@ def reachable_states(
 
     **Raises:**
 
-    `ValueError` if none is left.
+    `ValueError` if no state is left.
 
     !!! example
 

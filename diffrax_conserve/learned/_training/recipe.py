@@ -126,12 +126,12 @@ _LEVENBERG_MARQUARDT_MAX = 2000
 
 
 def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -> Recipe:
-    """The recipe of the paper, amended where it fails as written.
+    """The recipe of the paper, with changes where it fails as published.
 
     From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
     map 5,000 pairs of an initial state and a time and the projection schedule.
 
-    Amended: a PINN is projected from the first epoch on; the weight of the last iteration rises
+    Changed: a PINN is projected from the first epoch on; the weight of the last iteration rises
     within each stage; the loss of a flow map is bounded at each point; gradients are clipped. "The
     paper, reproduced" gives the reason and the effect of each.
 

@@ -53,7 +53,7 @@ class Windows(eqx.Module):
     slope: float  # of the first weights; 0 for none
     present: int = 0  # index of the one in training
     attempt: int = 0  # number of its earlier trainings
-    given_up: int = 0  # whether a window has failed for good
+    given_up: int = 0  # whether a window has finally failed
 
 
 @final

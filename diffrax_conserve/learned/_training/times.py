@@ -1,4 +1,4 @@
-"""Times of the collocation points, at which the defect is made small."""
+"""Distributions of the times of collocation points."""
 
 import jax.numpy as jnp
 import jax.random as jr

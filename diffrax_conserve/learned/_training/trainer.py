@@ -102,7 +102,8 @@ class Trainer:
         return state, ended
 
     def save(self, state: FitState, always: bool = False) -> None:
-        """Writes a checkpoint, unless the last one took long compared with the time since."""
+        """Writes a checkpoint, unless the time since the last one is short compared with its
+        duration."""
         begun = time.perf_counter()
         if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
             return

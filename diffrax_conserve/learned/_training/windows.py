@@ -187,7 +187,7 @@ def _limit(trainer: Trainer, pinn: PINN) -> float:
 
 # A solution with a larger error than this, relative to its largest component, counts as wrong.
 _WRONG = 1e-4
-# Errors of windows add up, and later windows may amplify them.
+# A safety factor: errors of windows add up, and later windows may amplify them.
 _GROWTH = 4
 
 
