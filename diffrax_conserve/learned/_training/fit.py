@@ -81,8 +81,8 @@ def fit(
 
     A `PINN` of several windows is trained window by window; each starts at the end of the previous
     one, projected to the manifold if one is given. Each is judged by its estimated error. A window
-    that failed is trained again from other weights, and then in halves, up to `retries` times of
-    the recipe. If the solution is still wrong, a warning names the window and the error.
+    that failed is trained again from other weights, and then in halves, as often as the recipe's
+    `retries` allow. If the solution is still wrong, a warning names the window and the error.
 
     A training can be interrupted and continued. It stops after the recipe's epochs, at a `target`,
     after `seconds`, or at a keyboard interrupt, and returns the best model so far. With
