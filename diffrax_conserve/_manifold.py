@@ -169,8 +169,9 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 - `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
     `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
     `jax.pure_callback`. What more a derivative needs is taken by autodiff of both, or is an error.
-    It is trusted: residuals are judged relative to it, and derivatives use it. Compare it once with
-    differences, by `jax.test_util.check_grads` of `entry.fn`.
+    Residuals are judged relative to it, and derivatives use it. A solve compares it with difference
+    quotients at the initial state, and does not start if it is wrong there;
+    [`diffrax_conserve.project`][] trusts it.
 """
 
 
