@@ -1,6 +1,6 @@
 """Keep any diffrax solve exactly on the manifold that its physics prescribes.
 
-Say what is conserved, wrap the solver, and leave the rest of `diffrax.diffeqsolve` as it is:
+Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` as usual:
 
     import diffrax, diffrax_conserve as dfc, jax.numpy as jnp
 

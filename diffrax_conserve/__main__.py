@@ -56,12 +56,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run() -> int:
-    """`main`, and what standard output still holds."""
+    """Runs `main` and flushes standard output."""
     try:
         status = main()
         sys.stdout.flush()
     except OSError as error:
-        # Python flushes once more at the end, which must not fail again.
+        # Python flushes standard output once more at exit, and that must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):  # a reader that has seen enough
             _complain(error)

@@ -27,7 +27,7 @@ class Along(eqx.Module):
 
 
 def slope_like(y: Y, slope: Any) -> Y:
-    """What a vector field returned, in the shapes and dtypes of the state."""
+    """The value of a vector field, broadcast and cast to the shapes and dtypes of the state."""
     if jtu.tree_structure(slope) == jtu.tree_structure(y):
         pairs = zip(jtu.tree_leaves(slope), jtu.tree_leaves(y), strict=True)
         if all(jnp.shape(f) in ((), jnp.shape(x)) for f, x in pairs):

@@ -1,4 +1,4 @@
-"""Balance laws: what the rates of first integrals add up to along a solution."""
+"""Balance laws: the rates of first integrals, integrated along a solution."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,17 +12,17 @@ from jaxtyping import Array
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ._manifold import AbstractConserved, evaluate, is_entry, named_entries, rate_of
 
-# Gauss quadrature of order eight, which is that of the solver of diffrax with the highest.
+# Gauss quadrature of order eight, the highest order of any solver in diffrax.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 def has_rates(manifold: Manifold) -> bool:
-    """Whether a conserved value of the manifold changes along a solution."""
+    """Whether an entry of the manifold has a rate, so that its conserved value changes in time."""
     return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
 
 
 def refuse_rates(manifold: Manifold, user: str) -> None:
-    """Raises if an entry has a rate, whose integral `user` does not compute."""
+    """Raises if an entry has a rate, because `user` does not integrate rates."""
     for name, entry in named_entries(manifold):
         if rate_of(entry) is not None:
             raise ValueError(
@@ -55,7 +55,7 @@ def integrated_rates(
 ) -> Values:
     """The integral of each rate along `path`, zero for an entry without one.
 
-    All times are the solver's, which are `direction` times those of the manifold.
+    All times are those of the solver, that is `direction` times the times of the manifold.
     """
     half = (end - start) / 2
 

@@ -24,8 +24,9 @@ DenseInfo = dict[str, PyTree[Array]]
 Values = PyTree[Real[ArrayLike, "..."]]
 ConstraintFn = Callable[[RealScalarLike, Any, Any], Values]
 
-# A PyTree of `FirstIntegral`s and `Constraint`s. (Not spelled as a `PyTree[...]`: those are
-# themselves PyTrees with leaves of any kind.) A type checker refuses a bare function, as we do.
+# A PyTree of `FirstIntegral`s and `Constraint`s. It is not spelled as a `PyTree[...]`, because the
+# entries are themselves PyTrees with leaves of any kind. The type rejects a bare function, as
+# `check_manifold` does.
 if TYPE_CHECKING:
 
     class _Entry(Protocol):
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
         def fn(self) -> Callable[..., Any]: ...
 
     Manifold: TypeAlias = "_Entry | Sequence[Manifold] | Mapping[Any, Manifold]"
-    # The state's type comes back.
+    # A function that takes a state returns one of the same type.
     State = TypeVar("State")
 else:
     Manifold = Annotated[Any, "FirstIntegral, Constraint, or a PyTree of them"]

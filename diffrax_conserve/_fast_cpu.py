@@ -1,4 +1,4 @@
-"""The option of XLA that makes single trajectories fast on a CPU."""
+"""The XLA option that makes single trajectories fast on a CPU."""
 
 import importlib
 import os
@@ -8,15 +8,15 @@ _LIST = "--xla_backend_extra_options="
 
 
 def fast_cpu() -> None:
-    """Sets the option with which XLA compiles a loop over small steps into one kernel.
+    """Sets the XLA option that compiles a loop over small steps into one kernel.
 
     By default XLA does so only if a step reads and writes less than 1 kB. A projected RK4 step of
     the rigid body, one trajectory on a CPU, then takes about 80 ns instead of 350 to 520. Plain
     solves gain as well; batches do not.
 
     XLA reads its options once, when the first array is made. Call this before that, for example
-    right below the imports. It adds to `XLA_FLAGS` in the environment, and leaves the option alone
-    if it is set already. Accelerators are not affected.
+    right below the imports. It appends to the environment variable `XLA_FLAGS`, and changes nothing
+    if the option is already set there. Accelerators are not affected.
 
     **Raises:**
 
@@ -49,7 +49,7 @@ def fast_cpu() -> None:
 
 
 def _has_started() -> bool:
-    """Whether jax has a backend. There is no public way to ask."""
+    """Whether jax has initialised a backend. jax has no public function for this."""
     bridge = importlib.import_module("jax._src.xla_bridge")
     started = getattr(bridge, "backends_are_initialized", None)
     return started is not None and started()

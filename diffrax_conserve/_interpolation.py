@@ -1,8 +1,9 @@
 """Dense output on the manifold: the inner solver's interpolant, projected at each evaluation.
 
-Between nodes an interpolant leaves the manifold by its own error, so overwriting its end points is
-not enough. It is not snapped to the nodes at the ends of a step: that would kill the time
-derivative there, which the root finder of an event needs.
+Between the ends of a step the interpolant is off the manifold by its own error, so it does not
+suffice to replace its end values. At the ends of a step the interpolant is projected too, because
+replacing it by the stored states would make its time derivative zero there, which the root finder
+of an event needs.
 """
 
 import dataclasses
@@ -24,13 +25,13 @@ from ._tree import tree_sub
 
 @final
 class PackedTarget(eqx.Module):
-    """A `Target` as it travels in `dense_info`: only arrays are leaves."""
+    """A `Target` in the form in which `dense_info` stores it: only arrays are leaves."""
 
     arrays: PyTree[Array]
     static: Any = eqx.field(static=True)
 
     def __init__(self, target: Target):
-        # Python numbers stay what they are: a function may use them as a shape or an index.
+        # Python numbers are kept static, because a function may use them as a shape or an index.
         arrays, static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
         leaves, treedef = jtu.tree_flatten(static)
@@ -45,9 +46,9 @@ class PackedTarget(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
-    Where the projection of the interpolant fails, that by `SimplifiedNewton` starts again closer
-    and closer to the nearer end of the step, which lies on the manifold. If even that fails, the
-    value is NaN. Nothing is extrapolated: a time outside the step counts as the end of the step.
+    Where the projection of the interpolant fails, `SimplifiedNewton` is tried, which starts again
+    closer and closer to the nearer end of the step, a state on the manifold. If that fails too, the
+    value is NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -62,7 +63,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        # Strictly, so that the slope at the ends is that of the interpolant.
+        # Strict inequalities keep the derivative of the interpolant at the ends of the step.
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
         t0 = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         early = jnp.abs(t0 - self.t0) < jnp.abs(self.t1 - t0)
@@ -86,8 +87,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 @dataclasses.dataclass(frozen=True)
 class MakeManifoldInterpolation:
-    """The `interpolation_cls` of a projected solver. Equal if the inner classes are, so that two
-    solves with dense output share their compiled evaluation."""
+    """The `interpolation_cls` of a projected solver. Two instances are equal if their inner classes
+    are, so that two solves with dense output share one compiled evaluation."""
 
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 

@@ -1,4 +1,4 @@
-"""What is conserved: first integrals, constraints, and the PyTrees of them that make a manifold."""
+"""First integrals, constraints, and the PyTrees of them that define a manifold."""
 
 import abc
 import math
@@ -18,27 +18,27 @@ from ._with_jacobian import WithJacobian
 
 
 class AbstractConserved(eqx.Module):
-    """One entry of a manifold: a function of `(t, y, args)` and what its value must be."""
+    """One entry of a manifold: a function of `(t, y, args)` and its conserved value."""
 
     fn: eqx.AbstractVar[ConstraintFn]
 
     @abc.abstractmethod
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        """What `fn` is kept at in a solve that starts at `(t, y, args)`."""
+        """The value of `fn` that a solve started at `(t, y, args)` conserves."""
 
 
 @final
 class FirstIntegral(AbstractConserved):
-    r"""A function $I(t, y, args)$ that is constant along the exact solution, or of known rate.
+    r"""A function $I(t, y, args)$ that is constant along the exact solution, or has a known rate.
 
     The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
     that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
 
     With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*: the conserved
-    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve integrates
-    it step by step, by Gauss quadrature with four nodes along the dense output of the wrapped
-    solver, and carries it in the solver state. So one keeps the balance of energy and dissipated
-    power, or an entropy that decreases; see "Balance laws" in the guide.
+    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve computes
+    this integral step by step, by Gauss quadrature with four nodes along the dense output of the
+    wrapped solver, and carries it in the solver state. Examples are the balance of energy and
+    dissipated power, and an entropy that decreases; see "Balance laws" in the guide.
 
     !!! example
 
@@ -68,7 +68,7 @@ class FirstIntegral(AbstractConserved):
         self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
         self.rate = rate
         check_numbers("value", value)
-        # Arrays, so that another value does not compile again.
+        # Arrays, so that a different value does not trigger another compilation.
         self.value = jtu.tree_map(
             lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
         )
@@ -94,7 +94,7 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
     from the initial state of the solve. With `rate` it is the value at the start of the solve.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
     $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
-- `jacobian`: as of a [`diffrax_conserve.Constraint`][].
+- `jacobian`: the derivative of `fn` by the state, as in [`diffrax_conserve.Constraint`][].
 """
 
 
@@ -125,8 +125,9 @@ class Constraint(AbstractConserved):
     def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
         r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
 
-        Where $g = 0$ holds all the time, so does this. For the positions of a mechanism it is the
-        constraint of the velocities, and any field with the right $q' = v$ will do.
+        If $g = 0$ holds for all times, so does the hidden constraint. For a constraint on the
+        positions of a mechanism it is the constraint on the velocities, and it depends only on the
+        part $q' = v$ of the field.
 
         **Arguments:**
 
@@ -168,10 +169,10 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
     constraint.
 - `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
     `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
-    `jax.pure_callback`. What more a derivative needs is taken by autodiff of both, or is an error.
-    Residuals are judged relative to it, and derivatives use it. A solve compares it with difference
-    quotients at the initial state, and does not start if it is wrong there;
-    [`diffrax_conserve.project`][] trusts it.
+    `jax.pure_callback`. All other derivatives are taken by autodiff of `fn` and `jacobian`; where
+    that is impossible it is an error. The scales of residuals and all derivatives depend on it. A
+    solve compares it with difference quotients at the initial state, and does not start if it is
+    wrong there; [`diffrax_conserve.project`][] does not check it.
 """
 
 
@@ -221,7 +222,7 @@ def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
 
 
 def entry_name(manifold: Manifold, position: int) -> str:
-    """The name of an entry of a manifold, which the message of a failed solve gives as a number.
+    """The name of an entry of a manifold; the message of a failed solve gives only its number.
 
     **Arguments:**
 
@@ -276,8 +277,8 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
 
 
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
-    """Raises unless the functions of the manifold return real floating-point arrays, at least one
-    scalar in all and at most as many as the state has unknowns."""
+    """Raises unless the functions of the manifold return real floating-point arrays, in total at
+    least one scalar and at most as many as the state has unknowns."""
     count = 0
     for name, entry in named_entries(manifold):
         for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
@@ -312,7 +313,7 @@ def _check_rate(name: str, entry: Any, t: RealScalarLike, y: Y, args: Args) -> N
 
 
 def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
-    """Raises unless the conserved values are shaped as what the first integrals return."""
+    """Raises unless the conserved values have the shapes of what the first integrals return."""
     entries = named_entries(manifold)
     treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
     try:

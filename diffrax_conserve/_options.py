@@ -1,4 +1,4 @@
-"""What numbers and functions that a user passes must be."""
+"""Checks of the numbers and functions that a user passes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def dtype_of(x: Any) -> Any:
-    """The dtype of a number or an array; of anything else `object`."""
+    """The dtype of a number or an array; `object` for anything else."""
     if hasattr(x, "dtype"):
         return x.dtype
     return np.asarray(x).dtype if eqx.is_array_like(x) else np.dtype(object)
@@ -31,8 +31,9 @@ def check_number(
     above: float | None = None,
     optional: bool = True,
 ) -> None:
-    """Raises unless `value` is a real number, an array of them (for a `vmap`), a tracer, or, where
-    it is `optional`, `None`. It must be at least `least` and greater than `above`; NaN is neither.
+    """Raises unless `value` is a real number, an array of real numbers (for a `vmap`), a tracer,
+    or, if `optional`, `None`. It must be at least `least` and greater than `above`; NaN is
+    rejected.
     """
     if isinstance(value, jax.core.Tracer) or (optional and value is None):
         return
@@ -55,7 +56,7 @@ def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
 
 
 def check_count(name: str, value: Any) -> None:
-    """Raises unless `value` is an integer of at least one."""
+    """Raises unless `value` is a positive integer."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
     if value < 1:
@@ -63,7 +64,7 @@ def check_count(name: str, value: Any) -> None:
 
 
 def check_vector_field(vector_field: Callable, example: str) -> None:
-    """Raises unless a vector field, as it is passed in `example`, is a function."""
+    """Raises unless `vector_field` is callable; the message shows `example` as the correct call."""
     if not callable(vector_field):
         raise TypeError(
             f"`vector_field` is {vector_field!r}, which is not callable. Pass the function, not a "
@@ -72,7 +73,7 @@ def check_vector_field(vector_field: Callable, example: str) -> None:
 
 
 def check_solution(sol: Any, user: str) -> None:
-    """Raises unless `sol` is what a solve returned."""
+    """Raises unless `sol` is a `diffrax.Solution`."""
     if not isinstance(sol, dfx.Solution):
         raise TypeError(
             f"`sol` is of type `{type(sol).__name__}`, but `{user}` takes the `diffrax.Solution` "

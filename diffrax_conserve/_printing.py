@@ -1,4 +1,4 @@
-"""How records of numbers are printed."""
+"""Printing of records of numbers."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,13 +9,14 @@ import numpy as np
 
 
 def printed(title: str, rows: Mapping[str, Any]) -> str:
-    """`title`, and a line for each row: its name and its number, or the range of a batch."""
+    """`title`, and one line for each row with its name and its number, or the range over a
+    batch."""
     width = max(map(len, rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {_text(x)}" for name, x in rows.items())])
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether there are no numbers yet, as inside `jax.jit`."""
+    """Whether a leaf is a tracer, as inside `jax.jit`, so that there is no number to print."""
     return any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(tree))
 
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic replacement of files."""
 
 import os
 import secrets
@@ -8,9 +8,10 @@ from typing import Any
 
 
 def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
-    """`write(path)`, such that no reader ever sees a part of the file.
+    """Calls `write` such that no reader ever sees a partly written file.
 
-    A symbolic link stays one. An existing file keeps its mode; that of a new one follows the umask.
+    The target of a symbolic link is replaced, not the link. An existing file keeps its mode; the
+    mode of a new one follows the umask.
     """
     path = Path(os.path.realpath(path))
     mode = path.stat().st_mode & 0o7777 if path.exists() else None
@@ -19,7 +20,7 @@ def replace_file(path: Path, write: Callable[[Path], Any]) -> None:
     os.close(os.open(temporary, flags, 0o666 if mode is None else mode))
     try:
         if mode is not None:
-            temporary.chmod(mode)  # the umask may have taken some of it away
+            temporary.chmod(mode)  # the umask may have removed some bits
         write(temporary)
         os.replace(temporary, path)
     finally:

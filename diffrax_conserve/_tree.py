@@ -16,15 +16,16 @@ from ._custom_types import RealScalarLike, Y
 def real_view(y: Any) -> Any:
     """`y` with the real and the imaginary part of each complex leaf along a new first axis.
 
-    A projection sees this alone: it minimises a distance and takes gradients, of real functions,
-    by real and imaginary parts. A weight that is shaped like the leaf still fits.
+    Projections work on this view only: they minimise a distance and take gradients of real
+    functions with respect to real and imaginary parts. A weight shaped like the leaf still
+    broadcasts.
     """
     return jtu.tree_map(lambda x: jnp.stack([jnp.real(x), jnp.imag(x)]) if _is_complex(x) else x, y)
 
 
 def from_view(view: Any, like: Any) -> Any:
-    """The state that `view` is the `real_view` of, complex where `like` is, of which no more is
-    used than that."""
+    """The state whose `real_view` is `view`, complex where `like` is. Only the dtypes of `like` are
+    used."""
     return jtu.tree_map(lambda v, x: lax.complex(v[0], v[1]) if _is_complex(x) else v, view, like)
 
 
@@ -43,10 +44,10 @@ def tree_sub(a: Y, b: Y) -> Y:
 
 
 def tree_cancel(a: Y, b: Y) -> Y:
-    """`a - b`, where what is left of `a` up to its roundoff is zero.
+    """`a - b`, with differences of at most two units of roundoff of `a` set to zero.
 
-    A component whose true value is zero is then reached, and not only approached: by itself it
-    would never be small beside its own size.
+    An iteration then reaches a component whose true value is zero exactly; otherwise its roundoff
+    would never be small relative to the component itself.
     """
 
     def subtract(x: Array, y: Array) -> Array:
@@ -70,15 +71,15 @@ def tree_mul(a: Y, b: Y) -> Y:
 def tree_dot(a: Y, b: Y, dtype: jnp.dtype) -> Real[Array, ""]:
     """The Euclidean inner product `Σ a b` as a scalar of `dtype`.
 
-    An elementwise product and a sum, not `jnp.vdot`: XLA fuses it into its surroundings, and it is
-    never done in a reduced precision on an accelerator.
+    Written as an elementwise product and a sum, not as `jnp.vdot`: XLA fuses it into the
+    surrounding code, and an accelerator never computes it in reduced precision.
     """
     products = jtu.tree_map(lambda x, y: jnp.sum(x * y).astype(dtype), a, b)
     return ft.reduce(jnp.add, jtu.tree_leaves(products))
 
 
 def tree_norm(a: Y) -> Real[Array, ""]:
-    """The Euclidean norm. In single precision squares can overflow, and are scaled."""
+    """The Euclidean norm. Below float64 the squares can overflow, so they are scaled."""
     a = real_view(a)
     dtype = working_dtype(a)
     if dtype == jnp.float64:
@@ -105,7 +106,8 @@ def tree_all_finite(a: PyTree[Array]) -> Array:
 
 
 def working_dtype(y: Y) -> jnp.dtype:
-    """The dtype that holds every leaf of `y`, or their real parts, without loss."""
+    """The real dtype that represents the real and imaginary parts of every leaf of `y` without
+    loss."""
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*jtu.tree_leaves(y))
     return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
@@ -122,10 +124,10 @@ def tree_shapes(a: Any) -> Any:
 
 
 def tree_stop_gradient(a: Any) -> Any:
-    """`a`, whose arrays count as constants for every derivative."""
+    """`a` with `stop_gradient` applied to its arrays."""
     return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, a)
 
 
 def tree_tangents(a: Any, t_a: Any) -> Any:
-    """`t_a`, the tangents of `a`, with zeros in the place of those that are `None`."""
+    """`t_a`, the tangents of `a`, with `None` replaced by zeros."""
     return jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, a, t_a)

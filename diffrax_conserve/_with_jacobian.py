@@ -1,4 +1,4 @@
-"""Functions that come with their Jacobian, for those that autodiff cannot see."""
+"""Functions with a Jacobian given by the user, for functions that autodiff cannot differentiate."""
 
 import functools as ft
 from typing import Any
@@ -14,7 +14,8 @@ from ._tree import tree_add, tree_max, tree_tangents, working_dtype
 
 
 class WithJacobian(eqx.Module):
-    """`fn`, differentiated by the state as `jacobian` says, and by all else as it is written."""
+    """`fn`, whose derivative by the state is `jacobian`; by everything else autodiff differentiates
+    it."""
 
     fn: ConstraintFn
     jacobian: Any  # a function like `fn`; checked below, with a remedy
@@ -83,7 +84,8 @@ def _call(others: Any, y: Y) -> Values:
 
 @_call.def_jvp
 def _call_jvp(primals, tangents):
-    """`J ẏ`, and what autodiff says of the time, the parameters and the arrays of `fn`."""
+    """`J ẏ`, plus the derivatives by the time, the parameters and the arrays of `fn` by
+    autodiff."""
     others, y = primals
     t_others, t_y = tangents
     fn, jacobian, t, args = others
@@ -105,7 +107,8 @@ def _call_jvp(primals, tangents):
 
 
 def _product(value: Array, row: Any, t_y: Y) -> Array:
-    """`row · ẏ`, where `row` is shaped like the state, each leaf with the axes of `value` first."""
+    """`row · ẏ`, where `row` is shaped like the state with the axes of `value` prepended to each
+    leaf."""
     expected = jtu.tree_map(lambda t: value.shape + t.shape, t_y)
     got = jtu.tree_map(jnp.shape, row)
     if got != expected:

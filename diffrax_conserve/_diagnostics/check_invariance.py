@@ -1,4 +1,4 @@
-"""Proof by autodiff that what is said to be conserved is conserved."""
+"""A check by autodiff that a manifold is conserved by a vector field."""
 
 import dataclasses
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .._tree import from_view, real_view
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceEntry:
-    """What `check_invariance` found for one entry of the manifold.
+    """The result of `check_invariance` for one entry of the manifold.
 
     `defect` is the largest relative defect over all states and elements, and `state` the index of
     the state where it was found.
@@ -80,38 +80,38 @@ def check_invariance(
     $$\frac{|\partial_t I + \sum_i \partial_i I\, f_i|}{|\partial_t I| + \sum_i |\partial_i I\,
     f_i|},$$
 
-    which is a few roundoffs if $I$ is a first integral, and at almost every state of order one if
-    it is not. This tests the equations, with no solver involved; a misprint in either $I$ or $f$
-    shows. For a [`diffrax_conserve.Constraint`][] the same derivative must vanish where the
-    constraints hold, so the states must lie on all constraints of the manifold. For a
-    [`diffrax_conserve.FirstIntegral`][] next to constraints this makes the weaker, and right,
-    demand that it be conserved where they hold. Of one with a `rate` that is subtracted from the
-    derivative, and its size added to those of the terms.
+    which is a few units of roundoff if $I$ is a first integral, and of order one at almost every
+    state if it is not. This tests the equations without a solver; it reveals a misprint in either
+    $I$ or $f$. For a [`diffrax_conserve.Constraint`][] the same derivative must vanish where the
+    constraints hold, so the states must satisfy all constraints of the manifold. A
+    [`diffrax_conserve.FirstIntegral`][] next to constraints is thus tested only where they hold, as
+    it should be. A `rate` is subtracted from the derivative, and its size is added to the
+    denominator.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
     - `manifold`: a [`diffrax_conserve.FirstIntegral`][], a [`diffrax_conserve.Constraint`][] or a
         PyTree of them.
-    - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree of arrays like `y` with
-        one leading axis more, over the states. Take states in general position: at an equilibrium
-        everything is conserved.
+    - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree of arrays like `y` with an
+        additional leading axis over the states. Take states in general position: at an equilibrium
+        every function is conserved.
     - `t`: the time, or one for each state. Give several for integrals that depend on time.
     - `args`: passed to `vector_field` and to the functions of the manifold.
     - `key`: seeds the sampler; by default `jax.random.key(0)`.
     - `num_states`: how many states to draw from the sampler.
-    - `rtol`: the largest relative defect that is taken for roundoff; by default ten thousand times
-        the machine epsilon of the states.
+    - `rtol`: the largest relative defect that is attributed to roundoff; by default ten thousand
+        times the machine epsilon of the states.
 
     **Returns:**
 
-    An `InvarianceReport`: its `ok` is the verdict, `str` of it a table, and `entries` hold the
-    largest relative defect of each entry of the manifold.
+    An `InvarianceReport`: `ok` is the verdict, `str` returns a table, and `entries` has the largest
+    relative defect of each entry of the manifold.
 
     **Raises:**
 
-    `ValueError` if a state does not lie on a constraint, or if `vector_field` returns something
-    that is not like `y`; `TypeError` or `ValueError` if `manifold` is not a manifold.
+    `ValueError` if a state violates a constraint, or if the value of `vector_field` is not shaped
+    like `y`; `TypeError` or `ValueError` if `manifold` is not valid.
 
     !!! example
 
@@ -226,7 +226,8 @@ def _relative_sizes(
     y = real_view(state)
     value, along_flow = jax.jvp(fn, (t, y), (jnp.ones_like(t), f))
     jacobian = jax.jacrev(fn, argnums=(0, 1))(t, y)
-    # The sizes of what cancels: of the derivative's terms, and of the value's to first order.
+    # The sizes of the terms that cancel: those of the derivative, and those of the value to first
+    # order.
     speeds = [_term_sizes(rows, (jnp.ones_like(t), f)) for rows in jacobian]
     sizes = [_term_sizes(rows, (t, y)) for rows in jacobian]
     rate = rate_of(entry)
@@ -235,7 +236,8 @@ def _relative_sizes(
         along_flow = [a - b for a, b in zip(along_flow, rates, strict=True)]
         speeds = [a + jnp.abs(b) for a, b in zip(speeds, rates, strict=True)]
     residual = value if isinstance(entry, Constraint) else [jnp.zeros_like(x) for x in value]
-    # An integral that is not defined at `y` is not conserved, though its derivative may vanish.
+    # An integral that is not finite at `y` counts as not conserved, although its derivative may
+    # vanish.
     along_flow = [
         jnp.where(jnp.isfinite(x), dx, jnp.nan) for x, dx in zip(value, along_flow, strict=True)
     ]
@@ -250,7 +252,7 @@ def _term_sizes(rows: Any, x: Any) -> Float[Array, " elements"]:
 
 def _largest_ratio(numerators: list[Array], denominators: list[Array]) -> Float[Array, ""]:
     a, b = jnp.abs(jnp.concatenate(numerators)), jnp.concatenate(denominators)
-    return jnp.max(a / jnp.where(b == 0, 1, b))  # 0 / 0 is no defect; NaN stays NaN
+    return jnp.max(a / jnp.where(b == 0, 1, b))  # 0 / 0 counts as 0; NaN stays NaN
 
 
 def _verdict(

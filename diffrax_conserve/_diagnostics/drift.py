@@ -1,4 +1,4 @@
-"""How well a solution was conserved."""
+"""The drift of a solution from a manifold."""
 
 from collections.abc import Callable
 
@@ -33,31 +33,32 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
 
-    Of a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
-    is subtracted from the numerator. It is taken along the dense output of the wrapped solver,
-    or of a solver that is not wrapped, so the solution must have some.
+    For a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
+    is subtracted from the numerator. It is computed along the dense output of the solver (of the
+    wrapped one in a `ManifoldProjection`), so the solution must have dense output.
 
-    The scale is what roundoff is relative to: a momentum that vanishes as the sum of large terms is
-    not divided by zero.
+    Roundoff is proportional to this scale. It is not zero for a momentum that vanishes as the sum
+    of large terms.
 
     **Arguments:**
 
-    - `sol`: what `diffrax.diffeqsolve` returned. It needs saved times; save `t0` too (as in
-        `SaveAt(t0=True, steps=True)`) if the drift from the initial state is wanted. For a batch
-        of solutions use `jax.vmap`. What a `SaveAt(fn=...)` saved is taken for states.
+    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too (as in
+        `SaveAt(t0=True, steps=True)`) to get the drift from the initial state. For a batch of
+        solutions use `jax.vmap`. Values saved by a `SaveAt(fn=...)` are treated as states.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
     **Returns:**
 
-    A PyTree like the values of the functions in `manifold`, with a leading axis of saved times.
-    Rows that diffrax padded (times `inf`) are zero.
+    A PyTree shaped like the values of the functions in `manifold`, with a leading axis over the
+    saved times. Rows that diffrax padded (times `inf`) are zero.
 
     **Raises:**
 
-    `ValueError` if the solution holds no saved states, only one with nothing to compare it with,
-    those of several `SaveAt(subs=...)`, or, where dense output tells, something else than states,
-    or is a batch; or, of a balance law, no dense output. `TypeError` if `sol` is no solution.
+    `ValueError` if `sol` is a batch, has no saved states, has a single one without a conserved
+    value to compare it with, or was saved by `SaveAt(subs=...)`; if the saved values do not have
+    the shapes of states (checked only with dense output); or if a balance law has no dense output.
+    `TypeError` if `sol` is not a solution.
 
     !!! example
 
@@ -131,7 +132,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
 
 def _check_states(sol: dfx.Solution, y0: Y) -> None:
-    """Raises if what was saved is known not to be states."""
+    """Raises if the saved values are known not to be states."""
     if sol.interpolation is None:
         return
     states = tree_shapes(eqx.filter_eval_shape(sol.evaluate, sol.t0))
@@ -145,7 +146,8 @@ def _check_states(sol: dfx.Solution, y0: Y) -> None:
 def _gained(
     sol: dfx.Solution, manifold: Manifold, args: Args
 ) -> Callable[[RealScalarLike], Values] | None:
-    """What the rates of the manifold add to its values until a time, if it has any."""
+    """The integral of the rates of the manifold up to a time, as a function of that time; `None` if
+    there are no rates."""
     if not has_rates(manifold):
         return None
     path = sol.interpolation
@@ -159,13 +161,14 @@ def _gained(
     def until(step: RealScalarLike, end: RealScalarLike) -> Values:
         info = jtu.tree_map(lambda x: x[step], path.infos)
         local = path.interpolation_cls(t0=path.ts[step], t1=path.ts[step + 1], **info)
-        # Of a projected solver, what its own balance was computed from.
+        # For a projected solver this is the interpolation from which the solver computed its
+        # balance.
         local = getattr(local, "inner", local)
         return integrated_rates(manifold, path.ts[step], end, local.evaluate, args, path.direction)
 
     steps = jnp.arange(path.ts.size - 1)
     used = steps < path.ts_size - 1
-    # Those that diffrax padded are computed too, for the first step.
+    # Padded steps are computed too, with the values of the first step, and discarded.
     each = jax.vmap(lambda i, ok: until(jnp.where(ok, i, 0), path.ts[jnp.where(ok, i, 0) + 1]))
     sums = jtu.tree_map(
         lambda x: jnp.cumsum(jnp.where(used.reshape(-1, *[1] * (x.ndim - 1)), x, 0), axis=0),

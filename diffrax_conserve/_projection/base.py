@@ -1,4 +1,4 @@
-"""What every projection takes and returns."""
+"""The interface of projections: the problem, the report, and the checks of options."""
 
 import abc
 from typing import Any, ClassVar
@@ -22,21 +22,23 @@ from .step import Step
 
 
 class ProjectionInfo(eqx.Module):
-    """How a projection went.
+    """The report on a projection.
 
     **Attributes:**
 
     - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
         residual is within its tolerance at the state that is returned.
-    - `num_steps`: how many iterations were made.
+    - `num_steps`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint at the projected state,
         $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
-    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate, of a
-        `Newton` at the result. With more than 128 constraints it is not formed: their number.
-    - `worst`: if the projection failed, the position of the scalar constraint that is farthest
-        off, before and after it, in the order in which the manifold is flattened; otherwise 0.
+    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate (for
+        `Newton`: at the result). With more than 128 constraints the matrix is not formed, and this
+        is their number.
+    - `worst`: if the projection failed, the position of the scalar constraint with the largest
+        relative residual (the smaller of its residuals before and after), in the order in which the
+        manifold is flattened; otherwise 0.
     """
 
     result: optx.RESULTS
@@ -66,7 +68,7 @@ class ProjectionInfo(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What a projection solves.
+    """The problem that a projection solves.
 
     **Attributes:**
 
@@ -75,11 +77,11 @@ class Problem(eqx.Module):
     - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
     - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
         manifold, from which `residual` was made.
-    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s. Of a complex leaf,
-        everything else here, the candidate and the result have the real and the imaginary part
-        along a new first axis; `state` puts them together.
-    - `anchor`: a state near the manifold, in dense output the nearer end of the step, to start
-        from where the candidate leads nowhere; in a step `None`.
+    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s. For a complex leaf, all
+        other attributes, the candidate and the result have the real and the imaginary part along a
+        new first axis; `state` combines them.
+    - `anchor`: a state near the manifold, from which an iteration can start if it fails from the
+        candidate: in dense output the nearer end of the step, in a step `None`.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` where there is none, as in
         [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
     """
@@ -95,7 +97,7 @@ class Problem(eqx.Module):
     step: Step | None = None
 
     def state(self, y: Y) -> Any:
-        """A candidate as the state of the solve: the same, but with its complex leaves.
+        """Converts a candidate to a state of the solve, with its complex leaves.
 
         **Arguments:**
 
@@ -103,7 +105,7 @@ class Problem(eqx.Module):
 
         **Returns:**
 
-        A state, complex where that of the solve is.
+        The state, complex where the state of the solve is.
         """
         return from_view(y, self.like)
 
@@ -116,7 +118,7 @@ class Problem(eqx.Module):
         rtol: float | Array | None = None,
         atol: float | Array | None = None,
     ) -> "ProjectionInfo":
-        """The report on a projection that led from `candidate` to `y`: what `solve` returns.
+        """The report on a projection from `candidate` to `y`, as `solve` must return it.
 
         **Arguments:**
 
@@ -128,7 +130,7 @@ class Problem(eqx.Module):
 
         A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
         """
-        # A verdict has no derivative, and that of a Jacobian may not exist.
+        # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
         given = self.residual, self.magnitude, candidate, y
         residual, magnitude, candidate, y = tree_stop_gradient(given)
         before, jacobian = linearise(residual, candidate)
@@ -141,19 +143,19 @@ class Problem(eqx.Module):
 
 
 def option(default: Any, **kwargs: Any) -> Any:
-    """A field that is given by keyword, if at all."""
+    """An optional, keyword-only field."""
     return eqx.field(default=default, kw_only=True, **kwargs)
 
 
 class AbstractProjection(eqx.Module):
-    """A way to return from a candidate to the manifold.
+    """A map from a candidate to a state on the manifold.
 
     Write your own as a subclass with a field `metric` and the method `solve`; see "Your own
     projection" in the guide.
     """
 
     metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
-    # Whether `Problem.step` is given. Then the error estimate is saved with dense output.
+    # Whether `Problem.step` is set. If so, dense output also stores the error estimate.
     sees_step: ClassVar[bool] = True
 
     @abc.abstractmethod
@@ -180,7 +182,7 @@ def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
 
 
 def check_options(projection: Any) -> None:
-    """Raises unless those that the projections share are numbers that make sense."""
+    """Raises unless the options common to the projections are valid."""
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):
@@ -190,7 +192,7 @@ def check_options(projection: Any) -> None:
 
 
 def check_projection(projection: Any) -> None:
-    """Raises unless `projection` is a projection, and not the class of one."""
+    """Raises unless `projection` is an instance of a projection, not a class."""
     if not isinstance(projection, AbstractProjection):
         raise TypeError(
             f"`projection` is {projection!r}, which is not a projection. Pass an instance, for "
@@ -201,32 +203,32 @@ def check_projection(projection: Any) -> None:
 # The options that the Newton iterations share.
 NEWTON_OPTIONS = r"""**Arguments:**
 
-- `rtol`: how large a residual may remain, relative to the scale of its constraint at the projected
-    state, which is what roundoff is relative to. Default: 16 units of roundoff of the dtype.
-    Nearly every projection ends well below it.
-- `atol`: the same, absolute. Default: 0. Set it where the functions of the manifold are themselves
-    less accurate than roundoff.
+- `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
+    state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
+    every projection ends well below it.
+- `atol`: an absolute tolerance, added to the relative one. Default: 0. Set it where the functions
+    of the manifold are less accurate than roundoff.
 - `max_steps`: the largest number of iterations; after that the projection has failed.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.
 - `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
     PyTrees like the state of scalars or arrays. The result is
-    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest point of the
-    manifold within the bounds, which it never leaves. Where there is none the projection fails.
-    Derivatives hold what is at a bound there. Of a complex component they bound both parts.
-    Default: none.
+    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, which is always within the bounds and for
+    linear constraints is the nearest such point of the manifold. If there is no such point, the
+    projection fails. In derivatives, components at a bound are constant. For a complex component
+    the bounds apply to both parts. Default: none.
 
 **Raises:**
 
 `TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
-less than 1, a weight is not positive, if a lower bound is above its upper one, or, when they are
-used, if the bounds are not shaped like the state.
+less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
+projection is used, the bounds are not shaped like the state.
 """
 
 
 def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
-    """`metric`, checked at once where its values are known, and otherwise when they are."""
+    """`metric`, checked now if its values are known, and at run time if they are tracers."""
     message = (
         "`metric` has a weight that is not positive. Every weight must be greater than 0; they are "
         "per component, not a matrix."
@@ -244,9 +246,9 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
 
 
 class Outcome(eqx.Module):
-    """The verdict on a state that a projection returns: its result, and the worst constraint.
+    """The verdict on the state that a projection returns: the result and the worst constraint.
 
-    Two integers, so that a solve carries no more than that.
+    It consists of two integers, to keep the state that a solve carries small.
     """
 
     result: optx.RESULTS
@@ -258,8 +260,9 @@ class Outcome(eqx.Module):
 
     @classmethod
     def of(cls, before: Vector, after: Vector, scale: Vector, tolerance: Tolerance) -> "Outcome":
-        """Of a state with residuals `after` of the scales `scale`, from a candidate with residuals
-        `before`: not finite if that was not, divergence if only the state is not."""
+        """The verdict on a state with residuals `after` and their scales `scale`, from a candidate
+        with residuals `before`: `nonfinite` if `before` is not finite, divergence if only `after`
+        is not."""
         kinds = optx.RESULTS
         success = within(after, tolerance(scale))
         result = kinds.where(
@@ -277,7 +280,8 @@ class Outcome(eqx.Module):
 
 
 def _smaller(before: Vector, after: Vector) -> Vector:
-    """What an iteration that diverged left larger was not the fault of that constraint."""
+    """The smaller of both residuals, so that a constraint is not blamed for an iteration that
+    diverged."""
 
     def smaller(a: Array, b: Array) -> Array:
         a, b = (jnp.where(jnp.isnan(x), jnp.inf, jnp.abs(x)) for x in (a, b))
@@ -287,7 +291,7 @@ def _smaller(before: Vector, after: Vector) -> Vector:
 
 
 def _member(result: optx.RESULTS) -> optx.RESULTS:
-    """The same with an array in it, as it comes out of a `where`."""
+    """The same result with an array as its value, as `RESULTS.where` returns it."""
     return optx.RESULTS.where(jnp.asarray(True), result, result)
 
 

@@ -1,10 +1,10 @@
 """Projection to a manifold and a box, by a semismooth Newton iteration on the multipliers.
 
 `y = clip(ŷ + M⁻¹ Bᵀ λ)` with `g(y) = 0`, where `B` is the constraint Jacobian at the candidate or,
-for the nearest point, at `y`. For linear constraints that is a quadratic program, whose dual is
-convex, and once differentiable: Newton's method with a search along its steps finds its minimum
-from anywhere (L. Qi and D. Sun, "A nonsmooth version of Newton's method", 1993). For others it is
-repeated with constraints that are linear about the last state.
+for the nearest point, at `y`. For linear constraints this is a quadratic program, whose dual is
+convex and once differentiable: Newton's method with a line search converges globally (L. Qi and D.
+Sun, "A nonsmooth version of Newton's method", 1993). For nonlinear constraints a sequence of such
+programs is solved, each with the constraints linearised about the last state.
 """
 
 import functools as ft
@@ -40,12 +40,13 @@ from .jacobian import AbstractJacobian
 from .linearise import linearise
 from .residual import largest, relative
 
-# Of one quadratic program: how many steps of Newton's method, and halvings in search of the
-# minimum along each.
+# For one quadratic program: the largest number of Newton steps, and the number of bisections in the
+# line search of each.
 _INNER_STEPS, _HALVINGS = 100, 30
-# What a component beyond its bound counts for in the Gram matrix, in turn: without it a constraint
-# all of whose components are at bounds would stay as it is. Either alone gave up one in some
-# thousand random programs whose bounds and balances nearly contradict each other.
+# Relative weights in the Gram matrix of a component beyond its bound, used in alternate steps: with
+# weight zero a constraint all of whose components are at bounds would never change. With either
+# value alone, one in some thousand random programs with nearly contradictory bounds and balances
+# failed.
 _AT_BOUND = (1e-8, 1e-4)
 
 
@@ -57,21 +58,21 @@ class Box(eqx.Module):
 
     def clip(self, y: Y) -> Y:
         def clip(x: Array, a: Array, b: Array) -> Array:
-            # At a bound the derivative is that of the inside.
+            # At a bound the derivative is taken from inside, so not by `jnp.clip`.
             inside = jnp.where(x < a, a, jnp.where(x > b, b, x))
             return jnp.where(jnp.isnan(a) | jnp.isnan(b), jnp.nan, inside)
 
         return jtu.tree_map(clip, y, self.lower, self.upper)
 
     def inside(self, y: Y) -> Y:
-        """One where a component is within its bounds, and zero where it is beyond."""
+        """1 where a component is within its bounds, otherwise 0."""
         return jtu.tree_map(
             lambda x, a, b: ((x >= a) & (x <= b)).astype(x.dtype), y, self.lower, self.upper
         )
 
 
 def box_of(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None, y: Y) -> Box | None:
-    """The box of two options of a projection, if one is given."""
+    """The box for the options `lower` and `upper`, or `None` if neither is given."""
     if lower is None and upper is None:
         return None
     return Box(_bound("lower", lower, -np.inf, y), _bound("upper", upper, np.inf, y))
@@ -88,7 +89,7 @@ def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, y: Y) -> 
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
-    """Raises if both are known and a lower bound is above its upper one."""
+    """Raises if a lower bound is above its upper bound, where both are known."""
     leaves = [jtu.tree_leaves(x) for x in (lower, upper)]
     if len(leaves[0]) != len(leaves[1]) or any(
         isinstance(x, jax.core.Tracer) or not eqx.is_array_like(x) for x in [*leaves[0], *leaves[1]]
@@ -117,8 +118,8 @@ Unbounded = Callable[[Equations], tuple[Y, Vector, ProjectionInfo]]
 def project_into(
     equations: Equations, box: Box, *, unbounded: Unbounded, frozen: bool, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    """The state, its multipliers, and how it went. Where the `unbounded` projection ends within the
-    box that is the answer."""
+    """The state, its multipliers and the report. If the result of the `unbounded` projection is
+    within the box, it is returned."""
     candidate = equations.candidate
     free, free_multiplier, free_info = unbounded(equations)
     within_box = ft.reduce(jnp.logical_and, map(jnp.all, jtu.tree_leaves(box.inside(free))))
@@ -166,8 +167,9 @@ def project_into(
 def _polished(
     equations: Equations, box: Box, base: AbstractJacobian, multiplier: Vector
 ) -> tuple[Y, Vector]:
-    """The state of these multipliers, corrected by what it still lacks: a component that is small
-    beside its candidate is only as accurate as that."""
+    """The state for these multipliers after two further corrections, and the corrected multipliers:
+    without them a component much smaller than its candidate only has the absolute accuracy of the
+    candidate."""
     z = tree_add(equations.candidate, equations.correction(base, multiplier))
     y, active = box.clip(z), tree_mul(equations.weights, box.inside(z))
     gram_solver = base.gram_solver(active)
@@ -189,8 +191,8 @@ def _quadratic_program(
 ) -> Vector:
     """The multipliers of the nearest point of the box with `g + B (x - y) = 0`.
 
-    They minimise a convex function whose gradient is that residual. Its value is never computed:
-    it would lose in roundoff what small components of the state have to say.
+    They minimise a convex function whose gradient is this residual. Only the gradient is used: in
+    the value of the function, small components of the state would be lost in roundoff.
     """
     candidate, weights = equations.candidate, equations.weights
     dtype = working_dtype(candidate)
@@ -212,7 +214,7 @@ def _quadratic_program(
         slope = tree_dot(gradient, change, dtype)
 
         def slope_at(length: Array) -> Array:
-            """Of the function along the step: it grows with the length."""
+            """The derivative of the function along the step, which increases with the length."""
             moved = tree_sub(box.clip(tree_add(z, tree_scale(length, step))), x)
             return slope + tree_dot(pull, moved, dtype)
 
@@ -226,7 +228,7 @@ def _quadratic_program(
 
 
 def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
-    """Where a slope that grows is zero between 0 and 1, by bisection; 1 if it is negative there."""
+    """The zero in [0, 1] of an increasing slope, by bisection; 1 if the slope is negative there."""
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         a, b = ends
@@ -235,7 +237,7 @@ def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
         return jnp.where(falls, middle, a), jnp.where(falls, b, middle)
 
     one = jnp.ones((), dtype)
-    # A full step that ends just past the minimum is as good as one to it.
+    # A full step that ends just past the minimum is accepted too.
     good = slope_at(one) <= 1e-3 * jnp.abs(slope_at(jnp.zeros((), dtype)))
     _, b = lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros((), dtype), one))
     return jnp.where(good, one, b)
@@ -243,7 +245,7 @@ def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
 
 @project_into.def_jvp
 def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
-    """The implicit function theorem, with the components that are at their bounds held there."""
+    """The implicit function theorem, with the components at their bounds held constant."""
     (equations, box), (t_equations, t_box) = primals, tangents
     y, multiplier, info = project_into(
         equations, box, unbounded=unbounded, frozen=frozen, max_steps=max_steps
@@ -251,7 +253,7 @@ def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
     _, at_y = linearise(equations.residual, y)
 
     def pulled(base: Y, parameters: Any) -> tuple[Y, Y]:
-        """The state before and after it is clipped."""
+        """The state before and after clipping."""
         residual, candidate, weights, box = parameters
         _, vjp = eqx.filter_vjp(residual, base)
         z = tree_add(candidate, tree_mul(vjp(multiplier)[0], weights))

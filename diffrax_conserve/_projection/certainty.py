@@ -1,8 +1,8 @@
-"""Whether the derivative of a projection means anything.
+"""Whether the derivative of a projection is well determined.
 
 Where gradients of constraints are nearly parallel, multipliers are large and cancel, so that
-roundoff and the smallest correction decide on their derivatives. Gradients that are parallel
-everywhere do no harm: such a constraint only says again what others say.
+roundoff dominates their derivatives. Gradients that are parallel everywhere do no harm: such a
+constraint is redundant.
 """
 
 import jax.numpy as jnp
@@ -15,17 +15,19 @@ from .iteration import Equations
 from .jacobian import AbstractJacobian
 from .linearise import linearise
 
-# How far, relative to the state, to go to see whether gradients are parallel there too.
+# The relative distance to the state at which it is tested whether gradients are parallel
+# everywhere.
 _OFFSET = 1e-3
-# Gradients at a smaller angle than the cube root of roundoff are not told apart, and at a smaller
-# one than this only if the correction, divided by the angle, is a smaller part of the state.
+# Gradients count as nearly parallel if the sine of their angle is below the cube root of roundoff,
+# or if it is below `_SMALL_ANGLE` and the correction, relative to the state and divided by the
+# sine, is above `_SHORT_CORRECTION`.
 _SMALL_ANGLE, _SHORT_CORRECTION = 1e-2, 1e-5
 
 
 def certain(equations: Equations, y: Y, jacobian: AbstractJacobian) -> Float[Array, ""]:
     """One if the derivative of the projected state `y` is well determined, otherwise NaN."""
     dtype = working_dtype(y)
-    if equations.magnitude.size == 1:  # parallel to nothing
+    if equations.magnitude.size == 1:  # a single gradient
         return jnp.ones((), dtype)
     eps = float(jnp.finfo(dtype).eps)
     sines = jacobian.sines(equations.weights)
@@ -41,7 +43,7 @@ def certain(equations: Equations, y: Y, jacobian: AbstractJacobian) -> Float[Arr
 
 
 def _beside(y: Y) -> Y:
-    """A state near `y`, in no special direction."""
+    """A state near `y` in a generic direction."""
     largest = tree_max(y)
 
     def offset(x: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A projection that the user knows how to write down."""
+"""A projection by a formula that the user gives."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, final
@@ -18,8 +18,8 @@ class ClosedForm(AbstractProjection):
     r"""Projects by a formula: $y = \mathrm{fn}(t, \hat y, args, values)$.
 
     For manifolds with a known projection, such as spheres, unit quaternions and rotation matrices.
-    The residual of what the formula returns is checked like that of every other projection: where
-    it does not lie on the manifold, the projection has failed.
+    The residual at the returned state is checked as in every projection: if the state is not on the
+    manifold, the projection has failed.
 
     !!! example
 
@@ -66,13 +66,14 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a function `fn(t, y, args, values)` of the time, the candidate, the parameters and the
     conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
-    which returns the state on the manifold, shaped like `y`. It is differentiated as it is written.
+    which returns the state on the manifold, shaped like `y`. Derivatives of the projection are
+    those of `fn`.
 - `rtol`, `atol`: how large a residual may remain; see `SimplifiedNewton`.
 
 **Raises:**
 
-`TypeError` if `fn` is not callable; `ValueError`, when it is used, if what it returns is not shaped
-like the state.
+`TypeError` if `fn` is not callable; `ValueError`, when the projection is used, if the value of `fn`
+is not shaped like the state.
 """
 
 

@@ -1,4 +1,4 @@
-"""Projection along the embedded error estimate, which keeps every linear invariant."""
+"""Projection along the embedded error estimate, which conserves every linear integral."""
 
 from typing import ClassVar, NamedTuple, final
 
@@ -20,26 +20,27 @@ from .residual import Tolerance, within
 class Directional(AbstractProjection):
     r"""Projects along the error estimate of the wrapped solver, for one integral.
 
-    For the candidate $\hat y$ and the error estimate $w$ of the step, in a Runge-Kutta method the
-    difference from the embedded one, solves the scalar equation
+    For the candidate $\hat y$ and the error estimate $w$ of the step (in a Runge-Kutta method the
+    difference from the embedded solution), it solves the scalar equation
 
     $$g(\hat y + \lambda w) = 0$$
 
-    by Newton's method, from $\lambda = 0$ and with derivatives along $w$ only. Whatever linear
-    integrals the wrapped solver keeps, as every Runge-Kutta method keeps all, both $\hat y$ and $w$
-    respect: so they survive a projection on the energy, without a metric and without being named.
+    by Newton's method, from $\lambda = 0$ and with derivatives along $w$ only. Linear integrals
+    that the wrapped solver conserves, as every Runge-Kutta method does, are constant along $w$ and
+    thus also conserved after a projection on the energy, without a metric and without being listed
+    in the manifold.
 
-    Where $w$ is nearly tangent to the manifold the correction is long, or there is none and the
-    projection fails: an adaptive solve then takes a smaller step, one with fixed steps ends. The
-    order of the wrapped solver is kept where the angle between $w$ and the manifold does not vanish
-    with the step size; a `max_correction` of the `ManifoldProjection` makes long corrections
-    failures. At saved times inside a step and in dense output the direction is that of the step;
-    where it leads nowhere there, the state is projected by a
-    [`diffrax_conserve.SimplifiedNewton`][] instead, which does not keep linear integrals.
+    Where $w$ is nearly tangent to the manifold, the correction is long, or does not exist and the
+    projection fails: an adaptive solve then takes a smaller step, a solve with fixed steps ends.
+    The order of the wrapped solver is kept if the angle between $w$ and the manifold does not
+    vanish with the step size; with a `max_correction` of the `ManifoldProjection`, long corrections
+    are failures. At saved times inside a step and in dense output the direction is that of the
+    step; where the projection fails there, [`diffrax_conserve.SimplifiedNewton`][] is used instead,
+    which does not conserve linear integrals.
 
-    Success is decided as in every projection. Derivatives are those of the implicit function
-    theorem for $\lambda$; where the sine of the angle between $w$ and the manifold is below the
-    cube root of roundoff they are NaN.
+    Success is judged as in every projection. Derivatives follow from the implicit function theorem
+    for $\lambda$; they are NaN where the sine of the angle between $w$ and the manifold is below
+    the cube root of roundoff.
 
     !!! example
 
@@ -88,9 +89,9 @@ Directional.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`ValueError`, when it is used and before anything is compiled: with more than one scalar constraint,
-with a solver that has no error estimate, or in [`diffrax_conserve.project`][], where there is no
-step; and at once with a `diffrax.HalfSolver`, whose error estimate has lost its sign.
+`ValueError`, when it is used and before compilation: with more than one scalar constraint, with a
+solver that has no error estimate, or in [`diffrax_conserve.project`][], where there is no step.
+`ValueError` from `ManifoldProjection` for a `diffrax.HalfSolver`, whose error estimate has no sign.
 """
 
 
@@ -111,7 +112,8 @@ def _direction(problem: Problem) -> Y:
             "none. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, or pass "
             "`projection=SimplifiedNewton()`."
         )
-    # Of size one: the result does not depend on it, and products with the gradient keep in range.
+    # Normalised: the result does not depend on the length, and products with the gradient do not
+    # overflow or underflow.
     size = lax.stop_gradient(tree_max(problem.step.error))
     return tree_scale(1 / jnp.where(size > 0, size, 1), problem.step.error)
 
@@ -132,7 +134,7 @@ def _length(
     *,
     max_steps: int,
 ) -> tuple[Real[Array, ""], Int[Array, ""]]:
-    """The root `λ`, and the number of iterations; where it ends, whatever it is."""
+    """The last iterate of `λ`, converged or not, and the number of iterations."""
     limit, magnitude = accuracy
     _, jacobian = linearise(residual, candidate)
     enough = SAFELY * limit(magnitude + jacobian.scale(candidate))[0]
@@ -144,7 +146,7 @@ def _length(
         _, last, length, num_steps = carry
         g, slope = jax.jvp(along, (length,), (jnp.ones_like(length),))
         size = jnp.abs(g)
-        # Where it no longer helps it ends; whether that is small enough is judged by others.
+        # Ends when the residual stops decreasing; `Problem.judge` decides on success.
         unfinished = (size > enough) & (size < 0.9 * last) & (num_steps < max_steps) & (slope != 0)
         step = jnp.where(unfinished, g / jnp.where(slope == 0, 1, slope), 0)
         return _Carry(unfinished, size, length - step, num_steps + unfinished.astype(int))
@@ -172,7 +174,7 @@ def _length_jvp(primals, tangents, *, max_steps):
     slope = tree_dot(gradient, direction, g.dtype)
     sine = jnp.abs(slope) / (tree_norm(gradient) * tree_norm(direction))
     certain = (sine > float(jnp.finfo(g.dtype).eps) ** (1 / 3)) | (tree_max(direction) == 0)
-    # Of a projection that failed nobody asks for the derivative: its step is rejected, or ends all.
+    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
     failed = ~within(g, limit(magnitude + jacobian.scale(y))[0])
     t_length = -t_g / jnp.where(slope == 0, 1, slope)
     factor = lax.stop_gradient(jnp.where(certain | failed, 1.0, jnp.nan).astype(g.dtype))

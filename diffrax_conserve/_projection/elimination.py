@@ -1,11 +1,11 @@
 """Solves with Gram matrices that may be singular, by Gaussian elimination without pivoting.
 
-A Gram matrix is positive semi-definite, and `G W Hᵀ` of two nearby Jacobians nearly so. A pivot at
-the level of roundoff, relative to its diagonal element, marks a constraint whose gradient depends
-on the earlier ones; its multiplier is zero, which changes nothing where the constraints are
-consistent. (Damping instead would leave huge multipliers along the null vector, whose roundoff
-moves the state.) Where gradients are merely almost parallel nothing is dropped: the direction in
-which they differ is the one that is needed.
+A Gram matrix is positive semi-definite, and `G W Hᵀ` for two nearby Jacobians nearly so. A pivot at
+the level of roundoff, relative to its diagonal element, belongs to a constraint whose gradient
+depends linearly on the earlier ones; its multiplier is set to zero, which is exact for consistent
+constraints. (With damping instead, huge multipliers along the null vector would remain, and their
+roundoff would move the state.) Gradients that are only nearly parallel are all kept, because the
+correction needs the direction in which they differ.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,12 @@ class GramSolver(NamedTuple):
     rank: Int[Array, ""]
 
     def scaled(self, rows: Vector, columns: Vector) -> "GramSolver":
-        """The solver for the matrix whose rows and columns are multiplied by these."""
+        """The solver for the matrix with rows and columns multiplied by `rows` and `columns`."""
 
         def solve(b: Vector) -> Vector:
             x = self.solve(jtu.tree_map(jnp.divide, b, rows))
-            # XLA makes one quotient of two, whose divisor can overflow, but not across a choice.
+            # XLA merges two quotients into one, whose divisor can overflow; the `where` prevents
+            # this.
             x = jtu.tree_map(lambda x, s: jnp.where(s < jnp.inf, x, jnp.nan), x, columns)
             return jtu.tree_map(jnp.divide, x, columns)
 
@@ -42,7 +43,7 @@ def _least_pivot(m: int, dtype: jnp.dtype) -> float:
 
 
 def unrolled_solver(gram: list[list[Array]], damping: Real[Array, ""] | float) -> GramSolver:
-    """Written out, for a matrix given as `m²` scalars."""
+    """Elimination written out, for a matrix given as `m²` scalars."""
     m = len(gram)
     least = _least_pivot(m, gram[0][0].dtype)
     lu = [list(row) for row in gram]
@@ -66,8 +67,8 @@ def unrolled_solver(gram: list[list[Array]], damping: Real[Array, ""] | float) -
         for i in reversed(range(m)):
             for j in range(i + 1, m):
                 x[i] = x[i] - lu[i][j] * x[j]
-            # A division, not a product with the inverse: XLA computes a cheap operation again
-            # in every loop that uses it, with all that it depends on.
+            # A division, not a product with the inverse: XLA recomputes cheap operations, and all
+            # that they depend on, in every loop that uses them, but not divisions.
             x[i] = x[i] / pivots[i]
         return tuple(x)
 
@@ -75,11 +76,12 @@ def unrolled_solver(gram: list[list[Array]], damping: Real[Array, ""] | float) -
 
 
 def dense_solver(gram: Real[Array, "m m"], damping: Real[Array, ""] | float) -> GramSolver:
-    """In a loop over the pivots, each of which updates the whole matrix."""
+    """Elimination in a loop over the pivots, each of which updates the whole matrix."""
     m = gram.shape[0]
     least = _least_pivot(m, gram.dtype)
     index = jnp.arange(m)
-    # Rows with a diagonal of ones, so that rows of very different size have comparable pivots.
+    # Rows are scaled to a unit diagonal, so that rows of very different size have comparable
+    # pivots.
     diagonal = jnp.diagonal(gram)
     inverse = jnp.where(diagonal != 0, 1 / jnp.where(diagonal != 0, diagonal, 1), 0)
     scaled = gram * inverse[:, None]
@@ -97,8 +99,8 @@ def dense_solver(gram: Real[Array, "m m"], damping: Real[Array, ""] | float) -> 
     lower, upper = lax.fori_loop(0, m, eliminate, (identity, scaled + damping * identity))
     kept = jnp.abs(jnp.diagonal(upper)) > least
 
-    # By columns, in loops: a triangular solve of the library would be a call, and XLA compiles no
-    # loop that holds one, as the solve around this, into one kernel.
+    # Substitution by columns, in loops: XLA cannot compile a loop that contains a library call,
+    # such as a triangular solve, into one kernel.
     def forward(k: Array, x: Array) -> Array:
         return x - jnp.where(index > k, lower[:, k] * x[k], 0)
 

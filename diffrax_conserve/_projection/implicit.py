@@ -1,4 +1,4 @@
-"""The linear systems of the implicit function theorem, in the state and the multipliers."""
+"""The linear systems of the implicit function theorem, for the state and the multipliers."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,14 +15,14 @@ from .._custom_types import Y
 from .elimination import Vector
 from .jacobian import AbstractJacobian
 
-# Above this many unknowns systems are solved iteratively, matrix-free.
+# Systems with more unknowns are solved iteratively, without forming the matrix.
 SYSTEM_DENSE_MAX = 256
 
 
 def units(jacobian: AbstractJacobian, weights: Y) -> tuple[Y, Vector]:
-    """What components of the state and residuals are to be measured in, so that the condition of a
-    system does not depend on their units: the roots of the weights, and the norms of the rows of
-    `G` in that metric."""
+    """Units for the components of the state and for the residuals that make the condition number of
+    a system independent of the user's units: the square roots of the weights, and the norms of the
+    rows of `G` in that metric."""
     roots = jtu.tree_map(jnp.sqrt, weights)
     return jtu.tree_map(lambda x: jnp.where(x > 0, x, 1), (roots, jacobian.scale(roots)))
 
@@ -33,8 +33,9 @@ def solve_linearised(
     right: tuple[Y, Vector],
     measured_in: tuple[Y, Vector],
 ) -> tuple[Y, Vector]:
-    """The shortest solution of `F' x = right` for the Jacobian `F'` of `fn` at `unknowns`, which
-    are a state and multipliers. The values of `fn` are shaped like them, a state and residuals."""
+    """The minimum-norm solution of `F' x = right`, where `F'` is the Jacobian of `fn` at
+    `unknowns`. The unknowns are a state and multipliers; `fn` returns a state and residuals of the
+    same shapes."""
     rows = lax.stop_gradient(measured_in)
     columns = rows[0], jtu.tree_map(lambda x: 1 / x, rows[1])
 
@@ -59,8 +60,8 @@ def solve_linearised(
 
 
 def _shortest(matrix: Array, b: Array, rcond: float) -> Array:
-    """By singular values: dependent constraints make the system singular but consistent. Whatever
-    is not finite makes the solution NaN, in both directions of a derivative."""
+    """By singular values, because dependent constraints make the system singular but consistent. If
+    `matrix` is not finite the solution is NaN, in forward and in reverse mode."""
     finite = jnp.all(jnp.isfinite(matrix))
     matrix = jnp.where(finite, matrix, jnp.eye(len(b), dtype=matrix.dtype))
     u, s, vt = jnp.linalg.svd(lax.stop_gradient(matrix))

@@ -1,4 +1,4 @@
-"""Newton's iteration for the multipliers, the one loop of every iterative projection."""
+"""Newton's iteration for the multipliers, the loop that `Newton` and `SimplifiedNewton` share."""
 
 import functools as ft
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from .jacobian import AbstractJacobian
 from .linearise import Elements, Joined, linearise
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, relative, within
 
-# An iteration ends at this part of the tolerance, or where it no longer halves the residual.
+# An iteration ends at this fraction of the tolerance, or where it no longer halves the residual.
 SAFELY = 0.25
-# Where a step with this much damping does not reduce the residual, none will.
+# The iteration ends if a step with this much damping does not reduce the residual.
 _MOST_DAMPING = 1e8
-# A start is taken whose squared residual is this part of the candidate's, or less.
+# A `Start` is used if its squared residual is at most this fraction of the candidate's.
 _WELL_STARTED = 1e-4
 
 
@@ -50,12 +50,13 @@ class Equations(eqx.Module):
         return tree_mul(jacobian.pullback(multiplier), self.weights)
 
     def scale(self, jacobian: AbstractJacobian, y: Y) -> Vector:
-        """What roundoff in the residual is relative to, at `y`, whose Jacobian is given."""
+        """The scale of the residual at `y`, to which its roundoff is proportional; `jacobian` is
+        that at `y`."""
         return jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
 
     def merit(self, g: Vector, scale: Vector) -> Array:
-        """The sum of squares of the residuals, relative to their scales and to what `atol` says is
-        small."""
+        """The sum of squares of the residuals, relative to their scales, which are enlarged to
+        allow for `atol`."""
         atol = 0.0 if self.tolerance.atol is None else self.tolerance.atol
 
         def square(g: Array, scale: Array) -> Array:
@@ -70,7 +71,7 @@ class Equations(eqx.Module):
 
 
 class Iterate(NamedTuple):
-    """A state with its multipliers, residual and scale, and how many steps led to it."""
+    """A state with its multipliers, residual and scale, and the number of steps up to it."""
 
     y: Y
     multiplier: Vector
@@ -81,7 +82,7 @@ class Iterate(NamedTuple):
 
 class _Carry(NamedTuple):
     unfinished: Bool[Array, ""]
-    returned: Bool[Array, ""]  # to `best`, from a state that was worse
+    returned: Bool[Array, ""]  # to `best`, because the last state was worse
     damping: Array
     merit: Array  # of `best`
     y: Y
@@ -90,8 +91,7 @@ class _Carry(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The state and multipliers after `num_steps` steps, which are those of the candidate after
-    none."""
+    """The state and multipliers after `num_steps` steps; after none, those of the candidate."""
 
     y: Y
     multiplier: Vector
@@ -106,24 +106,23 @@ def iterate(
     start: Start | None = None,
     enabled: Bool[Array, ""] | bool = True,
 ) -> tuple[Vector, Iterate]:
-    r"""Newton's method from the candidate, or from a `start`: the residual at the candidate, and
-    where the iteration ends.
+    r"""Newton's method from the candidate, or from a `start`. Returns the residual at the candidate
+    and the last iterate.
 
     Each step solves $(G(y) M^{-1} B^\top + D)\, \Delta = g(y)$ and moves $y$ by
     $-M^{-1} B^\top \Delta$. With `frozen`, $B$ is the Jacobian at the candidate, so that the
     result is $\hat y + M^{-1} B^\top \lambda$; otherwise it is that at $y$, which is a Gauss-Newton
     iteration. The damping $D = \mu \min(10^{-2}, |g|^2)$, relative to the diagonal, vanishes with
-    the relative residual: it passes near points where gradients are parallel, and convergence is
-    quadratic elsewhere. From a state whose residual is larger than the last one the iteration goes
-    back, and takes that step again with ten times the $\mu$, as in the method of Levenberg and
-    Marquardt. From a `start` whose residual is not a hundredth of the candidate's it goes back to
-    the candidate.
+    the relative residual: the iteration can pass near points where gradients are parallel, and
+    converges quadratically elsewhere. If a step increases the residual, it is repeated from the
+    last state with ten times the $\mu$, as in the Levenberg-Marquardt method. If the residual of
+    `start` is more than a hundredth of the candidate's, the iteration begins at the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
     first = _first_scale(equations, at_candidate)
 
-    # A loop in a batch evaluates its condition in two places, where it may be rounded in two ways,
-    # and then never ends: so the condition is evaluated once, and carried.
+    # In a batch, a loop evaluates its condition in two places. If these round differently, the loop
+    # may never end, so the condition is evaluated once and carried.
     def body(carry: _Carry) -> _Carry:
         _, returned, damping, last, y, multiplier, best = carry
         g, jacobian = linearise(equations.residual, y)
@@ -135,12 +134,13 @@ def iterate(
         success = within(g, equations.tolerance(scale))
         stalled = returned | (merit > 0.25 * last)
         ended = success & (equations.safely_satisfied(g, scale) | stalled)
-        # Without a first state there is none to return to.
+        # Without an earlier state there is none to return to.
         lost = ~stays & ((damping > _MOST_DAMPING) | ~(last < jnp.inf))
         unfinished = ~lost & ~(stays & (ended | (count >= max_steps)))
 
         base = at_candidate if frozen else jacobian
-        # Near a state of which all terms vanish the residual is never small beside them there.
+        # Near a state where all terms vanish, the residual never becomes small relative to their
+        # size there, so the scale of the candidate bounds it from below.
         vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
         change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
@@ -159,8 +159,9 @@ def iterate(
 
 
 def _first_scale(equations: Equations, at_candidate: AbstractJacobian) -> Vector:
-    """The scale at the candidate. A term may vanish there, and not in the next state: so that scale
-    is at least roundoff of what it would be if all components were as large as the largest."""
+    """The scale at the candidate. Because a term may vanish there but not at the next state, it is
+    at least one unit of roundoff times the scale that equal components, all as large as the
+    largest, would have."""
     candidate = equations.candidate
     eps = float(jnp.finfo(working_dtype(candidate)).eps)
     roundoff = eps * tree_max(candidate)
@@ -176,7 +177,8 @@ def _begin(
     start: Start | None,
     enabled: Bool[Array, ""],
 ) -> _Carry:
-    # All that a batch carries is batched from the start: else jax traces the body again to see it.
+    # All carried values are batched from the start; otherwise jax traces the body again to find out
+    # which are.
     zero = jnp.where(enabled, 0, 0)
     zeros = jtu.tree_map(lambda x: jnp.zeros_like(x) + zero.astype(x.dtype), before)
     one = 1 + zero.astype(jtu.tree_leaves(before)[0].dtype)
@@ -187,7 +189,7 @@ def _begin(
         y, multiplier, count = start
         required = _WELL_STARTED * equations.merit(before, scale)
         known = (count > 0) & (required < jnp.inf)
-        damping = jnp.where(known, 0.1 * damping, damping)  # so that it is one after a return
+        damping = jnp.where(known, 0.1 * damping, damping)  # which is one after a return
         merit = jnp.where(known, required, merit)
         best = best._replace(num_steps=zero + jnp.maximum(count - 1, 0))
     return _Carry(enabled, zero > 0, damping, merit, y, multiplier, best)

@@ -18,8 +18,8 @@ from .._custom_types import Y
 from .._tree import tree_dot, tree_mul, tree_scale, tree_sub, working_dtype
 from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
-# Up to this many constraints are unrolled: the ten integrals of gravitating bodies. Compile time
-# grows as m³, against a loop that costs some microseconds however small the matrix.
+# Up to this many constraints are unrolled, enough for the ten integrals of the N-body problem.
+# Unrolling makes compile time grow as m³; a loop costs some microseconds even for a small matrix.
 UNROLLED_MAX = 10
 _UNROLLED_IN_ARRAYS_MAX = 3
 
@@ -27,8 +27,8 @@ _UNROLLED_IN_ARRAYS_MAX = 3
 class AbstractJacobian(eqx.Module):
     """The rows `∂g_i/∂y` at one state, each shaped like the state."""
 
-    # How many iterations to make before asking whether they are needed. Enough for nearly every
-    # step of an integrator where they are cheap.
+    # The number of iterations that are made before convergence is tested. Where iterations are
+    # cheap, these are enough for nearly every step of an integrator.
     inline_steps: ClassVar[int] = 2
 
     @abc.abstractmethod
@@ -50,14 +50,14 @@ class AbstractJacobian(eqx.Module):
         """Solves with `G W Hᵀ`, where `H` is `other`, a Jacobian of the same kind, or `G`.
 
         Rows are divided by their largest element before they are multiplied, so that no product
-        overflows or vanishes whatever the units. `damping` is relative to the diagonal, to which it
-        is added.
+        overflows or underflows for any units. `damping` is relative to the diagonal, to which it is
+        added.
         """
 
     @abc.abstractmethod
     def unit_rows(self) -> tuple["AbstractJacobian", Vector]:
-        """The same with rows whose largest elements are one, where rows are formed, and what each
-        was divided by."""
+        """The Jacobian with each row divided by its largest element, and these divisors; unchanged
+        where rows are not formed."""
 
     @abc.abstractmethod
     def sines(self, weights: Y) -> Real[Array, " m"] | None:
@@ -104,7 +104,8 @@ class Unrolled(AbstractJacobian):
         return unrolled_solver(gram, damping).scaled(row_sizes, column_sizes)
 
     def sines(self, weights: Y) -> Real[Array, " m"]:
-        # Gram and Schmidt: squares of sines, as pivots are, would have half the digits.
+        # Gram-Schmidt, not the pivots of the Gram matrix: those are squares of sines, with half the
+        # digits.
         dtype = working_dtype(weights)
         roots = jtu.tree_map(jnp.sqrt, weights)
         basis: list[Y] = []
@@ -116,7 +117,7 @@ class Unrolled(AbstractJacobian):
             norms = [jnp.sqrt(tree_dot(x, x, dtype)) for x in (rest, row)]
             length, whole = (jnp.where(x > 0, x, 1) for x in norms)
             basis.append(tree_scale(1 / length, rest))
-            # A gradient that vanishes is parallel to none.
+            # A zero gradient counts as parallel to none.
             sines.append(jnp.where(norms[1] > 0, norms[0] / whole, 1))
         return jnp.stack(sines)
 
@@ -207,8 +208,8 @@ class Dense(AbstractJacobian):
 
 
 def _size(maxima: list[Array], always: bool) -> Array:
-    """The largest element of a row, or one if all are zero. In float64 products of elements
-    neither overflow nor vanish in usual units, so there it is one, unless `always`."""
+    """The largest element of each row, or one if all are zero. In float64 it is one unless
+    `always`, because products of elements neither overflow nor underflow in usual units."""
     dtype = working_dtype(maxima)
     if dtype == jnp.float64 and not always:
         return jnp.ones_like(maxima[0])
@@ -217,8 +218,8 @@ def _size(maxima: list[Array], always: bool) -> Array:
 
 
 def _contract(a: Array, b: Array) -> Array:
-    """`a @ b`, over the last axis of `a` and the first of `b`, for small arrays in a way that XLA
-    fuses and compiles into a loop around it."""
+    """The contraction of the last axis of `a` with the first of `b`. For small arrays it is written
+    so that XLA fuses it into the surrounding loop."""
     if a.size * b.size > _SMALL:
         return jnp.tensordot(a, b, axes=1, precision=lax.Precision.HIGHEST)
     axis = a.ndim - 1
@@ -229,19 +230,21 @@ def _contract(a: Array, b: Array) -> Array:
 _SMALL = 4096
 
 
-# The accuracy of one iterative solve. The iteration around it corrects what is left, so the total
-# number of inner iterations hardly depends on it.
+# The relative tolerance of one iterative solve. The outer iteration corrects the remaining error,
+# so the total number of inner iterations hardly depends on it.
 _SOLVE_RTOL = 1e-4
-# With two different Jacobians, how often the solve with one is corrected: to roundoff.
+# With two different Jacobians, the number of corrections of the solve with one of them, which reach
+# roundoff.
 _CORRECTIONS = 4
 
 
 @final
 class MatrixFree(AbstractJacobian):
-    """Only products: `G y` by forward mode, `Gᵀ λ` by reverse mode, solves by conjugate gradients.
+    """Uses products only: `G y` by forward mode, `Gᵀ λ` by reverse mode, solves by conjugate
+    gradients.
 
-    Memory is that of a few states. Norms of rows are estimates, good to about a third: see
-    `estimated_norms`.
+    It needs the memory of a few states. Norms of rows are estimates with a relative error of about
+    a third: see `estimated_norms`.
     """
 
     forward: Callable[[Y], Vector]
@@ -295,8 +298,8 @@ class MatrixFree(AbstractJacobian):
 def estimated_norms(linear: Callable[[Y], Vector], weights: Y) -> Vector:
     """The norms of the rows of `G diag(weights)`, where `linear` is `y ↦ G y`.
 
-    Estimated without forming a row: for random signs `s` the mean of `(G (weights s))²` is the
-    squared norm, so over 16 draws, always the same, it is good to about a third.
+    No row is formed: for random signs `s` the mean of `(G (weights s))²` is the squared norm. The
+    mean over 16 fixed draws has a relative error of about a third.
     """
     leaves, treedef = jtu.tree_flatten(weights)
     keys = jr.split(jr.key(0), len(leaves))

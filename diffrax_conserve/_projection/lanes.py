@@ -1,4 +1,4 @@
-"""A branch that few lanes of a batch take, at the cost of those few."""
+"""A branch that few lanes of a batch take, computed for those lanes only."""
 
 import functools as ft
 import math
@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Int
 
 _State = TypeVar("_State")
 
-# Lanes are gathered in up to so many blocks, each by itself, so that no block meets another: with a
-# batch that is sharded over that many devices nothing is sent between them.
+# Lanes are gathered separately in up to this many blocks, so that a batch sharded over as many
+# devices needs no communication between them.
 _BLOCKS = 32
-# One over the part of the lanes that is finished at a time, and the least number of them: of fewer
-# the arithmetic costs less than to start it.
+# The reciprocal of the fraction of lanes that is finished at a time, and the least number of such
+# lanes: for fewer lanes, starting the computation costs more than the arithmetic.
 _SHARES = 8
 _LEAST_WIDTH = 64
 
@@ -30,11 +30,11 @@ def continue_if_any(
     state: _State,
     operands: Any,
 ) -> _State:
-    """`fn(flag, state, operands)` if `flag` is set, and `state` if not.
+    """`fn(flag, state, operands)` if `flag` is set, otherwise `state`.
 
-    In a batch, the lanes whose flag is set are gathered, some at a time, finished by one copy of
-    `fn`, and put back. (A `lax.cond` in a batch runs both branches for every lane.) What `fn`
-    returns for a lane whose flag is not set is not used. It may close over no arrays.
+    In a batch, the lanes whose flag is set are gathered, some at a time, passed to `fn`, and
+    scattered back. (A `lax.cond` in a batch runs both branches for every lane.) The value of `fn`
+    for a lane whose flag is not set is not used. `fn` must not close over arrays.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
@@ -52,10 +52,10 @@ def continue_if_any(
         out = _lanes(flags, states, batch, shared)
         return out, jtu.tree_map(lambda _: True, out)
 
-    # The loop of a solve is traced more than once. Compiled functions are traced once.
+    # The loop of a solve is traced more than once, but a jitted function only once.
     finish = jax.jit(ft.partial(_finish, lane), inline=True)
 
-    # A batch of batches is one batch.
+    # A nested `vmap` is flattened to one batch.
     @jax.custom_batching.custom_vmap
     def _lanes(flags, states, batch, shared):
         def not_taken(flags, states, batch, shared):
@@ -67,7 +67,7 @@ def continue_if_any(
     def batch_of_batches(size, axes, flags, states, batch, shared):
         lanes = flags.shape[1 if axes[0] else 0]
         more, same = _split(shared, axes[3])
-        # What is shared by the lanes of each batch, but not by the batches, is repeated.
+        # Operands shared within each inner batch, but not across batches, are repeated.
         more = jtu.tree_map(lambda x: jnp.repeat(x, lanes, axis=0), more)
         flat = jtu.tree_map(
             lambda x: x.reshape(size * lanes, *x.shape[2:]),
@@ -105,7 +105,7 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
         start, states = carry
         index = lax.dynamic_slice_in_dim(order, start, width, axis=1)
 
-        # All blocks together, in one row: loops over short rows are slow.
+        # All blocks in one row, because loops over short rows are slow.
         def row_of(x: Array) -> Array:
             return jax.vmap(taken)(x, index).reshape(blocks * width, *x.shape[2:])
 
@@ -123,8 +123,8 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
 
 
 def _positions(flags: Bool[Array, " length"], size: int) -> Int[Array, " size"]:
-    """Where `flags` are set, and then an index that is out of range. As `jax.numpy.nonzero`, with
-    one cumulative sum less."""
+    """The indices of the set `flags`, padded with an index that is out of range. Like
+    `jax.numpy.nonzero`, with one cumulative sum less."""
     length = flags.shape[0]
     place = jnp.where(flags, jnp.cumsum(flags) - 1, size)
     return jnp.full(size, length).at[place].set(jnp.arange(length), mode="drop")
@@ -137,5 +137,5 @@ def _broadcast(size: int, axes: Any, tree: Any) -> Any:
 
 
 def _split(arrays: Any, axes: Any) -> tuple[Any, Any]:
-    """Those with an axis of lanes, and those without."""
+    """The arrays with an axis of lanes, and those without."""
     return eqx.partition(arrays, axes)

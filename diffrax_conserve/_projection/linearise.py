@@ -1,9 +1,9 @@
 """A residual to first order: its value and its constraint Jacobian at a state.
 
-`linearise` chooses the form of the Jacobian. Up to ten constraints of a small state come as
-scalars: each product, sum and 2×2 solve is plain elementwise arithmetic that XLA fuses into the
-step around it (a `linalg` call on a 2×2 matrix costs more than the step itself). More of them make
-a matrix. Of very many the rows are never formed.
+`linearise` chooses the form of the Jacobian. Up to ten constraints are handled as scalars: each
+product, sum and 2×2 solve is elementwise arithmetic that XLA fuses into the surrounding step (a
+`linalg` call on a 2×2 matrix costs more than the step itself). More constraints form a matrix. For
+more than `DENSE_MAX` the rows are never formed.
 
 A vector of `m` numbers (residuals, multipliers) is accordingly one array of shape `(m,)` or a tuple
 of `m` scalars. Code that uses one treats it as a PyTree.
@@ -25,8 +25,7 @@ from .scalars import elements_in_scalars
 
 Residual = Callable[[Y], Vector]
 
-# Above this many the gradients are never formed: what is needed of them is computed from products
-# with them.
+# Above this many constraints the gradients are never formed, only products with them.
 DENSE_MAX = 128
 
 
@@ -64,8 +63,8 @@ class Elements(eqx.Module):
 
     @classmethod
     def of(cls, residual: Joined, y: Y) -> "Elements":
-        # Of the parts, not of the whole: the gradient of an element of that would be made of the
-        # gradients of all parts, most of them times zero.
+        # Elements of the parts, not of the joined vector: the gradient of an element of that would
+        # contain the gradients of all parts, most of them multiplied by zero.
         sizes = [x.size for x in eqx.filter_eval_shape(residual.parts, y)]
 
         def element(part: int, i: int) -> Residual:
@@ -80,8 +79,8 @@ class Elements(eqx.Module):
 def written_out(
     residual: Joined, magnitude: Real[Array, " m"], y: Y
 ) -> tuple[Joined | Elements, Vector, Callable[[Y], Y], Callable[[Y], Y]]:
-    """The same residual and magnitude with scalars in the place of vectors, if they are few, and
-    of states, if they are small, and the maps to its states and back."""
+    """The same residual and magnitude as scalars if there are few constraints, with states as
+    scalars too if these are small; and the maps to the new form of the state and back."""
     if magnitude.size > UNROLLED_MAX:
         return residual, magnitude, _same, _same
     converted = elements_in_scalars(residual, y)
@@ -92,8 +91,8 @@ def written_out(
 
 
 def flattened(residual: Joined, y: Y) -> tuple[Joined, Callable[[Y], Y], Callable[[Y], Y]]:
-    """The same residual of states in one vector, if their dtypes agree, and the maps to it and
-    back: fewer operations, each on more numbers."""
+    """The same residual as a function of the state in one vector, if all leaves have one dtype, and
+    the maps to it and back. This gives fewer operations, each on more numbers."""
     if len({x.dtype for x in jtu.tree_leaves(y)}) > 1:
         return residual, _same, _same
     _, join = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, y))
@@ -105,5 +104,5 @@ def _same(y: Y) -> Y:
 
 
 def as_array(vector: Vector) -> Real[Array, " m"]:
-    """A vector in either form, of shape `(m,)`."""
+    """A vector of either form as an array of shape `(m,)`."""
     return jnp.stack(vector) if isinstance(vector, tuple) else vector

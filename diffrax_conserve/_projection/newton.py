@@ -1,4 +1,4 @@
-"""Newton's method for the nearest point: fresh Jacobians, damped. For candidates far away."""
+"""Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
 
 import functools as ft
 from typing import Any, ClassVar, final
@@ -49,20 +49,19 @@ class Newton(AbstractProjection):
 
     $$y = \hat y + M^{-1} G(y)^\top \lambda, \qquad g(y) = 0,$$
 
-    in two phases. First a Gauss-Newton iteration reaches the manifold, with a
-    damping $\min(10^{-2}, |g|^2)$ of the row-scaled Gram matrix, which vanishes with the
-    (relative) residual: it passes near points where gradients become parallel, and converges
-    quadratically elsewhere. Then Newton's method on both equations moves along the manifold to
-    the point nearest to the candidate. Where that fails, the result is the point that was reached
-    first: on the manifold, but not the nearest, and its derivative is NaN. The second phase costs
-    second derivatives of the constraint functions
-    and linear solves with all unknowns, so for the candidates of an integrator, which are close,
-    use [`diffrax_conserve.SimplifiedNewton`][].
+    in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
+    $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: the
+    iteration can pass near points where gradients are parallel, and converges quadratically
+    elsewhere. Then Newton's method on both equations moves along the manifold to the point nearest
+    to the candidate. If that fails, the result of the first phase is returned: it is on the
+    manifold, but not the nearest point, and its derivative is NaN. The second phase needs second
+    derivatives of the constraint functions and linear solves with all unknowns, so for the close
+    candidates of an integrator use [`diffrax_conserve.SimplifiedNewton`][].
 
-    Success is decided at the state that is returned, by the scale of the constraints there. The
-    result is differentiated by the implicit function theorem on both equations. Where the gradients
-    of the constraints are nearly parallel at the projected state, though not everywhere, the
-    derivative is NaN.
+    Success is judged at the returned state, relative to the scale of the constraints there. The
+    result is differentiated by the implicit function theorem for both equations. The derivative is
+    NaN where the gradients of the constraints are nearly parallel at the projected state but not
+    everywhere.
 
     !!! example
 
@@ -134,7 +133,7 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
     after, scale = residuals(y)
     outcome = Outcome.of(before, after, scale, equations.tolerance)
-    # Only that of the nearest point has a derivative.
+    # Only the multipliers of the nearest point have a derivative.
     reached_only = (outcome.result == optx.RESULTS.successful) & ~found
     multiplier = jnp.where(reached_only, jnp.nan, multiplier)
     rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
@@ -143,7 +142,7 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
 
 
 def _state_norm(unknowns: tuple[Y, Vector]) -> Array:
-    # Where gradients are nearly parallel the state is well determined, the multipliers are not.
+    # Where gradients are nearly parallel, only the state is well determined, not the multipliers.
     y, _ = unknowns
     return optx.max_norm(y)
 
@@ -160,13 +159,13 @@ def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -
 def _nearest(
     equations: Equations, start: Y, max_steps: int
 ) -> tuple[Y, Vector, Int[Array, ""], Bool[Array, ""]]:
-    """Newton's method on the optimality system, from a point of the manifold and the multipliers
-    that suit the candidate best there: the state, its multipliers, the number of steps, and whether
-    it arrived."""
+    """Newton's method on the optimality system, from a point of the manifold and its least-squares
+    multipliers. Returns the state, its multipliers, the number of steps, and whether it
+    converged."""
     residual, candidate, weights = equations.residual, equations.candidate, equations.weights
     _, jacobian = linearise(residual, start)
     offset = jacobian.pushforward(tree_sub(start, candidate))
-    # In units in which a linear solver sees the rank of the system.
+    # Scaled, so that a linear solver finds the right rank of the system.
     roots, norms = units(jacobian, weights)
     multiplier = jacobian.gram_solver(weights).solve(offset) * norms
 
@@ -177,8 +176,8 @@ def _nearest(
         return jtu.tree_map(jnp.divide, off, roots), g
 
     def tolerance(y: Y, multiplier: Vector) -> Array:
-        """How far off may be what is to be the nearest point. Multipliers of nearly parallel
-        gradients are large and cancel, up to their roundoff."""
+        """The tolerance for the optimality condition. It allows for the roundoff of the
+        multipliers, which are large and cancel where gradients are nearly parallel."""
         free = jtu.tree_map(lambda x, w: jnp.where(w > 0, x, 0), y, weights)
         return rtol * optx.max_norm(free) + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
 
@@ -201,7 +200,7 @@ def _nearest(
         throw=False,
     )
     y, multiplier = solution.value
-    # Judged there: at the start multipliers may be much smaller.
+    # Judged with the tolerance at the end, because multipliers may be much smaller at the start.
     off, _ = scaled((y, multiplier), parameters)
     arrived = optx.max_norm(off) <= tolerance(y, multiplier)
     return tree_mul(y, roots), multiplier / norms, solution.stats["num_steps"], arrived

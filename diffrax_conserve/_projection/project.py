@@ -1,4 +1,4 @@
-"""`project`: one state to the manifold. Also what the solver and the interpolation call."""
+"""`project`, and the function below it that the solver and the interpolation call."""
 
 from typing import Any
 
@@ -38,23 +38,22 @@ def project(
 ) -> tuple[State, ProjectionInfo]:
     r"""Projects one state to the manifold $\{y : g(t, y, args) = 0\}$.
 
-    Use it to make an initial state consistent, or to move a state to another value of its
-    integrals.
+    Use it to make an initial state consistent, or to change the values of its integrals.
 
     **Arguments:**
 
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `y`: the candidate, any PyTree of floating-point arrays, real or complex.
     - `t`, `args`: passed to the functions of the manifold.
-    - `value`: the conserved values: a PyTree like `manifold`, with what `fn` is to be kept at in
-        the place of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed
-        where each `FirstIntegral` has a `value` of its own.
-    - `projection`: how to get there. Default: `Newton()`, the nearest point.
+    - `value`: the conserved values: a PyTree like `manifold`, with the conserved value in the place
+        of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed if each
+        `FirstIntegral` has its own `value`.
+    - `projection`: the method. Default: `Newton()`, the nearest point.
 
     **Returns:**
 
     The state on the manifold, shaped like `y`, and a
-    [`diffrax_conserve.ProjectionInfo`][]. `info.result` says whether it succeeded: nothing is
+    [`diffrax_conserve.ProjectionInfo`][]. `info.result` tells whether it succeeded: nothing is
     raised at run time.
 
     **Raises:**

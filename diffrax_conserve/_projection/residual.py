@@ -1,8 +1,8 @@
-"""What a manifold asks of a state: residuals, and what roundoff in them is relative to.
+"""The residuals of a manifold, and the scales to which their roundoff is proportional.
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The scale of a scalar
 constraint at a state `y` is `|I₀| + Σ_k |y_k ∂g/∂y_k|`: the conserved value, and the terms that
-cancel in the residual. Success is judged by the scale at the state that is returned.
+cancel in the residual. Success is judged relative to the scale at the returned state.
 """
 
 import functools as ft
@@ -19,17 +19,17 @@ from .._tree import from_view, real_view, tree_max, working_dtype
 from .elimination import Vector
 from .linearise import Joined, linearise
 
-# What is accepted, in units of roundoff of the scale. Rounding the state and evaluating the
-# residual cost about one unit each, so nearly every projection ends well below; where gradients are
-# almost parallel, not much.
+# The accepted residual, in units of roundoff of the scale. Rounding the state and evaluating the
+# residual contribute about one unit each, so nearly every projection ends well below this; where
+# gradients are almost parallel, only just below.
 ROUNDOFF_MULTIPLE = 16
 
 
 def residual_of(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Joined, Real[Array, " m"]]:
-    """The residual as a function of the state, or of the `real_view` of a complex one, and the
-    absolute conserved values, as vectors."""
+    """The residual as a function of the state (of its `real_view` if it is complex), and the
+    absolute conserved values, both as vectors."""
     dtype = working_dtype(y)
 
     def parts(view: Y) -> list[Array]:
@@ -37,7 +37,7 @@ def residual_of(
         residuals = jtu.tree_map(lambda a, b: a - jnp.asarray(b, a.dtype), out, values)
         return [x.astype(dtype) for x in jtu.tree_leaves(residuals)]
 
-    # Whatever `fn` closes over becomes part of `residual`'s PyTree, and can be differentiated.
+    # Arrays over which `fn` closes become part of `residual`'s PyTree, and can be differentiated.
     residual = Joined(eqx.filter_closure_convert(parts, real_view(y)))
     outputs = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), y)
     magnitudes = jtu.tree_map(lambda a, b: jnp.abs(jnp.asarray(b, a.dtype)), outputs, values)
@@ -58,7 +58,7 @@ def measure(
     """The residuals at `y` and their scales there, both shaped like `values`.
 
     With `uniform`, the scales are those of a state whose components are all as large as the largest
-    of `y`: what a constraint on a component that is zero up to roundoff is to be compared with.
+    of `y`, so that a constraint on a component that is zero up to roundoff has a meaningful scale.
     """
     residual, magnitude = residual_of(manifold, values, t, y, args)
     view = real_view(y)
@@ -84,12 +84,12 @@ def relative(residual: PyTree[Array], scale: PyTree[Array]) -> PyTree[Array]:
 
 
 def largest(ratios: PyTree[Array]) -> Float[Array, ""]:
-    """The largest modulus of all, NaN if one is."""
+    """The largest modulus, or NaN if any element is NaN."""
     return ft.reduce(jnp.maximum, [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(ratios)])
 
 
 def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
-    """Whether every residual is within its tolerance, which NaN and infinity never are."""
+    """Whether every residual is within its tolerance. NaN and infinity never are."""
     satisfied = jtu.tree_map(
         lambda g, tol: jnp.all((jnp.abs(g) <= tol) & (tol < jnp.inf)), residual, tolerance
     )
@@ -97,7 +97,8 @@ def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
 
 
 class Tolerance(eqx.Module):
-    """Which residual counts as zero: `atol + rtol * scale`. By default `rtol` is roundoff."""
+    """The largest residual that counts as zero, `atol + rtol * scale`. The default of `rtol` is
+    `ROUNDOFF_MULTIPLE` units of roundoff."""
 
     rtol: float | Array | None
     atol: float | Array | None

@@ -1,9 +1,9 @@
 """Functions of small states, written out in scalars.
 
-A sum over three components, or a stack of them, ends a loop of XLA's: with a small state nearly
-every operation of a projection is a loop of its own, which costs more than what it computes. In
-scalars all is elementwise arithmetic that XLA fuses, along a batch as well. The functions are
-whatever the user wrote, so it is their jaxprs that are written out.
+XLA does not fuse across a sum or a stack of components: with a small state nearly every operation
+of a projection becomes a separate loop, whose overhead exceeds its arithmetic. In scalars
+everything is elementwise arithmetic, which XLA fuses, also in a batch. The functions are the
+user's, so their jaxprs are rewritten.
 """
 
 import functools as ft
@@ -25,14 +25,14 @@ from .._custom_types import Y
 
 Scalars = tuple[Array, ...]
 
-# Compile time grows with the number of scalar operations, of which the gradients take a multiple.
+# Compile time grows with the number of scalar operations, and gradients multiply that number.
 MAX_SCALARS = 32
 MAX_OPERATIONS = 512
 
 
 def written_out(fn: Callable[[Y], PyTree[Array]], y: Y) -> PyTree[Array]:
-    """`fn(y)`, computed in scalars if that is possible, and if it is so little that XLA may as
-    well compute all of it again for each element of the outcome, which it tends to do."""
+    """`fn(y)`, computed in scalars where that is possible and `fn` is small. The limit allows for
+    XLA's tendency to repeat the whole computation for each element of the result."""
     closed, out = jax.make_jaxpr(fn, return_shape=True)(y)
     leaves, treedef = jtu.tree_flatten(out)
     limit = MAX_OPERATIONS // max(1, sum(x.size for x in leaves))
@@ -46,10 +46,10 @@ def written_out(fn: Callable[[Y], PyTree[Array]], y: Y) -> PyTree[Array]:
 def elements_in_scalars(
     fn: Callable[[Y], Array], y: Y
 ) -> tuple[list[Callable[[Scalars], Array]], Callable[[Y], Scalars], Callable[[Scalars], Y]] | None:
-    """Each element of `fn`, whose values have shape `(m,)`, as a function of a tuple of scalars,
-    and the maps from states to those and back.
+    """Each element of `fn`, whose values have shape `(m,)`, as a function of a tuple of scalars;
+    and the maps from states to such tuples and back.
 
-    `None` for a function that is too large, or that uses a primitive which is not known here.
+    `None` if the function is too large or uses a primitive that is not supported here.
     """
     leaves, treedef = jtu.tree_flatten(y)
     shapes = [jnp.shape(x) for x in leaves]
@@ -68,7 +68,8 @@ def elements_in_scalars(
 
 
 def _element(closed: jex.ClosedJaxpr, i: int) -> Callable[[Scalars], Array]:
-    """Only what the `i`-th output needs, so that its gradient touches no more than that."""
+    """The `i`-th output as a function, with only the equations that it needs, so that its gradient
+    involves no others."""
     output = closed.jaxpr.outvars[i]
     needed, eqns = {output}, []
     for eqn in reversed(closed.jaxpr.eqns):
@@ -96,7 +97,7 @@ _Places = np.ndarray  # of integers
 
 
 class _NotWrittenOut(Exception):
-    """A primitive or a parameter that is not known here, or too many operations."""
+    """The function has an unsupported primitive or parameter, or too many operations."""
 
 
 _ELEMENTWISE_NAMES = """
@@ -126,10 +127,11 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
     "stack": lambda *xs, axis: np.stack(xs, axis),
     "transpose": lambda x, permutation: x.transpose(permutation),
 }
-# Precision and type may be asked for: a sum of products in the type of the state has both.
+# A requested precision or type may be ignored: the sum of products is computed in the type of the
+# state.
 _DOT = {"dimension_numbers", "precision", "preferred_element_type"}
-# What matrices of constants are mostly made by. Of jax's own operations each is compiled by itself,
-# which takes 30 ms.
+# The operations from which constant matrices are mostly built, in numpy: jax would compile each one
+# separately, in 30 ms.
 _ON_NUMBERS: dict[str, Callable[..., np.ndarray]] = {
     "add": lambda x, y, **_: x + y,
     "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
@@ -145,8 +147,8 @@ _ON_NUMBERS: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-# XLA evaluates a sine again in each loop that uses it, and a gradient has dozens of such loops. It
-# does not do this with a quotient, so the sine is divided by a one that XLA cannot recognise.
+# XLA recomputes a sine in each loop that uses it, and a gradient has dozens of such loops. It does
+# not recompute quotients, so the sine is divided by a 1 that XLA cannot simplify away.
 @jax.custom_jvp
 def _sin(x: Array) -> Array:
     return lax.sin(x) / _one(x)
@@ -185,7 +187,7 @@ class _WriteOut:
         try:
             outputs = self._jaxpr(self.closed.jaxpr, self.closed.consts, inputs)
         except (KeyError, TypeError) as error:
-            # Another version of jax: a parameter that was renamed, or one that is new.
+            # In another version of jax a parameter may have been renamed or added.
             raise _NotWrittenOut from error
         return [jnp.asarray(self.scalars[i]) for places in outputs for i in places.flat]
 
@@ -210,7 +212,7 @@ class _WriteOut:
             raise _NotWrittenOut
         if name == "jit":
             return self._jaxpr(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
-        # An option that is not set does nothing.
+        # Parameters that are `None` have no effect.
         given = {key: value for key, value in params.items() if value is not None}
         if name == "unstack" and given.keys() == {"axis"}:
             return [np.asarray(x) for x in np.moveaxis(inputs[0], params["axis"], 0)]
@@ -232,7 +234,8 @@ class _WriteOut:
         return all(isinstance(self.scalars[i], np.generic) for i in places.flat)
 
     def _fold(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
-        """Of constants, at once: where a matrix is made from its indices, say."""
+        """Evaluates an equation of constants now, for example where a matrix is built from its
+        indices."""
         arrays = [
             np.array([self.scalars[i] for i in places.flat], _dtype(var)).reshape(places.shape)
             for places, var in zip(inputs, eqn.invars, strict=True)

@@ -1,5 +1,5 @@
-"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4: the direction is frozen at
-the candidate. For candidates that are as close as an integrator's local error."""
+"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, with the constraint Jacobian
+frozen at the candidate, for candidates as close as an integrator's local error."""
 
 import dataclasses
 import functools as ft
@@ -54,16 +54,16 @@ class SimplifiedNewton(AbstractProjection):
 
     $$\lambda \leftarrow \lambda - (G M^{-1} G^\top)^{-1} g(\hat y + M^{-1} G^\top \lambda),$$
 
-    which gain as many digits each as the step of the integrator has. That is enough for nearly
-    every step. Where it is not, the Gram matrix is computed anew in each further iteration, from
-    the Jacobian at the last state, and a step that does not reduce the residual is damped. For
-    candidates far away use [`diffrax_conserve.Newton`][].
+    each of which gains as many digits as the step of the integrator has. This is enough for nearly
+    every step. Otherwise each further iteration computes the Gram matrix again from the Jacobian at
+    the last state, and damps a step that does not reduce the residual. For candidates far away use
+    [`diffrax_conserve.Newton`][].
 
-    Success is decided at the state that is returned, by the scale of the constraints there.
+    Success is judged at the returned state, relative to the scale of the constraints there.
 
-    The result is differentiated by the implicit function theorem applied to $\lambda$: exactly for
-    the state that is returned, however many iterations were made. Where the gradients of the
-    constraints are so nearly parallel that roundoff would spoil the derivative, it is NaN.
+    The result is differentiated by the implicit function theorem for $\lambda$. The derivative is
+    exact for the returned state, independent of the number of iterations. It is NaN where the
+    gradients of the constraints are so nearly parallel that roundoff would dominate it.
 
     !!! example
 
@@ -118,10 +118,11 @@ def _project_alone(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, 
 
 # The state, the multipliers, the number of iterations and the verdict.
 _State = tuple[Y, Vector, Int[Array, ""], Outcome]
-# Up to so many products in a Gram matrix, further iterations are in scalars too. They are 1.6 to 7
-# times as fast (rigid bodies, a busy machine), but compile longer the larger that number.
+# Up to this many products in a Gram matrix, further iterations are computed in scalars too. They
+# are then 1.6 to 7 times as fast (rigid bodies, a busy machine), but compile time grows with this
+# number.
 _RARE_SCALARS_MAX = 64
-# How many starts between the candidate and the anchor are tried.
+# The number of starts between the candidate and the anchor that are tried.
 _STARTS = 8
 
 
@@ -142,32 +143,32 @@ def _project(
         last = g
         g, at_y = linearise(inline.residual, y)
     scale = inline.scale(at_y, y)
-    # XLA may compute `y` twice, for `g` and for the result, and round it in two ways. After a large
-    # correction whose terms cancel these would be different states.
+    # XLA may compute `y` twice, for `g` and for the result, with different rounding. After a large
+    # correction whose terms cancel, these would be different states.
     roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
     small = inline.tolerance(
         jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
     )
     close = within(last, tree_scale(roundoff ** (-2 / 3), small))
     done = close & inline.safely_satisfied(g, scale)
-    # Few steps need more. These linearise again: if they shared what is known here, it would be
-    # written to memory at every step of the solve.
+    # The few steps that need more iterations linearise again: sharing the values known here would
+    # write them to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
     finish = ft.partial(_finish, max_steps)
     y, multiplier, count, outcome = continue_if_any(finish, ~done, state, (equations, anchor))
-    # What follows is computed only where somebody asks for it.
+    # The rest is computed only if the report is used.
     after, at_y = linearise(equations.residual, y)
     scale, rank = equations.scale(at_y, y), gram_solver.rank
     info = report(outcome, count, equations.candidate, y, as_array(before), after, scale, rank)
     return y, multiplier, info
 
 
-# The same equations in another form, and the maps to its states and back.
+# The same equations in another form, and the maps to the new form of the state and back.
 _Converted = tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]
 
 
 def _in_scalars(equations: Equations) -> _Converted:
-    """In scalars, if they are few and small."""
+    """The equations in scalars, if they are few and small."""
     assert isinstance(equations.residual, Joined)
     residual, magnitude, split, join = written_out(
         equations.residual, equations.magnitude, equations.candidate
@@ -176,7 +177,7 @@ def _in_scalars(equations: Equations) -> _Converted:
 
 
 def _in_vectors(equations: Equations) -> _Converted:
-    """With a state in one array."""
+    """The equations with the state in one vector."""
     assert isinstance(equations.residual, Joined)
     residual, split, join = flattened(equations.residual, equations.candidate)
     return _of_states(equations, residual, split), split, join
@@ -200,9 +201,10 @@ def _finish(
     state: _State,
     operands: tuple[Equations, Y | None],
 ) -> _State:
-    """Further iterations, from `state`; none unless `unfinished`.
+    """Further iterations from `state`, if `unfinished`.
 
-    With an anchor, a state near the manifold, they start again halfway to it where they fail.
+    With an anchor, a state near the manifold, iterations that fail are restarted halfway to the
+    anchor.
     """
     equations, anchor = operands
 
@@ -253,7 +255,7 @@ def _from_between(
         y, multiplier, count, outcome = attempt(
             dataclasses.replace(equations, candidate=candidate), start, unfinished
         )
-        # The derivative is that of the projection of the candidate, which this is not.
+        # Only the projection of the original candidate has a derivative.
         multiplier = jnp.where(index == 0, multiplier, jnp.nan)
         failed = outcome.result != optx.RESULTS.successful
         state = y, multiplier, count, outcome
@@ -293,7 +295,7 @@ def _project_jvp(primals, tangents, *, max_steps):
     gram_solver = at_y.gram_solver(equations.weights, at_candidate)
     t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
     t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
-    # Of a projection that failed nobody asks for the derivative: its step is rejected, or ends all.
+    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
     factor = jnp.where(info.ok, certain(equations, y, at_y), 1)
     t_y = tree_scale(lax.stop_gradient(factor), t_y)
     return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

@@ -1,4 +1,4 @@
-"""Projection part by part: positions, then velocities."""
+"""Projection in stages, for example positions first and then velocities."""
 
 import dataclasses
 from typing import Any, ClassVar, final
@@ -18,12 +18,12 @@ from .project import check_metric, inverse_metric
 class Staged(AbstractProjection):
     r"""Projects to the parts of a manifold in a given order, later ones with the earlier ones held.
 
-    Stage $k$ takes the result of the one before to the set where the parts $1, \dots, k$ hold, by
-    its own projection in its own metric. An infinite weight freezes its component there. So
-    positions are projected first, with the velocities frozen, and then the velocities with the
-    positions frozen, so that errors of the velocities do not move the positions. Measure it: on a
-    pendulum at tolerance 1e-7 it is 19 times as accurate as the joint projection with Tsit5, as
-    accurate with Dopri5, and less so with Kvaerno5.
+    Stage $k$ projects the result of the previous stage to the set where the parts $1, \dots, k$
+    hold, by its own projection in its own metric. An infinite weight freezes its component in that
+    stage. For example, positions are projected first with the velocities frozen, then velocities
+    with the positions frozen, so that errors of the velocities do not move the positions. Compare
+    it with the joint projection for your problem: on a pendulum at tolerance 1e-7 it is 19 times as
+    accurate with Tsit5, equally accurate with Dopri5, and less accurate with Kvaerno5.
 
     !!! example
 
@@ -43,7 +43,7 @@ class Staged(AbstractProjection):
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), manifold, projection=staged)
         ```
 
-    Success is decided for all parts at the state that is returned.
+    Success is judged for all parts at the returned state.
 
     ??? cite "Reference"
 
@@ -100,8 +100,8 @@ Staged.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` if a stage is no such pair; `ValueError`, when it is used and before anything is
-compiled, if the keys are not those of the manifold.
+`TypeError` if a stage is not such a pair; `ValueError`, when it is used and before compilation, if
+the keys are not those of the manifold.
 """
 
 
@@ -116,7 +116,7 @@ def _key(entry: Any) -> Any:
 
 
 def _part(problem: Problem, wanted: list[bool]) -> Problem:
-    """The same problem, of some of the leaves of its values."""
+    """The problem restricted to the wanted leaves of its values."""
     sizes = [jnp.size(x) for x in jtu.tree_leaves(problem.values)]
     rows = [i for size, want in zip(sizes, wanted, strict=True) for i in [want] * size]
     parts = _Chosen(problem.residual.parts, tuple(wanted))

@@ -1,4 +1,4 @@
-"""What a projection may know about the step whose candidate it projects."""
+"""The step whose candidate is projected, as far as a projection may use it."""
 
 import dataclasses
 from typing import Any, final
@@ -14,16 +14,16 @@ from .._tree import real_view
 class Step(eqx.Module):
     r"""The step of a solve in which a projection is called.
 
-    All times are those of the vector field, also in a solve backwards in time, where `t1 < t0`. At
-    a saved time inside the step, and in dense output, it is the same step: the candidate is then
-    the dense output at `Problem.t`.
+    All times are those of the vector field; in a solve backwards in time `t1 < t0`. At a saved time
+    inside the step and in dense output this is the same step, and the candidate is the dense output
+    at `Problem.t`.
 
     **Attributes:**
 
     - `t0`, `t1`: where the step starts, and where it ends; the step size is `t1 - t0`.
     - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
-    - `error`: the error estimate of the wrapped solver at `t1`, shaped like the state, or `None`
-        where it has none.
+    - `error`: the error estimate of the wrapped solver at `t1`, shaped like the state, or `None` if
+        the solver has none.
     """
 
     t0: RealScalarLike
@@ -34,7 +34,8 @@ class Step(eqx.Module):
     direction: RealScalarLike
 
     def view(self) -> "Step":
-        """The same as a projection sees it: its states are those of `real_view`."""
+        """The step in the form in which a projection gets it, with `real_view` applied to its
+        states."""
         return dataclasses.replace(self, y0=real_view(self.y0), error=real_view(self.error))
 
     def evaluate(self, t: RealScalarLike) -> Any:
@@ -46,6 +47,6 @@ class Step(eqx.Module):
 
         **Returns:**
 
-        The state there, a candidate.
+        The state at `t`, a candidate.
         """
         return real_view(self.path.evaluate(t * self.direction))

@@ -1,4 +1,4 @@
-"""Vector fields made tangent to a manifold, and with them the forces of constraints."""
+"""Vector fields made tangent to a manifold, and the forces of constraints."""
 
 import math
 from collections.abc import Callable
@@ -38,42 +38,43 @@ def tangent(
     metric: PyTree[ArrayLike] | None = None,
     gain: float | Array = 0.0,
 ) -> "TangentField":
-    r"""The vector field less its component across a manifold.
+    r"""The vector field minus its normal component, so that it is tangent to a manifold.
 
     For $f$, the residual $g$ of the manifold with $G = \partial g/\partial y$, and the metric $M$,
 
     $$y' = f + M^{-1} G^\top \lambda, \qquad
     G M^{-1} G^\top \lambda = -(\partial_t g + G f + \text{gain} \cdot g),$$
 
-    so that along a solution $g' = -\text{gain} \cdot g$: it stays what it is, or with a `gain` it
+    so that along a solution $g' = -\text{gain} \cdot g$: the residual is constant, or with a `gain`
     decays (Baumgarte's stabilisation; the stabilised neural equations of White et al.). The field
-    is nearest to $f$ in the metric, and differentiable.
+    is the nearest to $f$ in the metric with this property, and differentiable.
 
     **Mechanisms.** For positions $q$ and velocities $v$ with masses $m$ and forces $F$ let
-    $f = (v, F/m)$, take the constraint of the velocities that
-    [`diffrax_conserve.Constraint.derivative`][] makes of that of the positions, and the metric
-    $(\infty, m)$: then $m v' = F + G^\top \lambda$, the equations of motion, whose
-    `multipliers` are the forces of the constraints. A projection of the solution of $f$ does not
-    solve them. See "Constrained mechanics" in the guide.
+    $f = (v, F/m)$, take the velocity constraint that [`diffrax_conserve.Constraint.derivative`][]
+    derives from the position constraint, and the metric $(\infty, m)$: then
+    $m v' = F + G^\top \lambda$, the equations of motion, whose `multipliers` are the forces of the
+    constraints. Projecting the solution of $f$ does not solve these equations. See "Constrained
+    mechanics" in the guide.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
-    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same
-        arguments. A `FirstIntegral` with a `rate` gets that.
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same arguments. A
+        `FirstIntegral` with a `rate` changes at that rate.
     - `metric`: a PyTree like the state of positive weights, scalars or arrays shaped like the
-        leaves. An infinite weight leaves its component of the field alone. Default: Euclidean.
-    - `gain`: how fast the residual decays, in units of one over time; for a solve backward in time
-        negative.
+        leaves. An infinite weight leaves its component of the field unchanged. Default: Euclidean.
+    - `gain`: the decay rate of the residual, in units of one over time; negative for a solve
+        backward in time.
 
     **Returns:**
 
-    A [`diffrax_conserve.TangentField`][], which is called as `vector_field` is.
+    A [`diffrax_conserve.TangentField`][], which is called like `vector_field`.
 
     **Raises:**
 
     `TypeError` or `ValueError` if an argument does not fit, or if a `gain` is given for a
-    `FirstIntegral` without a `value`; and, when it is called, if the field is not like the state.
+    `FirstIntegral` without a `value`; and, when it is called, if the value of the field is not
+    shaped like the state.
 
     !!! example
 
@@ -122,7 +123,7 @@ def tangent(
 
 @final
 class TangentField(eqx.Module):
-    """A vector field less its component across a manifold; see [`diffrax_conserve.tangent`][].
+    """A vector field made tangent to a manifold; see [`diffrax_conserve.tangent`][].
 
     Call it as any vector field, `field(t, y, args)`.
     """
@@ -137,7 +138,7 @@ class TangentField(eqx.Module):
         return tree_add(slope, correction)
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Values:
-        r"""The multipliers $\lambda$, in a mechanism the forces of its constraints.
+        r"""The multipliers $\lambda$; in a mechanism they are the forces of the constraints.
 
         **Arguments:**
 
@@ -145,13 +146,13 @@ class TangentField(eqx.Module):
 
         **Returns:**
 
-        A PyTree like the values of the functions of the manifold.
+        A PyTree shaped like the values of the functions of the manifold.
         """
         _, _, multiplier = self._solve(t, y, args)
         return multiplier
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
-        """The given field, what is added to it, and the multipliers."""
+        """The given field, the correction that is added to it, and the multipliers."""
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
         check_metric(self.metric, y)
@@ -166,7 +167,7 @@ class TangentField(eqx.Module):
         g, jacobian = linearise(inline, split(view))
         weights = split(inverse_metric(self.metric, view))
         wrong = tuple(wrong) if isinstance(g, tuple) else wrong
-        # Nobody judges the result, so no product may leave the range of the dtype.
+        # The result is not checked, so no product may overflow or underflow.
         rows, sizes = jacobian.unit_rows()
         solution = rows.gram_solver(weights).solve(jtu.tree_map(jnp.divide, wrong, sizes))
         correction = from_view(join(tree_mul(rows.pullback(solution), weights)), y)
@@ -174,7 +175,8 @@ class TangentField(eqx.Module):
         return slope, correction, shaped(as_array(multiplier), values)
 
     def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
-        """`-(∂g/∂t + G f + gain g)`, less the rates that are meant."""
+        """`rate - (∂g/∂t + G f + gain g)`, where `rate` is that of a balance law and otherwise
+        zero."""
         t = jnp.asarray(t, jnp.result_type(float, t))
 
         def residuals(t: RealScalarLike, y: Y) -> Values:

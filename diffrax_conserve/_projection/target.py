@@ -1,4 +1,4 @@
-"""What a solver projects to, and on which terms: the same at the end of a step and inside it."""
+"""The target of the projections of a solver, shared by the end of a step and its inside."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,20 +16,20 @@ from .base import AbstractProjection, Outcome, ProjectionInfo
 from .project import apply, relative_residual
 from .step import Step
 
-# diffrax traces a step three times, but what is compiled on its own is traced once.
+# diffrax traces a step three times; a jitted function is traced only once.
 _apply = eqx.filter_jit(apply)
 
 
 class Target(eqx.Module):
-    """Everything that a projection needs but the time and the candidate.
+    """Everything that a projection needs except the time and the candidate.
 
     **Attributes:**
 
     - `direction`: -1 where the solver's time is the negative of the manifold's.
-    - `gained`: what the rates of the manifold have added to `values` since the solve began.
+    - `gained`: the integrals of the rates of the manifold since the start of the solve.
     - `limit`: a larger correction is a failure.
-    - `threshold`: a candidate whose relative residual is not larger is left as it is.
-    - `due`: if not set, any finite candidate is left as it is.
+    - `threshold`: a candidate whose relative residual is at most this is not projected.
+    - `due`: if false, no finite candidate is projected.
     """
 
     projection: AbstractProjection
@@ -44,13 +44,14 @@ class Target(eqx.Module):
 
     @property
     def now(self) -> Values:
-        """The conserved values that hold now."""
+        """The current conserved values."""
         return self.values if self.gained is None else tree_add(self.values, self.gained)
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
     ) -> "Target":
-        """The same at the end of a step or inside it, to which `path` leads from its start."""
+        """The target at `end`, at the end of a step or inside it, given the `path` of the solution
+        from `start`."""
         if self.gained is None:
             return self
         gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
@@ -64,7 +65,7 @@ class Target(eqx.Module):
         error: Y | None,
         path: Callable[[], dfx.AbstractLocalInterpolation],
     ) -> Step | None:
-        """What a projection that asks for it may know about the step."""
+        """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
         if not self.projection.sees_step:
             return None
         start, end = start * self.direction, end * self.direction
@@ -98,7 +99,7 @@ class Target(eqx.Module):
         return _apply(self.projection, self.manifold, now, t, candidate, args, anchor, step)
 
     def too_far(self, info: ProjectionInfo) -> Bool[Array, ""]:
-        """Whether a projection that succeeded moved the state further than it may."""
+        """Whether a successful projection moved the state by more than `limit`."""
         if self.limit is None:
             return jnp.asarray(False)
         return info.ok & ~(info.correction <= self.limit)

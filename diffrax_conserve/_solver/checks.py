@@ -1,4 +1,4 @@
-"""What the arguments of a `ManifoldProjection` must be, and the solver inside others."""
+"""Checks of the arguments of a `ManifoldProjection`, and the innermost of nested solvers."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -23,7 +23,7 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
 
 
 def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    # `HalfSolver` does not forward these itself.
+    # `HalfSolver` does not forward the root finder and its options.
     while issubclass(type(solver), dfx.AbstractWrappedSolver):
         solver = solver.solver  # pyright: ignore
     return solver

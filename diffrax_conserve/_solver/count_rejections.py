@@ -1,4 +1,4 @@
-"""A step-size controller that counts what a solver cannot: steps rejected because of projection."""
+"""A step-size controller that counts the steps rejected because a projection failed."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -11,7 +11,7 @@ from jaxtyping import Array, Int, PyTree
 
 from .._custom_types import VF, Args, IntScalarLike, RealScalarLike, Y
 
-# How a projection that failed marks the error estimate: for controllers as large as infinity.
+# The error estimate of a step whose projection failed. Controllers treat it like infinity.
 FAILED_PROJECTION = -jnp.inf
 
 
@@ -19,9 +19,9 @@ FAILED_PROJECTION = -jnp.inf
 class CountRejections(dfx.AbstractAdaptiveStepSizeController[Any, Any]):
     """Counts the steps that an adaptive controller rejects because a projection failed.
 
-    diffrax discards the solver state of a rejected step, but not the controller's, so they are
-    counted here. [`diffrax_conserve.statistics`][] reports the count if the state is saved.
-    Otherwise the solve is that of the wrapped controller.
+    diffrax discards the solver state of a rejected step, but not the controller state, so these
+    steps are counted in the latter. [`diffrax_conserve.statistics`][] reports the count if that
+    state is saved. Everything else is done by the wrapped controller.
 
     !!! example
 

@@ -1,13 +1,13 @@
-"""What only private names of diffrax give: no other file touches one.
+"""All uses of private names of diffrax; no other file imports one.
 
-`WrapTerm` alone tells a solver that `t1 < t0`, where `diffeqsolve` negates its times, and
-`AdjointTerm` that it is called by `BacksolveAdjoint`, whose state is not on the manifold.
+Only by `WrapTerm` can a solver tell that `t1 < t0`, where `diffeqsolve` negates its times, and only
+by `AdjointTerm` that it is called by `BacksolveAdjoint`, whose state is not on the manifold.
 
 `register` adds messages of our own to diffrax's list of results. A step reports its failure by a
-member of `diffrax.RESULTS`, which diffrax turns into an error where the solve really ends. Its own
-members speak of implicit solvers. So messages are added to the end of its list, once, when a module
-of this package is imported: the list is the same in every process, and an index into it means the
-same in a pickled solution and in a cached compiled program.
+member of `diffrax.RESULTS`, which diffrax turns into an error if the solve ends with it. The
+messages of its own members are about implicit solvers. Ours are appended to its list once, when
+this package is imported, so the list is the same in every process, and an index into it has the
+same meaning in a pickled solution and in a cached compiled program.
 """
 
 import diffrax as dfx
@@ -19,7 +19,7 @@ from .._custom_types import IntScalarLike
 
 
 def register(*messages: str) -> int:
-    """The index of the first of `messages`, which are added. Call it when a module is imported."""
+    """Appends `messages` and returns the index of the first. Call it when a module is imported."""
     known = getattr(dfx.RESULTS, "_index_to_message", None)
     if not isinstance(known, list):
         raise ImportError(
@@ -32,6 +32,6 @@ def register(*messages: str) -> int:
 
 
 def member(index: IntScalarLike) -> dfx.RESULTS:
-    """The result at an index of the list."""
+    """The result with the given index in the list."""
     kind = type(dfx.RESULTS.successful)
     return kind(jnp.asarray(index, jnp.int32), dfx.RESULTS)  # pyright: ignore

@@ -14,7 +14,7 @@ from .._projection import ProjectionInfo
 from .diffrax_private import member, register
 from .initial import FINE, Initial
 
-# Of a manifold with more entries, the others are not told apart.
+# The entries of a manifold from this position on share one message.
 _POSITIONS = 16
 
 _STEP, _START = "the projection of a step failed: ", "the solve cannot start: "
@@ -44,7 +44,7 @@ _CAUSES = (
     "Compare it with difference quotients, by `jax.test_util.check_grads` for example.",
 )
 _NONFINITE, _TOO_FAR, _DIVERGED, _UNSATISFIED = range(4)
-# The causes of `initial.py`, from the first that is not fine.
+# The index of the first cause from `initial.py` other than `FINE`.
 _INITIAL = 4
 
 
@@ -66,13 +66,13 @@ def failure(
     manifold: Manifold,
     values: Values,
 ) -> dfx.RESULTS:
-    """The result of a step whose projection failed as `info` says, moved the state `too_far`, or
-    whose solve started where it cannot."""
+    """The result of a step whose projection failed as `info` reports or moved the state `too_far`,
+    or whose solve has an invalid initial state."""
     treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
     sizes = [
         sum(jnp.size(x) for x in jtu.tree_leaves(entry)) for entry in treedef.flatten_up_to(values)
     ]
-    # Written out: this is computed at every step, needed or not.
+    # Written out, because it is computed at every step.
     position = jnp.asarray(0, jnp.int32)
     for end in itertools.islice(itertools.accumulate(sizes[:-1]), _POSITIONS):
         position = position + (info.worst >= end).astype(jnp.int32)

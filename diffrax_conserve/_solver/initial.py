@@ -1,4 +1,4 @@
-"""What is wrong with an initial state: the solve then ends with its first step."""
+"""The check of the initial state: if it fails, the solve ends with its first step."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,9 +16,9 @@ FINE, NOT_FINITE, VIOLATED, UNREACHABLE, WRONG_JACOBIAN = range(5)
 
 
 class Initial(eqx.Module):
-    """The verdict on an initial state: one of the causes above, the position of the entry of the
-    manifold that is to blame, and how far the first step may move the state because a `value` is
-    not that of the initial state."""
+    """The verdict on an initial state: one of the causes above, the position of the responsible
+    entry of the manifold, and how far the first projection must move the state to a `value` that
+    differs from that of the initial state."""
 
     cause: Int[Array, ""]
     position: Int[Array, ""]
@@ -37,7 +37,7 @@ def judge(
     relative to the size of its terms; smaller ones are removed by the first step. A first integral
     with a `value` of its own may start elsewhere, if that value can be reached from there. A
     `jacobian` that is given must agree with difference quotients."""
-    # A verdict has no derivative, and that of a Jacobian may not exist.
+    # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
     manifold, values, t, y, args = tree_stop_gradient((manifold, values, t, y, args))
     dtype = working_dtype(y)
     limit = jnp.finfo(dtype).eps ** 0.5
@@ -61,7 +61,7 @@ def judge(
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)
     if any(given):
-        if projection.sees_step:  # of which there is none yet
+        if projection.sees_step:  # there is no step yet
             projection = SimplifiedNewton(metric=projection.metric)
         _, info = apply(projection, manifold, values, t, y, args)
         unreachable = (cause == FINE) & ~info.ok

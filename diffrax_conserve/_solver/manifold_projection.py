@@ -52,12 +52,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     for the first integrals $I$ and the constraints $g$ of `manifold`. Dense output, saved times and
     events are projected in the same way. The conserved values are computed once, at the start of
     the solve, and carried in the solver state, so that the drift does not grow with the number of
-    steps; a solve that continues from a `solver_state` keeps the first values.
+    steps; a solve that continues from a `solver_state` keeps the original values.
 
     The projected method has the order of the wrapped one. A wrapped solver that reuses its last
-    stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the one at the
-    candidate. To evaluate it again at the projected state costs one evaluation more a step, and did
-    not pay: on five systems the errors were the same to within 20 % at tolerance 1e-8, and to
+    stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the stage at the
+    candidate. Evaluating it again at the projected state costs one more evaluation per step without
+    a clear gain: on five systems the errors were the same to within 20 % at tolerance 1e-8, and to
     within a factor of 2.3 at 1e-5, some larger, some smaller
     (`benchmarks/studies/first_same_as_last.py`).
 
@@ -66,12 +66,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     [`diffrax_conserve.project`][]), if a function is not finite there, or if a `value` cannot be
     reached from there.
 
-    A projection that fails (no convergence, NaN, a correction larger than `max_correction` allows)
-    makes an adaptive solve reject the step and try a smaller one, until the candidate has hardly
-    moved from the last state; then the solve ends, as with fixed steps it does at once, with a
-    `diffrax.RESULTS` whose message gives the position of the constraint that is farthest off:
-    [`diffrax_conserve.entry_name`][] names it. [`diffrax_conserve.statistics`][] tells what the
-    projections did.
+    If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
+    an adaptive solve rejects the step and tries a smaller one, until the candidate is very close to
+    the last state; then the solve ends. A solve with fixed steps ends at once. The message of the
+    `diffrax.RESULTS` gives the position of the entry with the largest residual;
+    [`diffrax_conserve.entry_name`][] returns its name. [`diffrax_conserve.statistics`][] summarises
+    the projections.
 
     !!! example
 
@@ -100,7 +100,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
     !!! warning
 
-        To keep one integral is not always better than to keep none: see "Choosing a projection".
+        Conserving one integral is not always better than conserving none: see "Choosing a
+        projection".
 
     ??? cite "Reference"
 
@@ -137,7 +138,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
-    # off the wrapper. `Any`: `equinox.tree_at` puts placeholders in the place of values.
+    # attributes from the wrapper. They are `Any` because `equinox.tree_at` replaces values by
+    # placeholders.
 
     @property
     def term_structure(self) -> Any:  # pyright: ignore
@@ -221,7 +223,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             terms, t0, t1, y0, args, solver_state.inner, made_jump
         )
         start = self._target(terms, t1, y0, candidate, args, solver_state)
-        # Called only where something is asked of it.
+        # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, y0, error, path)
@@ -258,12 +260,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         )
 
     def _limit(self, y0: Y, candidate: Y, offset: Array) -> Array | None:
-        """The largest correction that is allowed in a step from `y0` to `candidate`."""
+        """The largest allowed correction in a step from `y0` to `candidate`."""
         if self.max_correction is None:
             return None
         dtype = working_dtype(candidate)
         moved, size = tree_norm(tree_sub(candidate, y0)), tree_norm(candidate)
-        # A correction as small as this is no jump, however short the step.
+        # A correction this small is allowed however short the step.
         harmless = jnp.finfo(dtype).eps ** 0.5 * size
         allowed = jnp.asarray(self.max_correction, dtype) * self.every
         return jnp.where(jnp.isinf(allowed), jnp.inf, allowed * moved + harmless + 2 * offset)
@@ -276,7 +278,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
 
 def _is_hopeless(initial: Initial, y0: Y, candidate: Y) -> Array:
-    """Whether smaller steps cannot help a projection that failed: its candidate hardly moved."""
+    """Whether a failed projection cannot succeed with smaller steps, because the candidate is
+    already very close to `y0` or the initial state is invalid."""
     dtype = working_dtype(candidate)
     little = max(1e-5, 16 * float(jnp.finfo(dtype).eps))
     moved = tree_norm(tree_sub(candidate, y0))
@@ -284,9 +287,9 @@ def _is_hopeless(initial: Initial, y0: Y, candidate: Y) -> Array:
 
 
 def _judged(error: Y | None, success: BoolScalarLike, hopeless: BoolScalarLike) -> Y | None:
-    """The error estimate of a step, infinite if the projection failed, so that an adaptive solve
-    tries a smaller step; and zero if that is hopeless, so that it accepts the step, whose result
-    then ends the solve."""
+    """The error estimate of a step. If the projection failed it is infinite, so that an adaptive
+    solve tries a smaller step; if that is hopeless it is zero, so that the step is accepted and its
+    result ends the solve."""
     failed = jnp.where(hopeless, 0.0, FAILED_PROJECTION)
     return jtu.tree_map(lambda e: jnp.where(success, e, failed.astype(e.dtype)), error)
 
@@ -295,21 +298,21 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
-- `projection`: how to return to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
+- `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
     `Directional`, or your own.
-- `max_correction`: a projection fails if it moves the candidate by more than this times the length
-    of the step, $\|\hat y - y_n\|$ (and by more than $\sqrt\varepsilon \|\hat y\|$), in the
+- `max_correction`: a projection fails if it moves the candidate by more than this times the
+    distance covered by the step, $\|\hat y - y_n\|$ (plus $\sqrt\varepsilon \|\hat y\|$), in the
     Euclidean norm. It guards against landing on another component of the manifold, and against
     quantities that are not conserved: 0.5 is a sensible value, since corrections are as short as
     the local error of the wrapped solver. Default: no limit. The first projection may also move the
-    state to a `value` that is not that of the initial state. With `every`, the limit is as many
-    times larger. There is none in stochastic equations, whose noise may leave the manifold as fast
-    as it moves the state.
-- `threshold`: leave a step as it is while its largest residual, relative to the scale of its
-    constraint, is not larger than this. Dense output is treated in the same way. Default: project
-    every step.
-- `every`: project every so many steps only. In the others neither the state nor dense output is
-    projected, so that a solve that ends in between ends off the manifold.
+    state to a `value` that is not that of the initial state. With `every`, the limit is multiplied
+    by it. Stochastic equations have no limit, because noise may move the state off the manifold as
+    fast as it moves the state.
+- `threshold`: do not project a step whose largest residual, relative to the scale of its
+    constraint, is at most this. Dense output is treated in the same way. Default: project every
+    step.
+- `every`: project only every `every`-th step. In the other steps neither the state nor dense output
+    is projected, so the final state may be off the manifold.
 - `project_error`: project the error estimate to the tangent space of the manifold, so that the
     step size is not limited by errors that the projection removes. With Tsit5 on the systems of
     the catalogue it saved at most a fifth of the steps, at up to 70 times the error
@@ -317,7 +320,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError`, before anything is compiled, if an argument is not what it must be, if
-the manifold is empty or has more scalar constraints than the state has unknowns, or if the metric
-or a conserved value does not fit.
+`TypeError` or `ValueError`, before compilation, if an argument is invalid, if the manifold is empty
+or has more scalar constraints than the state has unknowns, or if the metric or a conserved value
+does not fit.
 """

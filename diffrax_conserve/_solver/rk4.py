@@ -21,8 +21,8 @@ class RK4(dfx.AbstractSolver[None]):
 
     It has no error estimate: use it with `diffrax.ConstantStepSize` or `diffrax.StepTo`, or inside
     `diffrax.HalfSolver` for adaptive steps. Dense output is the cubic Hermite polynomial through
-    both ends, of fourth order too; the vector field at the end of a step is evaluated only where
-    dense output is asked for.
+    both ends, of fourth order too; the vector field at the end of a step is evaluated only if dense
+    output is requested.
 
     !!! example
 

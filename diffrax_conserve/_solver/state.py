@@ -1,4 +1,4 @@
-"""What a `ManifoldProjection` carries from step to step."""
+"""The solver state of a `ManifoldProjection`."""
 
 from typing import Any
 
@@ -17,7 +17,8 @@ class State(eqx.Module):
 
     inner: Any
     values: Values
-    # What their rates have added to them, by itself: of each step it is little beside the value.
+    # The integrals of the rates. They are kept apart from the values, because the increment of one
+    # step is small and would lose digits.
     gained: Values | None
     num_steps: Array | None  # counted only if not every step is projected
     statistics: ProjectionStatistics

@@ -1,4 +1,4 @@
-"""What the projections of a solve did, carried in the solver state."""
+"""Statistics of the projections of a solve, carried in the solver state."""
 
 import dataclasses
 from typing import Any, final
@@ -21,14 +21,14 @@ class ProjectionStatistics(eqx.Module):
 
     **Attributes:**
 
-    - `num_projections`: how many steps were projected.
+    - `num_projections`: the number of projected steps.
     - `num_iterations`, `max_iterations`: the iterations of all projections, and of the longest.
     - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.
     - `rank`: the smallest numerical rank of the constraints.
-    - `num_rejected`: how many steps were rejected because their projection failed, if they were
-        counted by a [`diffrax_conserve.CountRejections`][]; otherwise `None`.
+    - `num_rejected`: the number of steps rejected because their projection failed, if a
+        [`diffrax_conserve.CountRejections`][] counted them; otherwise `None`.
     """
 
     num_projections: Int[Array, "..."]
@@ -67,20 +67,20 @@ class ProjectionStatistics(eqx.Module):
 
 
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:
-    """What the projections of a solve did.
+    """The statistics of the projections of a solve.
 
-    It is part of the state of a `ManifoldProjection`, so diffrax must be asked to return that, by
-    `SaveAt(solver_state=True)`. Where it is not, nothing is computed.
+    They are part of the state of a `ManifoldProjection`, so `diffeqsolve` must return it, by
+    `SaveAt(solver_state=True)`. Otherwise they are not computed.
 
-    diffrax discards the solver state of a rejected step, so rejected steps count only in
-    `sol.stats["num_rejected_steps"]`. Those that a failed projection caused can be counted by a
-    [`diffrax_conserve.CountRejections`][] around the step-size controller, with
+    diffrax discards the solver state of a rejected step, so rejected steps appear only in
+    `sol.stats["num_rejected_steps"]`. To count those caused by a failed projection, wrap the
+    step-size controller in a [`diffrax_conserve.CountRejections`][] and pass
     `SaveAt(controller_state=True)`.
 
     **Arguments:**
 
-    - `sol`: what `diffrax.diffeqsolve` returned, with `saveat=SaveAt(..., solver_state=True)`; from
-        `jax.vmap` of it, a batch.
+    - `sol`: the solution from `diffrax.diffeqsolve` with `saveat=SaveAt(..., solver_state=True)`,
+        or a batch of them from `jax.vmap`.
 
     **Returns:**
 
@@ -88,7 +88,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Raises:**
 
-    `ValueError` if `sol` holds no state of a `ManifoldProjection`; `TypeError` if `sol` is no
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`; `TypeError` if `sol` is not a
     solution.
 
     !!! example

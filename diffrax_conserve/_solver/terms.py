@@ -1,4 +1,4 @@
-"""What the terms given to a solver's `init` and `step` say about the solve around it."""
+"""Properties of a solve that its terms, given to a solver's `init` and `step`, reveal."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from .diffrax_private import AdjointTerm, WrapTerm
 
 
 def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[Array, ""]:
-    """`-1` in a solve with `t1 < t0`, where `diffeqsolve` negates every time that a solver sees;
-    otherwise `1`. In the dtype of `t`."""
+    """`-1` in a solve with `t1 < t0`, for which `diffeqsolve` negates all times before it calls the
+    solver; otherwise `1`. In the dtype of `t`."""
     wrapped = [x for x in _leaves(terms, WrapTerm) if isinstance(x, WrapTerm)]
     direction = wrapped[0].direction if wrapped else 1
     return jnp.asarray(direction, jnp.result_type(t))
@@ -42,7 +42,7 @@ def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
 
 
 def _innermost(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:
-    """The terms inside those that only hold others."""
+    """The terms inside `MultiTerm`, `WrapTerm` and `AdjointTerm`."""
     found = []
     for term in _leaves(terms, (dfx.AbstractTerm, WrapTerm)):
         if isinstance(term, dfx.MultiTerm):

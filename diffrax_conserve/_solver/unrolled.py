@@ -18,11 +18,11 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 
     diffrax keeps the stages $k_i = f(t + c_i h, y + h \sum_j a_{ij} k_j)$ of a step in one array,
     which a loop over the stages updates in place. In a batch every stage then goes through memory.
-    Written out, the whole step is one expression, which XLA keeps in registers: the same method
-    with the same steps, error estimate and dense output, equal up to the order of its sums, and in
-    a batch of small systems about ten times as fast (`benchmarks/cost/overhead.py`). Compile time
-    grows with the number of stages times the size of the vector field: for a large system, or a
-    single long solve, it gains nothing.
+    Written out, the whole step is one expression, which XLA keeps in registers. The method, steps,
+    error estimate and dense output are the same up to the order of summation, and a batch of small
+    systems is about ten times as fast (`benchmarks/cost/overhead.py`). Compile time grows with the
+    number of stages times the size of the vector field. For a large system or a single long solve
+    there is no gain.
 
     !!! example
 
@@ -82,7 +82,8 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> VF | None:
-        """The first slope, where a method has the last one of each step in common with the next."""
+        """The first slope, if the method reuses the last stage of a step in the next ("first same
+        as last")."""
         del t1
         return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
 
@@ -105,7 +106,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
             y = _displaced(y0, row, increments)
             slope = terms.vf(t0 + float(fraction) * (t1 - t0), y, args)
             increments.append(terms.prod(slope, control))
-        # "Solution same as last": the last stage is at the solution.
+        # "Solution same as last": the last stage is evaluated at the solution.
         y1 = y if tableau.ssal else _displaced(y0, tableau.b_sol, increments)
         error = _combined(tableau.b_error, increments)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *increments)
@@ -116,7 +117,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 Unrolled.__init__.__doc__ = """**Arguments:**
 
 - `solver`: an explicit Runge-Kutta method with one Butcher tableau, such as `diffrax.Tsit5()`,
-    `diffrax.Dopri8()`, or one of your own. Of its options only the tableau is used.
+    `diffrax.Dopri8()`, or your own. Only its tableau is used, no other options.
 
 **Raises:**
 
@@ -132,7 +133,8 @@ def _first_slope(
     known: VF | None,
     made_jump: BoolScalarLike,
 ) -> VF:
-    """The slope at the start, which the last step may have left behind."""
+    """The slope at the start of a step: the `known` one from the last step, unless there was a
+    jump."""
     if known is None:
         return terms.vf(t0, y0, args)
     if made_jump is False:
@@ -141,7 +143,7 @@ def _first_slope(
 
 
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
-    """Their weighted sum, without what a zero would multiply."""
+    """The weighted sum of the increments, without those whose weight is zero."""
     used = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
     factors, terms = zip(*used, strict=True)
     return jtu.tree_map(

@@ -11,15 +11,15 @@ import numpy as np
 from ..systems import AbstractSystem
 from ._solve import Run
 
-# The figures show no more times than this. The largest drift is over all of them.
+# The largest number of times in the figures. The largest drift is taken over all times.
 PLOTTED_MAX = 2000
 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """The reference on a fine grid for the pictures, and each solver's distance from it."""
+    """The reference on a fine grid for the figures, and the error of each solver."""
 
-    reference: Any  # of the first initial state; None where there is none
+    reference: Any  # from the first initial state; None if there is no reference
     stride: int  # the errors are at every `stride`-th saved time
     errors: dict[str, np.ndarray]  # by solver, `(states, times)`; empty without a reference
     failure: str | None = None
@@ -41,7 +41,7 @@ def compare(system: AbstractSystem, y0s: Any, runs: dict[str, Run]) -> Compariso
     try:
         first = _reference(system, fine, take(y0s, slice(1)))
         others = _reference(system, times, take(y0s, slice(1, None)))
-    except RuntimeError as error:  # what diffrax and `equinox.error_if` raise
+    except RuntimeError as error:  # raised by diffrax and `equinox.error_if`
         return Comparison(None, stride, {}, f"the reference failed: {str(error).splitlines()[0]}")
     at_times = jtu.tree_map(lambda y: y[:, ::refinement], first)
     if others is not None:
@@ -66,7 +66,7 @@ def take(ys: Any, index: Any) -> Any:
 
 
 def _reference(system: AbstractSystem, times: np.ndarray, y0s: Any) -> Any:
-    """The reference through each of `y0s`, with a leading axis; None where there are none."""
+    """The reference through each of `y0s`, with a leading axis; `None` if `y0s` is empty."""
     if jtu.tree_leaves(y0s)[0].shape[0] == 0:
         return None
     return jtu.tree_map(np.asarray, eqx.filter_vmap(lambda y0: system.reference(times, y0))(y0s))

@@ -28,7 +28,7 @@ from ._trained import (
 
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
-    """What is compared, in the order of the table and of the legends."""
+    """The solvers to compare, in the order of the table and the legends."""
     classical = {
         "rk4": RK4(),
         "projected rk4": ManifoldProjection(RK4(), system.manifold),
@@ -50,9 +50,9 @@ def reproduce(
 ) -> bool:
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
-    With `anew` the networks of the paper's systems are trained first; otherwise they are those that
-    come with the package. `progress` is told what begins. Returns whether every solver succeeded.
-    Raises `SetupError` before any work is done.
+    With `anew` the networks of the paper's systems are trained first; otherwise the pretrained ones
+    are used. `progress` is called with each stage. Returns whether every solver succeeded. Raises
+    `SetupError` before the work starts.
     """
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]
@@ -93,7 +93,7 @@ def reproduce(
 def _train(
     system: AbstractSystem, out: Path, seed: int, epochs: int, write: Callable[[str], None]
 ) -> dict[str, Learned]:
-    """Trains the standard and the conservative network, and writes them beside the figures."""
+    """Trains the standard and the conservative network, and saves them beside the figures."""
     networks = {}
     for kind in KINDS:
         write(f"Training the {kind} network: {epochs} epochs, seed {seed}")

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
-# From M. Okabe and K. Ito's palette, told apart also by those who see fewer colours.
+# From the palette of M. Okabe and K. Ito, which is distinguishable with colour blindness.
 _COLOURS = {
     "rk4": "#D55E00",
     "projected rk4": "#0072B2",
@@ -23,9 +23,9 @@ _NAMES = {"rk4": "RK4", "projected rk4": "projected RK4"}
 _ROUNDOFF: dict[str, Any] = dict(color="black", linewidth=0.8, linestyle=":", zorder=3)
 
 _EPS = float(np.finfo(np.float64).eps)
-# Where an exact 0 is drawn on a logarithmic axis.
+# The position of an exact 0 on a logarithmic axis.
 _FLOOR = _EPS / 10
-# The last steps of each solver are marked on the whole reference: more would cover each other.
+# The number of last steps of each solver that are marked: more markers would overlap.
 _MARKED_MAX = 100
 
 _STYLE: dict[Any, Any] = {
@@ -48,19 +48,19 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "legend.handlelength": 1.6,
     "legend.columnspacing": 1.4,
-    "pdf.fonttype": 42,  # text stays text
+    "pdf.fonttype": 42,  # embeds fonts, so that text remains text
     "savefig.dpi": 300,
 }
 
-# In the order of the solvers: shapes that can be told apart where they cover each other.
+# In the order of the solvers: shapes that are distinguishable where they overlap.
 _MARKERS = (("o", 5.0), (".", 3.0), ("s", 5.0), ("x", 4.0), ("^", 4.0))
 
 _Curves = dict[str, np.ndarray]  # by solver, or by part of the system
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes `figure` in the format that the suffix of `path` names."""
-    # Without the date the same solve writes the same file.
+    """Writes `figure` in the format given by the suffix of `path`."""
+    # Without the date, equal figures give equal files.
     metadata = {"CreationDate": None} if path.suffix == ".pdf" else {}
     with mpl.rc_context(_STYLE):
         figure.savefig(path, metadata=metadata)
@@ -88,7 +88,7 @@ def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> F
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(3.5, 2.7), layout="constrained")
         ax = figure.subplots()
-        # An error of exactly 0 is drawn at the smallest other.
+        # An error of exactly 0 is drawn at the smallest positive one.
         smallest = min(
             np.min(values, where=values > 0, initial=np.inf) for values in errors.values()
         )
@@ -143,7 +143,8 @@ def trajectory(
     """One panel for each part of the system: the reference, and the last steps of each solver."""
     with mpl.rc_context(_STYLE):
         parts = list(next(iter(paths.values())))
-        # A single curve in space is shown as that, several by their first two coordinates.
+        # A single curve in space is drawn in three dimensions, several by their first two
+        # coordinates.
         solid = len(axis_labels) == 3 and len(parts) == 1
         labels = axis_labels if solid else axis_labels[:2]
         columns = min(len(parts), 3)
@@ -172,7 +173,8 @@ def trajectory(
 
 def _over_time(ax: Any, times: _Curves, curves: _Curves, time_unit: str) -> None:
     for i, (name, values) in enumerate(curves.items()):
-        # Roundoff jumps from step to step: under thinner lines the others can still be seen.
+        # Thinner lines for many values, because curves at roundoff level jump and would hide
+        # others.
         width = 1.2 if len(values) <= 200 else 0.7
         ax.plot(
             times[name],
@@ -198,7 +200,7 @@ def _draw_paths(
         style = dict(color="#BDBDBD", linewidth=0.5 if _is_long(paths) else 1.5, zorder=1)
         ax.plot(*reference.T[:dimension], label="reference", **style)
     for i, (name, path) in enumerate(paths.items()):
-        # Open shapes round each other: one solver cannot hide another.
+        # Open markers of different sizes, so that one solver cannot hide another.
         last = path[-_MARKED_MAX - 1 :].T[:dimension]
         marker, size = _MARKERS[i % len(_MARKERS)]
         ax.plot(
@@ -223,7 +225,8 @@ def _draw_paths(
 
 
 def _make_square(ax: Any) -> None:
-    """Equal scales and ranges, which unlike `adjustable="datalim"` the layout knows beforehand."""
+    """Sets equal scales and ranges, which unlike with `adjustable="datalim"` are known to the
+    layout."""
     (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
     half = max(x1 - x0, y1 - y0) / 2
     ax.set_xlim((x0 + x1) / 2 - half, (x0 + x1) / 2 + half)
@@ -244,7 +247,7 @@ def _tidy_space(ax: Any) -> None:
 
 
 def _are_alike(axis_labels: tuple[str, ...]) -> bool:
-    """Whether the coordinates measure the same, so that their scales should be equal."""
+    """Whether the coordinates are of the same kind, so that their scales should be equal."""
     first, second = (text.split()[0].rstrip("₁₂₃") for text in axis_labels)
     return first == second or (first, second) == ("x", "y")
 

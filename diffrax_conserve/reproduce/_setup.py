@@ -1,4 +1,4 @@
-"""What can be wrong before the work starts."""
+"""Checks before the work starts."""
 
 import math
 import tempfile
@@ -9,16 +9,16 @@ import jax.tree_util as jtu
 
 from ..systems import AbstractSystem
 
-# The states of all steps are held in memory.
+# The largest size of the states of all steps, which are kept in memory.
 _BYTES_MAX = 2**29
 
 
 class SetupError(Exception):
-    """The job cannot start; the message says why, and what to do."""
+    """The job cannot start; the message gives the reason and a remedy."""
 
 
 def check_times(system: AbstractSystem, t1: float, dt: float, states: int) -> None:
-    """Raises unless the solve from 0 to `t1` in steps of `dt` makes sense and fits into memory."""
+    """Raises unless the solve from 0 to `t1` in steps of `dt` is valid and fits into memory."""
     for name, value in {"t1": t1, "dt": dt}.items():
         if not 0 < value < math.inf:
             raise SetupError(f"{name} must be a positive number, but is {value}.")

@@ -19,10 +19,11 @@ from ..systems import AbstractSystem
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What one solver did: its states at `ts`, from the initial time, or why there are none.
+    """The result of one solver: its states at `ts`, which include the initial time, or the reason
+    of a failure.
 
-    The states and the drifts have a leading axis of initial states. Where a solve failed they are
-    NaN.
+    The states and the drifts have a leading axis over the initial states. They are NaN after a
+    failure.
     """
 
     ts: np.ndarray
@@ -39,13 +40,13 @@ def run(system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float,
     try:
         return _timed(system, solver, y0s, t1, dt)
     except (RuntimeError, TypeError, ValueError) as error:
-        # One solver that cannot start must not cost the results of the others.
+        # If one solver cannot start, the results of the others are kept.
         nothing = np.zeros(0)
         return Run(nothing, nothing, {}, 0, 0.0, 0.0, f"at the start: {_reason(error)}")
 
 
 def _reason(error: Exception) -> str:
-    """What an error says, without the lines that equinox and jax put around it."""
+    """The message of an error, without the lines that equinox and jax add."""
     found = re.search(r"EquinoxRuntimeError: (.*)", str(error))
     return str(error) if found is None else found[1]
 
@@ -115,7 +116,8 @@ def _largest_component(values: Any) -> np.ndarray:
 def _failure(
     result: dfx.RESULTS, counts: np.ndarray, ts: np.ndarray, ys: Any, drifts: dict[str, np.ndarray]
 ) -> str | None:
-    """What went wrong at the first initial state where something did, and at how many it did."""
+    """The failure at the first initial state with one, and the number of initial states with a
+    failure."""
     values = [*jtu.tree_leaves(ys), *drifts.values()]
     reasons = [
         _failure_of_one(

@@ -1,4 +1,4 @@
-"""What is written: the metrics, the table and the figures."""
+"""The output: the metrics, the table and the figures."""
 
 import json
 import platform
@@ -17,8 +17,8 @@ from ._compare import Comparison, take, thinned
 from ._solve import Run
 from ._trained import Learned
 
-# For the labels of systems with units: that of time, how many of the system's own it is, and that
-# of the error.
+# The labels of systems with units: the unit of time, its length in the system's own unit, and the
+# unit of the error.
 _UNITS = {"outer-solar-system": ("years", 365.25, "AU, AU/day")}
 
 FOOTER = """\

@@ -1,4 +1,4 @@
-"""The learned solvers of the paper's five systems, trained anew or as the package has them."""
+"""The learned solvers of the paper's five systems, newly trained or pretrained."""
 
 import dataclasses
 from typing import Any
@@ -30,7 +30,8 @@ from ..systems import AbstractSystem
 Network = PINN | DeepONet
 
 KINDS = ("standard", "conservative")
-# The paper learns one solution of the first two systems, and the flow map of the others.
+# The iterations of the conservative layers. The paper learns one solution of each of the first two
+# systems, and the flow maps of the others.
 _ITERATIONS = {
     "harmonic-oscillator": 5,
     "rigid-body": 5,
@@ -40,15 +41,16 @@ _ITERATIONS = {
 }
 _PINNS = ("harmonic-oscillator", "rigid-body")
 
-# Flow maps are judged on so many initial states.
+# The number of initial states on which flow maps are compared.
 _STATES = 20
-# Closer vortices turn about each other by more than half a radian in a step: RK4 fails there too.
+# Closer vortices rotate about each other by more than half a radian in a step, for which RK4 fails
+# too.
 _SEPARATION = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """A trained network, and its loss against the epoch."""
+    """A trained network, and its loss as a function of the epoch."""
 
     network: Network
     epochs: np.ndarray
@@ -56,18 +58,18 @@ class Learned:
 
 
 def is_learned(system: AbstractSystem) -> bool:
-    """Whether the paper has learned solvers for this system."""
+    """Whether the paper has a learned solver for this system."""
     return system.name in _ITERATIONS
 
 
 def is_flow_map(system: AbstractSystem) -> bool:
-    """Whether these are for many initial states."""
+    """Whether the paper learns a flow map of this system, for many initial states."""
     return is_learned(system) and system.name not in _PINNS
 
 
 def initial_states(system: AbstractSystem) -> Any:
-    """What all solvers are compared on, with a leading axis: the system's own initial state, and
-    for a flow map random ones."""
+    """The initial states of the comparison, with a leading axis: the system's own, and for a flow
+    map random ones."""
     own = jax.tree.map(lambda x: x[None], system.y0)
     if not is_flow_map(system):
         return own
@@ -130,7 +132,7 @@ def learned(network: Network, log: FitLog) -> Learned:
 
 
 def history(log: FitLog, points: int = 250) -> tuple[np.ndarray, np.ndarray]:
-    """The training loss at about so many epochs, each the median of those round it."""
+    """The training loss at about `points` epochs, each the median over nearby epochs."""
     width = max(len(log.losses) // points, 1)
     count = len(log.losses) // width
     blocks = log.losses[: count * width].reshape(count, width)
@@ -142,8 +144,8 @@ def learned_solvers(
 ) -> dict[str, dfx.AbstractSolver]:
     """The standard network, the conservative one, and the standard one projected afterwards.
 
-    A network can be far from the manifold, so `Newton` projects; and the conservative layer makes
-    few iterations, so the conservative network is projected too.
+    A network can be far from the manifold, so the projection is `Newton`. The conservative network
+    is projected too, because its layer makes only a few iterations.
     """
 
     def solver(network: Network) -> dfx.AbstractSolver:

@@ -20,14 +20,14 @@ State = tuple[Float[Array, "4"], Float[Array, "3"]]
 class RigidBodyAttitude(AbstractIntegratedSystem):
     r"""A free rigid body in space, `y = (Q, ω)` of shapes `(4,)` and `(3,)`.
 
-    The quaternion $Q$, scalar part first, takes the frame of the body to that of space; $\omega$
-    is the angular velocity in the frame of the body and $I$ the diagonal of the inertia tensor:
+    The quaternion $Q$, scalar part first, maps the frame of the body to that of space; $\omega$ is
+    the angular velocity in the frame of the body and $I$ the diagonal of the inertia tensor:
 
     $$Q' = \tfrac12\, Q\, \omega, \qquad I \omega' = (I \omega) \times \omega.$$
 
     **Manifold**: unit quaternion $Q \bar Q = 1$ (a constraint), energy
     $\tfrac12\, \omega \cdot I \omega$ and the three components of the angular momentum in space,
-    $Q\, (I \omega)\, \bar Q$. At a steady rotation, about a principal axis, they are dependent.
+    $Q\, (I \omega)\, \bar Q$. They are dependent in a steady rotation about a principal axis.
     **Reference**: numerical. **Samples**: $Q$ uniform, $\omega$ in a uniform direction with
     $\tfrac12 \le |\omega| \le 2$ uniform.
 

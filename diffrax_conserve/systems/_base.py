@@ -1,4 +1,4 @@
-"""What every system of the catalogue offers: equations, manifold, states, a reference."""
+"""The base class of the systems of the catalogue: equations, manifold, states, a reference."""
 
 import abc
 from collections.abc import Sequence
@@ -25,12 +25,13 @@ _System = TypeVar("_System", bound="AbstractSystem")
 def real(x: Any) -> Array:
     """`x` as an array of floating point numbers, in the default precision unless it has its own."""
     x = jnp.asarray(x)
-    # `astype` also makes the weak type of a Python number strong: other values compile nothing new.
+    # `astype` also removes the weak type of a Python number, so that other values do not compile
+    # again.
     return x.astype(x.dtype if eqx.is_inexact_array(x) else float)
 
 
 class AbstractSystem(eqx.Module):
-    r"""A differential equation $y' = f(t, y, args)$ together with what it conserves.
+    r"""A differential equation $y' = f(t, y, args)$ with its manifold.
 
     The parameters of the equation are the fields of the Module, so they can be changed
     (`Kepler(mu=2.0)`) and differentiated; `args` is not used by any system of the catalogue.
@@ -49,7 +50,7 @@ class AbstractSystem(eqx.Module):
     name: AbstractClassVar[str]
     title: AbstractClassVar[str]
     citation: AbstractClassVar[str]
-    # The solve that `python -m diffrax_conserve reproduce` shows: its horizon and its step.
+    # The final time and the step of the solve in `python -m diffrax_conserve reproduce`.
     t1: AbstractClassVar[float]
     dt: AbstractClassVar[float]
     # The labels of the two or three coordinates in `trajectories`.
@@ -62,7 +63,7 @@ class AbstractSystem(eqx.Module):
     @property
     @abc.abstractmethod
     def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        """What the exact solution conserves, by name; functionally independent."""
+        """The functionally independent integrals and constraints of the exact solution, by name."""
 
     @property
     @abc.abstractmethod
@@ -75,18 +76,19 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        """The states at `ts`, counted from `y0`, in float64; called by `reference`."""
+        """The states in float64 at the times `ts` after `y0`; called by `reference`."""
 
     @abc.abstractmethod
     def period(self, y0: Any = None) -> Float[Array, ""] | None:
-        """The period of the solution through `y0`; `None` where no closed form is known."""
+        """The period of the solution through `y0`; `None` if no closed form is known."""
 
     @property
     @abc.abstractmethod
     def metric(self) -> Y | None:
-        """Weights, like `y`, in which a projection on the energy alone keeps linear integrals.
+        """Weights, shaped like `y`, with which a projection on the energy alone conserves linear
+        integrals.
 
-        `None` where the system has no such metric or no need of it.
+        `None` if the system has no such metric or does not need one.
         """
 
     @abc.abstractmethod
@@ -104,11 +106,12 @@ class AbstractSystem(eqx.Module):
         *,
         t0: RealScalarLike = 0.0,
     ) -> Any:
-        """The states at the times `ts`, as accurately as float64 allows.
+        """The states at the times `ts`, as accurate as float64 allows.
 
-        From the exact solution where there is one in closed form, else by an eighth-order solve
-        that steps exactly onto `ts`; the page of each system says which. Over the default horizon
-        the error of the latter is 1e-13 to 1e-12 of the largest component.
+        They are computed from the exact solution if there is one in closed form, otherwise by an
+        eighth-order solve that steps exactly to `ts`; the page of each system says which. Over the
+        default time span the relative error of the latter is 1e-13 to 1e-12 of the largest
+        component.
 
         **Arguments:**
 
@@ -140,7 +143,8 @@ class AbstractSystem(eqx.Module):
         return _solution(self, ts - t0, y0)
 
     def like(self: _System, y: Any) -> _System:
-        """This system with its parameters in the precision of `y`, so that `f` keeps it."""
+        """This system with its parameters in the precision of `y`, so that `f` has that precision
+        too."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         return jtu.tree_map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self)
 

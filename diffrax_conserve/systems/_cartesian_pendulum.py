@@ -25,14 +25,14 @@ class CartesianPendulum(AbstractSystem):
 
     This is a differential-algebraic equation of index 3. Differentiating its position constraint
     once gives the hidden velocity constraint $q \cdot v = 0$, and once more the multiplier
-    $\lambda = (|v|^2 - g q_2) / |q|^2$, with which it is an ordinary differential equation that
-    keeps both constraints, but from which a numerical solution drifts away.
+    $\lambda = (|v|^2 - g q_2) / |q|^2$. With this $\lambda$ it is an ordinary differential equation
+    that conserves both constraints, but a numerical solution drifts away from them.
 
     **Manifold**: rod length and velocity constraint (both constraints), energy
     $\tfrac12 |v|^2 + g q_2$ (conserved where the constraints hold). **Reference**: exact, by
     Jacobi's elliptic functions; it loses accuracy at the separatrix, where the mass just reaches
-    the upper rest. **Samples**: any angle, with $l |\theta'| \le 3$ uniform, so both swings and
-    full turns.
+    the upper equilibrium. **Samples**: any angle, with $l |\theta'| \le 3$ uniform, so both swings
+    and full turns.
 
     Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", IV.4 and VII.1; Landau and
     Lifshitz, "Mechanics", §11 for the solution.
@@ -105,15 +105,15 @@ class CartesianPendulum(AbstractSystem):
         return q, speed[:, None] * jnp.stack([c, s], axis=1)
 
     def period(self, y0: State | None = None) -> Float[Array, ""]:
-        """Of a swing to and fro, or of one full turn."""
+        """The period of a swing back and forth, or of one full turn."""
         swings, modulus, m, _ = self._elliptic_form(self.y0 if y0 is None else y0)
         quarters = jnp.where(swings, 4.0, 2 / jnp.abs(modulus))
         return quarters * complete_elliptic(m) * jnp.sqrt(self.length / self.gravity)
 
     def _elliptic_form(self, y0: State) -> tuple[Array, Array, Array, Array]:
-        r"""Whether it swings, the modulus $k$, the parameter $m$ and the phase $u_0$.
+        r"""Whether the pendulum swings, the modulus $k$, the parameter $m$ and the phase $u_0$.
 
-        With $\omega^2 = g / l$ and the angle $\theta$ from the lower rest,
+        With $\omega^2 = g / l$ and the angle $\theta$ from the lower equilibrium,
         $k^2 = \sin^2(\theta/2) + (\theta' / 2 \omega)^2$. For $k < 1$ it swings:
         $\sin(\theta/2) = k\, sn$, $\cos(\theta/2) = dn$ and $\theta' / 2 \omega = k\, cn$, at
         $\omega t + u_0$ with $m = k^2$. Otherwise it turns: $\sin(\theta/2) = sn$,

@@ -18,7 +18,7 @@ State = Float[Array, " species"]
 
 
 class AbstractChemistry(AbstractSystem):
-    """Reactions by the law of mass action, with a reference for stiff equations."""
+    """Reactions with mass-action kinetics, and a reference solution for stiff equations."""
 
     @property
     @abc.abstractmethod
@@ -143,10 +143,10 @@ class Pollu(AbstractChemistry):
     The order of the species in `y`, of shape `(20,)`, is `system.mechanism.species`; the reactions
     are `system.mechanism.reactions`. Rate constants lie between 1.3e-4 and 4.4e11.
 
-    **Manifold**: the balances of nitrogen, sulphur and carbon, as far as the reactions keep them.
-    **Reference**: numerical, by Kvaerno5 at a tolerance of 1e-8, within 1e-10 of the published
-    state at $t = 60$, relative to each species. **Samples**: the initial concentrations, each with
-    a factor between 1/2 and 2.
+    **Manifold**: the balances of nitrogen, sulphur and carbon, as far as the reactions conserve
+    them. **Reference**: numerical, by Kvaerno5 at a tolerance of 1e-8, within 1e-10 of the
+    published state at $t = 60$, relative to each species. **Samples**: the initial concentrations,
+    each with a factor between 1/2 and 2.
 
     Source: J. G. Verwer, "Gauss-Seidel iteration for stiff ODEs from chemical kinetics", SIAM J.
     Sci. Comput. 15 (1994); E. Hairer and G. Wanner, "Solving Ordinary Differential Equations II";

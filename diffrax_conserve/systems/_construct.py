@@ -1,4 +1,4 @@
-"""Vector fields from what they conserve: Hamilton's and Nambu's equations by autodiff."""
+"""Vector fields from their first integrals: Hamilton's and Nambu's equations by autodiff."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,8 +27,8 @@ def hamiltonian_vector_field(hamiltonian: ScalarFn) -> Callable[[RealScalarLike,
 
     **Returns:**
 
-    A callable `vector_field(t, y, args)`, a PyTree: where `hamiltonian` is an
-    [`equinox.Module`][] or a method of one, its parameters stay differentiable.
+    A callable `vector_field(t, y, args)`, which is a PyTree: if `hamiltonian` is an
+    [`equinox.Module`][] or a method of one, its parameters remain differentiable.
 
     **Raises:**
 
@@ -66,8 +66,8 @@ def nambu_vector_field(h: ScalarFn, l: ScalarFn) -> Callable[[RealScalarLike, An
 
     **Returns:**
 
-    A callable `vector_field(t, y, args)`, a PyTree: parameters of `h` and `l` that are
-    [`equinox.Module`][]s, or methods of one, stay differentiable.
+    A callable `vector_field(t, y, args)`, which is a PyTree: if `h` and `l` are
+    [`equinox.Module`][]s or methods of one, their parameters remain differentiable.
 
     **Raises:**
 

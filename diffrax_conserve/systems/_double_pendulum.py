@@ -42,7 +42,7 @@ class DoublePendulum(AbstractIntegratedSystem):
     $[-\pi/6, \pi/6]^4$.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
-    horizon (20 steps of 0.5) are the defaults; it names no single initial state, that one is ours.
+    time span (20 steps of 0.5) are the defaults; it gives no initial state, so `y0` is our choice.
     Landau and Lifshitz, "Mechanics", §5.
     """
 
@@ -98,7 +98,7 @@ class DoublePendulum(AbstractIntegratedSystem):
 
     @property
     def y0(self) -> State:
-        """A state inside the paper's sampling domain, which names no single one."""
+        """A state inside the paper's sampling domain; the paper gives no initial state."""
         return jnp.array([0.5, -0.3, 0.2, 0.4])
 
     def sample(self, key: PRNGKeyArray) -> State:

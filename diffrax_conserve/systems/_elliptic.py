@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 # The arithmetic-geometric mean converges quadratically: ten steps reach roundoff for every m < 1
 # of float64.
 _AGM_STEPS = 10
-# Each step of Carlson's duplication quarters the spread of its arguments, and the series that ends
-# it is of sixth order in that spread.
+# Each step of Carlson's duplication divides the spread of its arguments by four, and the error of
+# the final series is of sixth order in that spread.
 _DUPLICATIONS = 12
 
 
@@ -27,7 +27,7 @@ def incomplete_elliptic(phi: Float[Array, "*s"], m: Float[Array, "*s"]) -> Float
 
     Computed as $\sin\phi\, R_F(\cos^2\phi, 1 - m \sin^2\phi, 1)$ (B. C. Carlson, "Numerical
     computation of real or complex elliptic integrals", Numer. Algorithms 10 (1995)), after
-    removing whole multiples of $\pi$ from $\phi$.
+    removing integer multiples of $\pi$ from $\phi$.
     """
     turns = jnp.round(phi / jnp.pi)
     s, c = jnp.sin(phi - turns * jnp.pi), jnp.cos(phi - turns * jnp.pi)
@@ -49,8 +49,8 @@ def jacobi_elliptic(
 ) -> tuple[Float[Array, "*s"], Float[Array, "*s"], Float[Array, "*s"]]:
     r"""$\mathrm{sn}(u, m)$, $\mathrm{cn}(u, m)$, $\mathrm{dn}(u, m)$.
 
-    By the descending Landen transformation (Abramowitz and Stegun, "Handbook of Mathematical
-    Functions", 16.4); at $m = 1$, where it fails, the hyperbolic functions.
+    Computed by the descending Landen transformation (Abramowitz and Stegun, "Handbook of
+    Mathematical Functions", 16.4); at $m = 1$, where it fails, by the hyperbolic functions.
     """
     u, m = jnp.broadcast_arrays(u, m)
     a, b = jnp.ones_like(m), jnp.sqrt(1 - m)

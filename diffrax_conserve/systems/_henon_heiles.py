@@ -24,8 +24,9 @@ class HenonHeiles(AbstractIntegratedSystem):
     $$H = \tfrac12 (|p|^2 + |q|^2) + \lambda \bigl(q_1^2 q_2 - \tfrac13 q_2^3\bigr), \qquad
     q' = p, \quad p' = -\partial H / \partial q.$$
 
-    The motion is bounded below the escape energy $1 / (6 \lambda^2)$ and becomes chaotic on the
-    way there; the default state, of energy close to $\tfrac{1}{12}$, moves almost regularly.
+    The motion is bounded below the escape energy $1 / (6 \lambda^2)$ and becomes chaotic as the
+    energy approaches it; the default state, of energy close to $\tfrac{1}{12}$, moves almost
+    regularly.
 
     **Manifold**: energy. **Reference**: numerical. **Samples**: uniform in area on the discs
     $|q| \le 0.3$ and $|p| \le 0.4$, where $H < \tfrac16$ for $\lambda = 1$.

@@ -25,12 +25,12 @@ class Kepler(AbstractSystem):
 
     **Manifold**: energy $H = \tfrac12 |p|^2 - \mu / |q|$ and angular momentum
     $L = q_1 p_2 - q_2 p_1$. The Laplace-Runge-Lenz vector `laplace_runge_lenz`, of length
-    $\mu e$, is conserved too. Left out of the manifold, because $|A|^2 = \mu^2 + 2 H L^2$ makes it
-    redundant: of $H$, $L$, $A_1$ and $A_2$ any three determine the fourth, and any three kept leave
-    no freedom but the position on the ellipse. On a circular orbit $H$ and $L$ are dependent.
+    $\mu e$, is conserved too. It is not in the manifold, because $|A|^2 = \mu^2 + 2 H L^2$ makes it
+    redundant: any three of $H$, $L$, $A_1$ and $A_2$ determine the fourth, and three of them leave
+    only the position on the ellipse free. On a circular orbit $H$ and $L$ are dependent.
     **Reference**: exact, by Kepler's equation; bound orbits only ($H < 0$). **Samples**: ellipses
-    of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, either sense, any
-    orientation and eccentric anomaly, all uniform.
+    of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, with any
+    orientation, direction of motion and eccentric anomaly, all uniform.
 
     Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.2. The default state
     is the perihelion of the ellipse with semi-major axis 1 and eccentricity 0.6.
@@ -146,8 +146,8 @@ def _eccentric_anomaly(
 ) -> Float[Array, " times"]:
     r"""Solves Kepler's equation $E - e \sin E = M$, modulo $2\pi$.
 
-    Newton's iteration from J. M. A. Danby's start, "Fundamentals of Celestial Mechanics" (1988);
-    it has converged long before the last of its iterations unless $e$ is very close to 1.
+    Newton's iteration from the starting value of J. M. A. Danby, "Fundamentals of Celestial
+    Mechanics" (1988). It converges in far fewer than 12 iterations unless $e$ is very close to 1.
     """
     m = mean_anomaly - 2 * jnp.pi * jnp.round(mean_anomaly / (2 * jnp.pi))
 

@@ -23,9 +23,9 @@ class KortewegDeVries(AbstractIntegratedSystem):
 
     $$u_t + 6 u u_x + u_{xxx} = 0, \qquad u(t, x + L) = u(t, x).$$
 
-    This is the method of lines with Fourier modes. Let $v = P u$ hold the modes of $u$ whose wave
-    number is at most $(N - 1) / 3$. Products of three such functions are integrated exactly by the
-    $N$ points, so the semi-discrete equation
+    This is the method of lines with Fourier modes. Let $v = P u$ consist of the modes of $u$ with a
+    wave number of at most $(N - 1) / 3$. Products of three such functions are integrated exactly by
+    the $N$ points, so the semi-discrete equation
 
     $$u' = -\partial_x P (3 v^2 + v_{xx})$$
 
@@ -37,8 +37,8 @@ class KortewegDeVries(AbstractIntegratedSystem):
     It is stiff: the fastest mode has the frequency $(2 \pi (N - 1) / 3 L)^3$, 297 by default, so
     RK4 is stable up to steps of 0.0095.
 
-    **Manifold**: mass, momentum, energy. **Reference**: numerical. From `y0` it is `soliton`, to
-    1e-8. **Samples**: random combinations of the modes 0 to 4.
+    **Manifold**: mass, momentum, energy. **Reference**: numerical. From `y0` it agrees with
+    `soliton` to 1e-8. **Samples**: random combinations of the modes 0 to 4.
 
     Source: P. G. Drazin and R. S. Johnson, "Solitons: an Introduction", Cambridge 1989, 1.2 and
     5.1; J. P. Boyd, "Chebyshev and Fourier Spectral Methods", 11.5, for the number of modes.
@@ -71,8 +71,8 @@ class KortewegDeVries(AbstractIntegratedSystem):
         return self._wave(-d * (3 * square + d * d * modes))
 
     def _modes(self, y: Wave) -> tuple[Modes, Modes]:
-        """The modes of $P u$, and $ik$, by which a derivative multiplies them; zeros where $P$
-        leaves the mode out."""
+        """The modes of $P u$, and the factors $ik$ of a derivative; both are zero for modes that
+        $P$ removes."""
         number = jnp.arange(self.points // 2 + 1)
         kept = number <= (self.points - 1) // 3
         k = jnp.where(kept, 2 * jnp.pi * number.astype(y.dtype) / self.like(y).length, 0)
@@ -111,7 +111,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
 
     @property
     def x(self) -> Wave:
-        """The points of the grid, from 0 on."""
+        """The grid points, starting at 0."""
         return self.length * jnp.arange(self.points, dtype=float) / self.points
 
     @property
@@ -132,7 +132,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
         return amplitudes[0] @ jnp.cos(angles) + amplitudes[1] @ jnp.sin(angles)
 
     def trajectories(self, ys: Float[Array, "times points"]) -> dict[str, Float[Array, "times 2"]]:
-        """The first Fourier mode, which a travelling wave turns in a circle."""
+        """The first Fourier mode, which moves on a circle for a travelling wave."""
         mode = 2 * jnp.fft.rfft(ys)[:, 1] / self.points
         return {"wave": jnp.stack([mode.real, -mode.imag], axis=1)}
 
@@ -142,5 +142,5 @@ KortewegDeVries.__init__.__doc__ = r"""**Arguments:**
 - `length`: the length $L$ of the ring.
 - `wave_number`: $\kappa$ of the soliton `y0`, whose height is $2 \kappa^2$ and whose speed is
     $4 \kappa^2$.
-- `points`: their number $N$.
+- `points`: the number $N$ of grid points.
 """

@@ -31,7 +31,7 @@ class ConservativeLorenz(AbstractIntegratedSystem):
     $[\tfrac12, \tfrac32]$.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
-    horizon (500 steps of 0.25) are the defaults; E. N. Lorenz, "Deterministic nonperiodic flow",
+    time span (500 steps of 0.25) are the defaults; E. N. Lorenz, "Deterministic nonperiodic flow",
     J. Atmos. Sci. 20 (1963); P. Névir and R. Blender, "Hamiltonian and Nambu representation of the
     non-dissipative Lorenz equations", Beitr. Phys. Atmosph. 67 (1994).
     """
@@ -70,7 +70,7 @@ class ConservativeLorenz(AbstractIntegratedSystem):
 
     @property
     def y0(self) -> State:
-        """A state inside the paper's sampling domain, which names no single one."""
+        """A state inside the paper's sampling domain; the paper gives no initial state."""
         return jnp.array([0.9, 0.3, 1.2])
 
     def sample(self, key: PRNGKeyArray) -> State:

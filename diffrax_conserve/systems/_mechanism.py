@@ -1,4 +1,5 @@
-"""Chemical kinetics: from reactions and rates to the equations and to what they conserve."""
+"""Chemical kinetics: the differential equations of reactions with given rates, and their
+balances."""
 
 import functools as ft
 import re
@@ -24,7 +25,7 @@ State = Float[Array, " species"]
 
 @final
 class Balance(eqx.Module):
-    """A weighted sum of concentrations, which no reaction changes."""
+    """A weighted sum of concentrations that no reaction changes."""
 
     weights: tuple[int, ...] = eqx.field(static=True)
 
@@ -35,13 +36,13 @@ class Balance(eqx.Module):
 
 @final
 class Mechanism(eqx.Module):
-    r"""Reactions by the law of mass action, as a differential equation for the concentrations.
+    r"""Reactions with mass-action kinetics, as a differential equation for the concentrations.
 
     $$y' = S r(y), \qquad r_j(y) = k_j \prod_i y_i^{a_{ij}}, \qquad S_{ij} = b_{ij} - a_{ij},$$
 
-    where reaction $j$ takes $a_{ij}$ molecules of species $i$ and makes $b_{ij}$. Whatever the
-    rates, $w \cdot y$ is conserved for each $w$ with $w^\top S = 0$: these are the balances, of
-    elements or of whatever the reactions keep together. They are computed by exact arithmetic.
+    where reaction $j$ consumes $a_{ij}$ molecules of species $i$ and produces $b_{ij}$. For all
+    rates, $w \cdot y$ is conserved for each $w$ with $w^\top S = 0$: these are the balances of
+    elements or of groups that the reactions do not split. They are computed in exact arithmetic.
 
     !!! example
 
@@ -94,7 +95,8 @@ class Mechanism(eqx.Module):
 
     @property
     def balances(self) -> dict[str, Balance]:
-        """What the reactions conserve: a basis of the left null space of $S$, by its formula."""
+        """The conserved quantities, a basis of the left null space of $S$, each under its
+        formula."""
         weights = _tables(self.reactions, self.species).balances
         return {_formula(w, self.species): Balance(w) for w in weights}
 
@@ -104,7 +106,7 @@ class Mechanism(eqx.Module):
         return {name: FirstIntegral(balance) for name, balance in self.balances.items()}
 
     def state(self, concentrations: Mapping[str, RealScalarLike]) -> State:
-        """The state with these concentrations, and without any other species."""
+        """The state with these concentrations; those of all other species are zero."""
         unknown = set(concentrations) - set(self.species)
         if unknown:
             raise ValueError(f"The mechanism has no species {', '.join(sorted(unknown))}.")
@@ -114,18 +116,18 @@ class Mechanism(eqx.Module):
         """The rates of change of the concentrations."""
         del t, args
         tables = _tables(self.reactions, self.species)
-        # The last factor of reactions of lower order is one.
+        # The missing factors of reactions of lower order are one.
         factors = jnp.append(y, jnp.ones((), y.dtype))[tables.factors]
         rates = self.rates.astype(y.dtype) * jnp.prod(factors, axis=1)
         return jnp.sum(jnp.asarray(tables.change, y.dtype) * rates[None, :], axis=1)
 
     def positive_projection(self) -> ClosedForm:
-        r"""A projection on the balances after which no concentration is negative.
+        r"""A projection to the balances after which no concentration is negative.
 
-        It returns $y_i = \max(\hat y_i, 0)\, e^{(W^\top \mu)_i}$ with the $\mu$ for which
-        $W y$ has the conserved values: the nearest state in relative entropy, found by Newton's
-        method for the convex dual problem. A species that is absent stays absent. All balances
-        must have weights that are not negative.
+        It returns $y_i = \max(\hat y_i, 0)\, e^{(W^\top \mu)_i}$ with the $\mu$ for which $W y$ has
+        the conserved values: the nearest state in relative entropy, found by Newton's method for
+        the convex dual problem. A concentration of zero stays zero. No balance may have a negative
+        weight.
 
         Source: I. Csiszár, "I-divergence geometry of probability distributions and minimization
         problems", Ann. Probab. 3 (1975).
@@ -141,20 +143,21 @@ class Mechanism(eqx.Module):
 
 Mechanism.__init__.__doc__ = """**Arguments:**
 
-- `reactions`: such as `"2 NO + O2 -> 2 NO2"`, one for each rate. Whole numbers before a name count
-    molecules; a side may be empty.
+- `reactions`: such as `"2 NO + O2 -> 2 NO2"`, one for each rate. An integer before a name is the
+    number of molecules; a side may be empty.
 - `rates`: the rate constants $k$.
-- `species`: the order of the species in the state. Default: that in which reactions name them.
+- `species`: the order of the species in the state. Default: the order in which the reactions name
+    them.
 
 **Raises:**
 
-`ValueError` if a reaction cannot be read, or rates or species do not match the reactions.
+`ValueError` if a reaction cannot be parsed, or rates or species do not match the reactions.
 """
 
 
 @final
 class _Entropic(eqx.Module):
-    """The projection by factors, as a formula."""
+    """The formula of the projection in relative entropy."""
 
     rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
@@ -175,7 +178,7 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
     small = _ROUNDOFF * jnp.finfo(y.dtype).eps
 
     def missing(y: State) -> Float[Array, " balances"]:
-        # Sums of products in a loop: a matrix product rounds differently in a batch.
+        # A sum of products, because a matrix product rounds differently in a batch.
         return target - jnp.sum(jnp.asarray(rows, y.dtype) * y, axis=1)
 
     def off(carry: tuple[Array, Array, Array]) -> Array:
@@ -193,26 +196,28 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
 
 @_balanced.defjvp
 def _(rows: Rows, primals: Any, tangents: Any) -> Any:
-    """By the implicit function theorem: an iteration has no reverse mode, and needs none."""
+    """The implicit function theorem, because a `while_loop` has no reverse mode."""
     (y, target), (t_y, t_target) = primals, tangents
     out = _balanced(rows, y, target)
-    # Where `y` is zero the factor is that of the first balances, which nothing else tells.
+    # Where `y` is zero its factor cannot be computed from `out / y` and is set to zero.
     t_out = jnp.where(y > 0, out / jnp.where(y > 0, y, 1), 0) * t_y
     left = t_target - jnp.sum(jnp.asarray(rows, y.dtype) * t_out, axis=1)
     return out, t_out + out * _exponents(rows, out, left)
 
 
 def _exponents(rows: Rows, y: State, left: Float[Array, " balances"]) -> State:
-    """The `Wᵀ μ` by which the balances of `y` change by `left`, to first order."""
+    """The `Wᵀ μ` that changes the balances of `y` by `left`, to first order."""
     weights = jnp.asarray(rows, y.dtype)
     gram = [[jnp.sum(a * b * y) for b in weights] for a in weights]
     multipliers = unrolled_solver(gram, 0.0).solve(tuple(left))
     return sum((m * row for m, row in zip(multipliers, weights, strict=True)), jnp.zeros_like(y))
 
 
-# From errors of ten per cent: 1e-1, 5e-3, 1e-5, 1e-10, roundoff. Larger ones need more.
+# The largest number of updates, and the largest exponent in one. Errors of ten per cent decrease as
+# 1e-1, 5e-3, 1e-5, 1e-10, roundoff; larger ones need more updates.
 _UPDATES, _LONGEST = 8, 1.0
-# In units of that of one number; a balance is a sum of several.
+# The accepted error in units of roundoff. It is above 1 because a balance is a sum of several
+# numbers.
 _ROUNDOFF = 4
 
 
@@ -237,7 +242,7 @@ def _tables(reactions: tuple[str, ...], species: tuple[str, ...]) -> _Tables:
 
 
 def _sides(reaction: str) -> tuple[dict[str, int], dict[str, int]]:
-    """How many molecules of each species a reaction takes, and makes."""
+    """The numbers of molecules of each species that a reaction consumes and produces."""
     sides = reaction.split("->")
     terms = [[term.strip() for term in side.split("+")] for side in sides]
     matches = [[re.fullmatch(r"(\d+)?\s*([^\W\d]\S*)", x) for x in side if x] for side in terms]
@@ -254,7 +259,8 @@ def _sides(reaction: str) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def _left_null_space(matrix: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """A basis of whole numbers of the `w` with `wᵀ matrix = 0`, positive where that is easy."""
+    """An integer basis of the `w` with `wᵀ matrix = 0`, without negative entries where these are
+    easily removed."""
     rows = [[Fraction(int(x)) for x in column] for column in matrix.T]
     pivots: list[int] = []
     for column in range(len(matrix)):
@@ -279,13 +285,14 @@ def _left_null_space(matrix: np.ndarray) -> tuple[tuple[int, ...], ...]:
 
 
 def _whole(vector: list[Fraction]) -> tuple[int, ...]:
-    """The shortest vector of whole numbers in this direction."""
+    """The shortest integer vector in this direction."""
     scaled = [int(x * np.lcm.reduce([x.denominator for x in vector])) for x in vector]
     return tuple(int(x // np.gcd.reduce(scaled)) for x in scaled)
 
 
 def _without_negative(basis: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-    """The same space, with multiples of other vectors added to those that have negative entries."""
+    """A basis of the same space, where multiples of other vectors are added to those with negative
+    entries."""
     vectors = [np.array(v) for v in basis]
     for i, vector in enumerate(vectors):
         for j, other in enumerate(vectors):
@@ -296,7 +303,7 @@ def _without_negative(basis: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
 
 
 def _formula(weights: tuple[int, ...], species: tuple[str, ...]) -> str:
-    """Such as `NO + 2 N2O5`."""
+    """The formula of a balance, such as `NO + 2 N2O5`."""
     parts = [(w, name) for w, name in zip(weights, species, strict=True) if w]
     text = " ".join(
         f"{'-' if w < 0 else '+'} {f'{abs(w)} ' if abs(w) != 1 else ''}{name}" for w, name in parts

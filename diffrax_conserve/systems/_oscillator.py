@@ -23,7 +23,7 @@ class HarmonicOscillator(AbstractSystem):
     **Manifold**: energy. **Reference**: exact. **Samples**: uniform in area on the annulus
     $\tfrac12 \le |y| \le \tfrac32$.
 
-    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose initial state and horizon are the
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose initial state and time span are the
     defaults.
     """
 

@@ -1,4 +1,4 @@
-"""References where no closed form is known."""
+"""Numerical references for systems without a known solution in closed form."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from ._base import AbstractSystem
 
 
 class AbstractIntegratedSystem(AbstractSystem):
-    """A system without a solution in closed form: its reference is computed numerically."""
+    """A system without a known solution in closed form: its reference is computed numerically."""
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
         return integrate(self, ts, y0)
@@ -27,10 +27,11 @@ def integrate(
 ) -> Any:
     """The states at `ts` by the eighth-order method of Dormand and Prince, in float64.
 
-    The solver steps exactly onto `ts`: dense output is off by 1e-10 even at tolerances near
-    roundoff. These are at roundoff because the local errors add up: over the default horizons a
-    tolerance of 1e-13 leaves errors of 1e-12 to 5e-9, one of 1e-15 errors of 1e-13 to 4e-11, for
-    1.6 times the steps (measured against closed forms, and against a tolerance of 1e-16).
+    The solver steps exactly to `ts`, because dense output has errors of 1e-10 even at tolerances
+    near roundoff. The tolerances are at roundoff because local errors add up: over the default time
+    spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to errors of
+    1e-13 to 4e-11, with 1.6 times the steps (compared with closed forms, and with a tolerance of
+    1e-16).
     """
     controller = dfx.ClipStepSizeController(dfx.PIDController(rtol=1e-15, atol=atol), step_ts=ts)
     sol = dfx.diffeqsolve(

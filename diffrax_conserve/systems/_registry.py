@@ -1,4 +1,4 @@
-"""The catalogue by name, as the command line sees it."""
+"""The catalogue by name, as the command line uses it."""
 
 import difflib
 
@@ -18,7 +18,7 @@ from ._solar import OuterSolarSystem
 from ._toda import TodaLattice
 from ._vortices import PointVortices
 
-# In the order in which they are listed: the paper's five first.
+# In the order of the list: the paper's five first.
 _SYSTEMS: dict[str, type[AbstractSystem]] = {
     system.name: system
     for system in (
@@ -43,7 +43,8 @@ _ALL = _SYSTEMS | _STIFF
 
 
 def names(*, stiff: bool = False) -> tuple[str, ...]:
-    """The names of the systems of the catalogue: of those that are not stiff, or of the stiff."""
+    """The names of the systems of the catalogue: the non-stiff ones, or with `stiff` the stiff
+    ones."""
     return tuple(_STIFF if stiff else _SYSTEMS)
 
 
@@ -56,12 +57,12 @@ def get(name: str) -> AbstractSystem:
 
     **Returns:**
 
-    An instance of the system's class. Other parameters are given to the class itself:
+    An instance of the system's class. For other parameters, call the class itself:
     `Kepler(mu=2.0)`.
 
     **Raises:**
 
-    `ValueError` for an unknown name, naming those that are close to it.
+    `ValueError` for an unknown name; the message suggests similar names.
 
     !!! example
 

@@ -26,14 +26,14 @@ class RigidBody(AbstractSystem):
     $$H = \tfrac12 \sum_i w_i^2 / I_i, \qquad L = \tfrac12 \sum_i w_i^2.$$
 
     **Manifold**: energy $H$ and half the squared angular momentum $L$ (the paper prints $w_3^3$ for
-    $w_3^2$ in $L$). At a steady rotation, about a principal axis, the two are dependent.
+    $w_3^2$ in $L$). The two are dependent in a steady rotation about a principal axis.
     **Reference**: exact, by Jacobi's elliptic functions; needs at least two distinct moments, and
-    loses accuracy at the separatrix $L = H I_2$, where the motion is itself unstable.
-    **Samples**: uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
+    loses accuracy at the separatrix $L = H I_2$, where the motion itself is unstable. **Samples**:
+    uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
 
-    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and horizon are
-    the defaults (1.55 periods; the step is ours, the paper gives none); Landau and Lifshitz,
-    "Mechanics", §37 for the solution.
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and time span
+    (1.55 periods) are the defaults; the paper gives no step, so `dt` is our choice; Landau and
+    Lifshitz, "Mechanics", §37 for the solution.
     """
 
     inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
@@ -91,7 +91,8 @@ class RigidBody(AbstractSystem):
         return None
 
     def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
-        # Not the two that the paper shows: there a closed orbit is an arc, run to and fro.
+        # All three components, unlike in the paper: in two of them a closed orbit appears as an
+        # arc, traversed back and forth.
         return {"angular momentum": ys}
 
 
@@ -113,8 +114,8 @@ def _elliptic_form(
 
     Here $b$ is the axis of the middle moment of inertia. With $w_i' = k_i w_j w_k$,
     inserting this form gives $\lambda^2 = -k_b k_c A^2$, $B = k_b A C / \lambda$ and
-    $m = k_a C^2 / k_c A^2$. Of the two outer axes, $a$ is the one for which $m \le 1$: the one that
-    $w$ circles.
+    $m = k_a C^2 / k_c A^2$. Of the two outer axes, $a$ is the one for which $m \le 1$, about which
+    $w$ rotates.
     """
     order = jnp.argsort(inertia)
     k = jnp.stack(_rates(inertia))

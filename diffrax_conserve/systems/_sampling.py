@@ -1,4 +1,4 @@
-"""Random points of the plane and of space, from which the systems build their initial states."""
+"""Random points of the plane and of space, for the initial states of the systems."""
 
 import jax.numpy as jnp
 import jax.random as jr

@@ -18,7 +18,7 @@ States = tuple[Float[Array, "times bodies 3"], Float[Array, "times bodies 3"]]
 
 _BODIES = ("Sun", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 
-# Relative to the Sun; the four inner planets are counted with the Sun.
+# Relative to the Sun; the mass of the Sun includes the four inner planets.
 _MASSES = (
     1.00000597682,
     0.000954786104043,
@@ -48,8 +48,8 @@ _VELOCITIES = (
     (0.00276725, -0.00170702, -0.00136504),
 )
 
-# One over the mean motion of Jupiter, in days: it makes the metric's weights of positions and of
-# velocities comparable.
+# The inverse mean motion of Jupiter, in days, which makes the weights of positions and velocities
+# in the metric comparable.
 _TIME_SCALE = 4332.6 / 6.283185307179586
 
 
@@ -57,30 +57,30 @@ _TIME_SCALE = 4332.6 / 6.283185307179586
 class OuterSolarSystem(AbstractSystem):
     r"""Newton's equations of the Sun, Jupiter, Saturn, Uranus, Neptune and Pluto.
 
-    The state `y = (q, v)` holds positions and velocities, each of shape `(6, 3)`, in astronomical
-    units and days, with masses in those of the Sun:
+    The state `y = (q, v)` consists of positions and velocities, each of shape `(6, 3)`, in
+    astronomical units and days, with masses in solar masses:
 
     $$q_i' = v_i, \qquad v_i' = -G \sum_{j \ne i} m_j \frac{q_i - q_j}{|q_i - q_j|^3}.$$
 
     **Manifold**: energy $\tfrac12 \sum m_i |v_i|^2 - G \sum_{i<j} m_i m_j / |q_i - q_j|$, linear
     momentum $\sum m_i v_i$ and angular momentum $\sum m_i q_i \times v_i$. `centre_of_mass` is a
-    first integral that depends on time; it is left out since every Runge-Kutta method keeps it.
+    first integral that depends on time; it is not in the manifold because every Runge-Kutta method
+    conserves it.
 
-    Before projecting on the energy alone: the Euclidean projection breaks the linear momentum,
-    which every Runge-Kutta method keeps, since the gradient of the energy is $m_i v_i$, and
-    $\sum m_i (m_i v_i) \ne 0$. In the mass metric (`metric`) the correction of $v_i$ is
-    proportional to $v_i$, and $\sum m_i v_i = 0$ in the barycentric frame: so the default state is
-    barycentric. Measured with RK4 over the default 2,000 steps: the momentum drifts by 2e-2 of its
-    scale in the Euclidean metric and by 3e-15 in that of the masses. With the whole manifold the
-    Euclidean projection is the more accurate: largest error 0.64 AU without projection, 0.31 in
-    the mass metric, 0.052 in the Euclidean.
+    Every Runge-Kutta method conserves the linear momentum, but a Euclidean projection on the energy
+    alone does not: the gradient of the energy is $m_i v_i$, and $\sum m_i (m_i v_i) \ne 0$. In the
+    mass metric (`metric`) the correction of $v_i$ is proportional to $v_i$, and $\sum m_i v_i = 0$
+    in the barycentric frame, so the default state is barycentric. With RK4 over the default 2,000
+    steps, the momentum drifts by 2e-2 of its scale in the Euclidean metric and by 3e-15 in the mass
+    metric. With the whole manifold the Euclidean projection is more accurate: the largest error is
+    0.64 AU without projection, 0.31 AU in the mass metric, and 0.052 AU in the Euclidean one.
 
-    **Reference**: numerical. **Samples**: the real state, with each heliocentric position and
-    velocity component changed by a normal deviate of 1 % of that body's distance or speed, then
-    barycentric.
+    **Reference**: numerical. **Samples**: the real state, with a normal deviate of 1 % of each
+    body's heliocentric distance or speed added to each component of its position or velocity, then
+    converted to barycentric coordinates.
 
-    Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.4, Table 2.2, where
-    the data are those of the "Ahnerts Kalender für Sternfreunde 1994" for September 5, 1994.
+    Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.4, Table 2.2, with
+    data from "Ahnerts Kalender für Sternfreunde 1994" for September 5, 1994.
     """
 
     masses: Float[Array, " bodies"] = eqx.field(converter=real, default=_MASSES)
@@ -121,7 +121,7 @@ class OuterSolarSystem(AbstractSystem):
         return jnp.sum(self.like(y).masses[:, None] * jnp.cross(q, v), axis=0)
 
     def centre_of_mass(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, "3"]:
-        r"""$\sum m_i (q_i - t v_i) / \sum m_i$: where the centre of mass was at time 0."""
+        r"""$\sum m_i (q_i - t v_i) / \sum m_i$, the centre of mass at time 0."""
         del args
         q, v = y
         masses = self.like(y).masses
@@ -146,7 +146,7 @@ class OuterSolarSystem(AbstractSystem):
         return self.barycentric((jnp.array(_POSITIONS), jnp.array(_VELOCITIES)))
 
     def barycentric(self, y: State) -> State:
-        """The state `y` seen from the centre of mass, which is then at rest at the origin."""
+        """The state `y` relative to the centre of mass, which is then at rest at the origin."""
         q, v = y
         weights = self.like(y).masses[:, None]
         weights = weights / jnp.sum(weights)
@@ -176,12 +176,12 @@ class OuterSolarSystem(AbstractSystem):
 
 OuterSolarSystem.__init__.__doc__ = r"""**Arguments:**
 
-- `masses`: of the six bodies, the Sun first, in solar masses.
+- `masses`: the masses of the six bodies, the Sun first, in solar masses.
 - `gravity`: the gravitational constant $G$, in AU³ per day² and solar mass.
 """
 
 
 def _distances(separation: Float[Array, "bodies bodies 3"]) -> Float[Array, "bodies bodies"]:
-    """Distances between bodies; a body is given distance 1 from itself."""
+    """Distances between bodies, with ones on the diagonal."""
     own = jnp.eye(separation.shape[0], dtype=separation.dtype)
     return jnp.sqrt(jnp.sum(separation**2, axis=2) + own)

@@ -24,8 +24,8 @@ class TodaLattice(AbstractIntegratedSystem):
     q' = p, \quad p' = -\partial H / \partial q, \qquad q_{N+1} = q_1.$$
 
     The system is integrable. With $d_i = \sqrt{a/b}\, e^{b (q_i - q_{i+1}) / 2}$, the symmetric
-    matrix $L$ that has $p_i$ on its diagonal and $d_i$ between the neighbours $i$ and $i + 1$ keeps
-    its eigenvalues, so
+    matrix $L$ with $p_i$ on its diagonal and $d_i$ between the neighbours $i$ and $i + 1$ has
+    constant eigenvalues, so
 
     $$I_k = \tfrac1k \operatorname{tr} L^k, \qquad k = 1, \dots, N$$
 
@@ -35,9 +35,9 @@ class TodaLattice(AbstractIntegratedSystem):
     \text{ a constant, for } N = 3).$$
 
     **Manifold**: linear momentum, energy, and the higher traces $I_3, \dots, I_N$, an array of
-    shape `(N - 2,)`. At the equilibrium they are dependent; for many particles the powers make
-    them poorly scaled, and the momentum and energy alone may serve better. **Reference**:
-    numerical. **Samples**: $q_i$ and $p_i$ uniform on $[-1, 1]$.
+    shape `(N - 2,)`. They are dependent at the equilibrium. For many particles the powers make them
+    poorly scaled, and momentum and energy alone may be preferable. **Reference**: numerical.
+    **Samples**: $q_i$ and $p_i$ uniform on $[-1, 1]$.
 
     Source: M. Hénon, "Integrals of the Toda lattice", and H. Flaschka, "The Toda lattice. II",
     both Phys. Rev. B 9 (1974); Hairer, Lubich and Wanner, "Geometric Numerical Integration", X.1.5.
@@ -125,6 +125,6 @@ class TodaLattice(AbstractIntegratedSystem):
 
 TodaLattice.__init__.__doc__ = r"""**Arguments:**
 
-- `a`, `b`: strength and steepness of the springs.
-- `particles`: their number $N \ge 3$.
+- `a`, `b`: the strength and steepness of the springs.
+- `particles`: the number $N \ge 3$ of particles.
 """

@@ -20,9 +20,9 @@ State = Float[Array, "vortices 2"]
 
 
 class Reduced(NamedTuple):
-    """A state up to symmetries: a `diffrax_conserve.learned.Frame` is made of these three."""
+    """A state up to symmetries: the three parts of a `diffrax_conserve.learned.Frame`."""
 
-    inputs: Float[Array, " k"]  # what the symmetries do not change
+    inputs: Float[Array, " k"]  # invariants of the symmetries
     basis: Float[Array, "n m"]  # directions that turn with the state
     clock: Float[Array, ""]  # units of its own time in one unit of time
 
@@ -40,13 +40,12 @@ class PointVortices(AbstractIntegratedSystem):
 
     **Manifold**: energy $H$, linear impulse $(\sum \Gamma_i x_i, \sum \Gamma_i y_i)$ and angular
     impulse $\sum \Gamma_i (x_i^2 + y_i^2)$. At a relative equilibrium, such as a regular polygon of
-    equal vortices, they are dependent. **Reference**: numerical; three vortices move regularly,
-    but four and more are chaotic, and then roundoff grows exponentially over long times.
-    **Samples**: each vortex uniform in area on the annulus of radii $\tfrac12$ and $\tfrac32$,
-    drawn again until all are at least $0.3 / N$ apart, since close pairs turn about each other
-    arbitrarily fast.
+    equal vortices, they are dependent. **Reference**: numerical; three vortices move regularly, but
+    four or more are chaotic, so that roundoff grows exponentially over long times. **Samples**:
+    each vortex uniform in area on the annulus of radii $\tfrac12$ and $\tfrac32$, drawn again until
+    all are at least $0.3 / N$ apart, because close pairs rotate about each other arbitrarily fast.
 
-    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose strengths and horizon (500 steps of
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose strengths and time span (500 steps of
     0.5) are the defaults; P. K. Newton, "The N-Vortex Problem" (2001).
     """
 
@@ -72,7 +71,7 @@ class PointVortices(AbstractIntegratedSystem):
         del t, args
         _, _, r2 = _separations(y)
         gamma = self.like(y).strengths
-        # A vortex is given distance 1 from itself, hence no self-energy.
+        # The distances on the diagonal are 1, so that the self-energy is zero.
         return -jnp.sum(gamma[:, None] * gamma[None, :] * jnp.log(r2)) / (8 * jnp.pi)
 
     def linear_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, "2"]:
@@ -93,7 +92,7 @@ class PointVortices(AbstractIntegratedSystem):
 
     @property
     def y0(self) -> State:
-        """An irregular polygon inside the paper's annulus; the paper names no single state."""
+        """An irregular polygon inside the paper's annulus; the paper gives no initial state."""
         k = jnp.arange(self.strengths.size, dtype=float)
         radius, angle = 1 + 0.4 * jnp.cos(k), 2 * jnp.pi * k / self.strengths.size
         return radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
@@ -117,14 +116,15 @@ class PointVortices(AbstractIntegratedSystem):
     def frame(self, y: State) -> Reduced:
         r"""The frame of three vortices of equal strengths, for a [`diffrax_conserve.DeepONet`][].
 
-        Their flow commutes with translations, rotations, permutations, and changes of scale by $c$
-        together with those of time by $c^2$. What is left of six numbers are two: with $r$ from one
-        to the other of the closest pair, $d = |r|$, and $q$ from their middle to the third vortex,
-        they are the ratio $d / |q|$ and the angle between $r$ and $q$. The third input and the sine
-        and cosine of twice the angle do not depend on which of the pair is the first. The basis
-        stretches and turns $r$ and a vector of length $d$ along $q$, and the clock is $1 / d^2$.
+        Their flow commutes with translations, rotations, permutations, and changes of the length
+        scale by $c$ together with the time scale by $c^2$. Two invariants remain of six numbers:
+        with $r$ from one vortex of the closest pair to the other, $d = |r|$, and $q$ from their
+        midpoint to the third vortex, they are the ratio $d / |q|$ and the angle between $r$ and
+        $q$. The inputs are the cosine and sine of twice the angle and the ratio, which do not
+        depend on the order of the pair. The columns of the basis stretch and rotate $r$, and move
+        the third vortex along and across $q$ in units of $d$; the clock is $1 / d^2$.
 
-        It is discontinuous where another pair becomes the closest.
+        The frame is discontinuous where another pair becomes the closest.
 
         **Raises:**
 
@@ -132,14 +132,15 @@ class PointVortices(AbstractIntegratedSystem):
         """
         _check_three_equal(self.strengths)
         third = jnp.argmax(jnp.sum((y - jnp.mean(y, axis=0)) ** 2, axis=1))
-        # The one that is farthest from the centre is opposite the closest pair.
+        # The vortex that is farthest from the centre is opposite the closest pair.
         alone = jnp.arange(3) == third
         second, first = jnp.roll(alone, 1), jnp.roll(alone, -1)
         r, q = second @ y - first @ y, alone @ y - (first @ y + second @ y) / 2
         d, e = jnp.linalg.norm(r), q / jnp.linalg.norm(q)
         cosine, sine = r @ e / d, r @ _quarter_turn(e) / d
         inputs = [cosine**2 - sine**2, 2 * sine * cosine, d / jnp.linalg.norm(q)]
-        # A change of `q` moves all three, one of `r` only the pair: neither moves the centre.
+        # A change of `q` moves all three vortices, a change of `r` only the pair; neither moves the
+        # centre.
         of_q, of_r = alone - 1 / 3, (second * 1.0 - first) / 2
         columns = [
             *(jnp.outer(of_q, d * x).reshape(-1) for x in (e, _quarter_turn(e))),
@@ -156,7 +157,7 @@ class PointVortices(AbstractIntegratedSystem):
 
 PointVortices.__init__.__doc__ = r"""**Arguments:**
 
-- `strengths`: the strengths $\Gamma_1, \dots, \Gamma_N$, whose number is that of the vortices.
+- `strengths`: the strengths $\Gamma_1, \dots, \Gamma_N$, one for each vortex.
 """
 
 

@@ -26,7 +26,7 @@ from .._manifold import (
 from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
 
-# Twice what a projection accepts by default: the residual is evaluated here once more.
+# Twice the default tolerance of a projection, because the residual is evaluated again here.
 ULPS = 32
 
 
@@ -43,26 +43,26 @@ def assert_conserved(
     r"""Asserts that a solution stays on a manifold, at each saved time and in dense output.
 
     At $(t_k, y_k)$ the residual of each scalar constraint is at most $atol + rtol \cdot s_k$. The
-    scale $s_k$, what roundoff is relative to, is the larger one of
+    scale $s_k$, to which roundoff is proportional, is the larger value of
     $|I_0| + \sum_i |y_i\, \partial I/\partial y_i|$ at $(t_k, y_k)$ and at the initial state.
 
     **Arguments:**
 
-    - `solution`: what `diffrax.diffeqsolve` returned, or `jax.vmap` of it: each lane is checked.
-        Rows that diffrax padded (times `inf`) are ignored.
+    - `solution`: the solution from `diffrax.diffeqsolve`, or from `jax.vmap` of it: each lane is
+        checked. Rows that diffrax padded (times `inf`) are ignored.
     - `manifold`: a PyTree of [`diffrax_conserve.FirstIntegral`][]s and
         [`diffrax_conserve.Constraint`][]s.
     - `args`: as given to `diffeqsolve`; the same in every lane.
-    - `y0`: the initial state, with whose integrals all is compared. Default: the first saved state.
+    - `y0`: the initial state, which defines the conserved values. Default: the first saved state.
     - `rtol`, `atol`: tolerances. Default: 32 units of roundoff of the coarsest dtype in the state,
         twice what a projection accepts, and 0.
-    - `num_dense`: at how many times, evenly spaced, to check dense output where there is some.
+    - `num_dense`: the number of evenly spaced times at which dense output, if present, is checked.
 
     **Raises:**
 
     `AssertionError` if the solve did not succeed, if a state is infinite or NaN, or if a constraint
-    is violated. Its message names the constraint and says where, by how much in units of roundoff,
-    and what to look at. `ValueError` if there is nothing to check.
+    is violated. Its message names the constraint, the place, the violation in units of roundoff,
+    and likely causes. `ValueError` if there is nothing to check.
 
     !!! example
 
@@ -123,8 +123,8 @@ def assert_on_manifold(
         [`diffrax_conserve.Constraint`][]s.
     - `y`: the state; for several, use a loop, or a solution and `assert_conserved`.
     - `t`, `args`: passed to the functions of the manifold.
-    - `value`: the conserved values, as in [`diffrax_conserve.project`][]. Not needed where each
-        `FirstIntegral` has a `value` of its own.
+    - `value`: the conserved values, as in [`diffrax_conserve.project`][]. Not needed if each
+        `FirstIntegral` has its own `value`.
     - `rtol`, `atol`: as in [`diffrax_conserve.testing.assert_conserved`][].
 
     **Raises:**
@@ -161,7 +161,7 @@ class Measured(NamedTuple):
     scale: Any
     found: Any
     target: Any  # of shape `(lanes, ...)`
-    finite: Array  # whether the state is, of shape `(lanes, times)`
+    finite: Array  # whether the state is finite, of shape `(lanes, times)`
 
 
 @eqx.filter_jit
@@ -177,8 +177,8 @@ def measure(
     lane: tuple[Real[Array, " times"], Any, Real[Array, ""], Any],
     args: Args,
 ) -> Measured:
-    """The residuals and their scales in a lane `(ts, ys, t0, y0)`; rows that are padded are taken
-    for the initial state."""
+    """The residuals and their scales in a lane `(ts, ys, t0, y0)`; padded rows are treated as the
+    initial state."""
     ts, ys, t0, y0 = lane
     target = conserved_values(manifold, t0, y0, args) if values is None else values
     _, initial_scale = residuals(manifold, target, t0, y0, args)
@@ -207,7 +207,7 @@ def _refuse_unsuccessful(solution: dfx.Solution) -> None:
 
 
 def _sampled(solution: dfx.Solution, num_dense: int) -> list[tuple[str, Array, Any]]:
-    """Names, times and states of what a solution holds."""
+    """The kind, times and states of each set of states in a solution."""
     kinds = []
     if solution.ts is not None and solution.ys is not None:
         if not eqx.is_array(solution.ts):
@@ -273,7 +273,7 @@ def _given_values(manifold: Manifold, value: Values | None, t: Array, y: Y, args
 def _limits(
     measured: Measured, rtol: RealScalarLike | None, atol: RealScalarLike, ys: Any
 ) -> tuple[Any, float]:
-    """What the residuals may be, and the unit of roundoff: that of the coarsest dtype."""
+    """The largest accepted residuals, and the unit of roundoff of the coarsest dtype."""
     dtypes = [x.dtype for x in jtu.tree_leaves((ys, measured.residual))]
     eps = max(float(jnp.finfo(dtype).eps) for dtype in dtypes)
     relative = ULPS * eps if rtol is None else rtol
@@ -289,7 +289,7 @@ def _samples(
     measured: Measured,
     limits: tuple[Any, float],
 ) -> list[Sample]:
-    """One for each scalar constraint, with its readable name."""
+    """One sample for each scalar constraint, with a readable name."""
     treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
     limit, eps = limits
     trees = (measured.residual, measured.scale, measured.found, limit, measured.target)

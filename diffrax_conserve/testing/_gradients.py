@@ -25,24 +25,23 @@ def assert_gradients(
 ) -> None:
     r"""Asserts that forward and reverse mode agree with finite differences.
 
-    For each array in `args`, along one random direction $v$ in it, and for one random $w$ like the
-    output, the three values of $w^\top J v$ are compared: forward mode gives $J v$, reverse mode
+    For each array in `args`, with one random direction $v$ in it and one random $w$ shaped like the
+    output, three values of $w^\top J v$ are compared: forward mode gives $J v$, reverse mode
     $J^\top w$, and the differences, of fourth order, use $f(x \pm h v)$ and $f(x \pm 2 h v)$ with
     $h \approx \epsilon^{1/5} \max(1, |x|) / 4$.
 
     **Arguments:**
 
     - `f`: a function of PyTrees that returns a PyTree of real arrays. It is compiled. In a solve,
-        use fixed steps: the differences see adaptive steps change, derivatives do not.
-    - `*args`: where to differentiate. Arrays and numbers that are floating-point are varied, all
-        else is passed on; arrays inside an [`equinox.Module`][] count.
+        use fixed steps: changes of adaptive steps affect the differences but not the derivatives.
+    - `*args`: the arguments at which to differentiate. Floating-point arrays and numbers are
+        varied, also those in an [`equinox.Module`][]; everything else is constant.
     - `rtol`: relative to the sum of the absolute terms of $w^\top J v$. Default: the square root of
         the machine epsilon, 1.5e-8 in float64.
-    - `atol`: absolute. Default: `rtol` times the largest output, which is what the differences
-        resolve.
-    - `forward`, `reverse`: which modes to check. `diffrax.RecursiveCheckpointAdjoint`, the default
-        of `diffeqsolve`, has no forward mode, and `diffrax.ForwardMode` no reverse mode.
-    - `seed`: of the directions.
+    - `atol`: absolute. Default: `rtol` times the largest output, the resolution of the differences.
+    - `forward`, `reverse`: whether to check these modes. `diffrax.RecursiveCheckpointAdjoint`, the
+        default of `diffeqsolve`, has no forward mode, and `diffrax.ForwardMode` no reverse mode.
+    - `seed`: the seed of the directions.
 
     **Raises:**
 
@@ -131,7 +130,7 @@ def _differences(
     """The derivative of `value` along `v`, to fourth order."""
     touched = [a for a, b in zip(jtu.tree_leaves(x), jtu.tree_leaves(v), strict=True) if b.any()]
     h = eps**0.2 * max(1.0, _largest(touched)) / 4
-    # A power of two, so that the displacements themselves are not rounded more than need be.
+    # A power of two, so that the displacements have as little roundoff as possible.
     h = 2.0 ** round(np.log2(h))
 
     def at(factor: float) -> PyTree[Array]:

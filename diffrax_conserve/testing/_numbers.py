@@ -13,7 +13,7 @@ from .._custom_types import RealScalarLike
 def rounded(magnitude: RealScalarLike) -> st.SearchStrategy[float]:
     """Numbers in `[-magnitude, magnitude]` to six significant digits of `magnitude`.
 
-    Rounding keeps products of what is drawn from underflow, and counter-examples readable.
+    Rounding avoids underflow in products, and makes counterexamples readable.
     """
     magnitude = float(magnitude)
     digits = 6 - math.floor(math.log10(magnitude))
@@ -34,9 +34,9 @@ def step_sizes(
 
     **Returns:**
 
-    A strategy of positive numbers with three significant digits. It shrinks to `largest`: a
-    counter-example with few steps is the easiest to follow. They are NumPy's `float64`, since
-    [`equinox.filter_jit`][] compiles anew for each Python float.
+    A strategy of positive numbers with three significant digits. It shrinks to `largest`, because a
+    counterexample with few steps is the easiest to follow. The numbers are NumPy `float64`, because
+    [`equinox.filter_jit`][] compiles again for each Python float.
 
     **Raises:**
 
@@ -67,7 +67,7 @@ def step_sizes(
     def step(k: int) -> float:
         return min(max(float(f"{largest * ratio ** (k / 1000):.3g}"), smallest), largest)
 
-    # In two maps: of a named function hypothesis would show the call, not the value.
+    # Two maps, because hypothesis shows the call of a named function instead of its value.
     return st.integers(0, 1000).map(step).map(lambda h: np.asarray(h)[()])
 
 
@@ -78,9 +78,9 @@ def times(
 
     **Arguments:**
 
-    - `t0`, `t1`: the ends, of which the second may be the smaller.
-    - `size`: how many times. It is fixed, so that a compiled solve with `SaveAt(ts=...)` is
-        compiled once.
+    - `t0`, `t1`: the ends; `t1` may be smaller than `t0`.
+    - `size`: the number of times. It is fixed, so that a solve with `SaveAt(ts=...)` is compiled
+        once.
 
     **Returns:**
 
@@ -111,6 +111,6 @@ def times(
             f"`times` needs finite ends and a positive size, but got t0={t0}, t1={t1}, size={size}."
         )
     parts = st.lists(st.integers(0, 1000), min_size=size, max_size=size)
-    # Both ends exactly: beyond them a solution holds nothing.
+    # Clipped to the exact ends, because a solution is not defined beyond them.
     low, high = min(t0, t1), max(t0, t1)
     return parts.map(lambda k: np.clip(t0 + (t1 - t0) * np.sort(k) / 1000, low, high))

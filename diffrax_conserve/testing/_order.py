@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, RealScalarLike, Y
 
 _REFINEMENTS = np.array([1, 2, 3, 4, 6])
-# Errors below this many units of roundoff of the state are not the method's.
+# Errors below this many units of roundoff of the state are dominated by roundoff.
 _FLOOR = 1e3
 
 
@@ -29,22 +29,23 @@ def assert_order(
     reference: Y | None = None,
     margin: RealScalarLike = 0.3,
 ) -> None:
-    r"""Asserts that the error of a solver falls with the step as its order says.
+    r"""Asserts that the error of a solver decreases with the step size according to its order.
 
     Solves with fixed steps of $h/1$, $h/2$, $h/3$, $h/4$ and $h/6$, where $h$ is `dt0`, fits
-    $\log(\text{error at } t_1) = p \log h + c$ by least squares, and demands
-    $p \ge order - margin$. Errors that are lost in roundoff are left out. A higher order than
-    claimed is no failure.
+    $\log(\text{error at } t_1) = p \log h + c$ by least squares, and requires
+    $p \ge order - margin$. Errors dominated by roundoff are ignored. A higher order than claimed is
+    not a failure.
 
     **Arguments:**
 
     - `solver`: a diffrax solver, wrapped or not, for which fixed steps make sense.
-    - `terms`, `y0`, `t0`, `t1`, `dt0`, `args`: as for `diffrax.diffeqsolve`. Take a smooth problem,
-        a horizon of a few steps or more, and a `dt0` at which the method already is asymptotic.
-    - `order`: what is claimed. Default: `solver.order(terms)`.
+    - `terms`, `y0`, `t0`, `t1`, `dt0`, `args`: as for `diffrax.diffeqsolve`. Choose a smooth
+        problem, an interval of at least a few steps, and a `dt0` in the asymptotic range of the
+        method.
+    - `order`: the claimed order. Default: `solver.order(terms)`.
     - `reference`: the exact state at `t1`. Default: computed by `diffrax.Dopri8` with ten times as
         many steps, if `terms` is a `diffrax.ODETerm`; otherwise by `solver` with 48 times as many.
-    - `margin`: how much smaller the measured slope may be.
+    - `margin`: the accepted difference by which the measured slope is smaller.
 
     **Raises:**
 
@@ -94,7 +95,7 @@ def _final(
     sol = dfx.diffeqsolve(
         terms, solver, t0, t0 + span, span / count, y0, args, max_steps=max_steps, throw=False
     )
-    # NaN in the table says which of the solves failed.
+    # NaN in the table marks the solves that failed.
     okay = dfx.is_okay(sol.result)
     return jtu.tree_map(lambda y: jnp.where(okay, y[-1], jnp.nan), sol.ys)
 

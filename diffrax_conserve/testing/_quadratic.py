@@ -27,8 +27,8 @@ class QuadraticSystem(eqx.Module):
     f_i(y) = \sum_j A_{ij} (Q_1 y)_j \quad\text{or}\quad
     f_i(y) = \sum_{jl} A_{ijl} (Q_1 y)_j (Q_2 y)_l.$$
 
-    Then $\nabla I_k \cdot f = 0$. The first is a linear Hamiltonian system with any constant
-    Poisson structure, the second is Nambu's: the free rigid body, for $n = 3$.
+    Then $\nabla I_k \cdot f = 0$. The first is a linear Hamiltonian system with a constant Poisson
+    structure, the second a Nambu system: for $n = 3$ the free rigid body.
 
     **Attributes:** `forms`, the $Q_k$, of shape `(integrals, n, n)`; `alternating`, $A$, of shape
     `(n, n)` or `(n, n, n)`; `y0`, the initial state, of shape `(n,)`.
@@ -64,23 +64,23 @@ class QuadraticSystem(eqx.Module):
 def quadratic_systems(dimension: int, *, integrals: int = 1) -> st.SearchStrategy[QuadraticSystem]:
     """Random quadratic first integrals with a vector field that conserves them, and a state.
 
-    All is drawn as arrays of fixed shapes in a [`diffrax_conserve.testing.QuadraticSystem`][],
-    which is a PyTree: passed to a compiled function, it compiles once for all draws.
+    Draws are [`diffrax_conserve.testing.QuadraticSystem`][]s, which are PyTrees with arrays of
+    fixed shapes, so that a function of one compiles once for all draws.
 
     **Arguments:**
 
-    - `dimension`: of the state; greater than `integrals`.
-    - `integrals`: 1 or 2.
+    - `dimension`: the dimension of the state; greater than `integrals`.
+    - `integrals`: the number of integrals, 1 or 2.
 
     **Returns:**
 
     A strategy of systems with positive definite forms, so that solutions stay bounded, and initial
-    states with components in [-2, 2], not all zero. It shrinks to diagonal forms, no motion, and
-    a state of zeros and one 1.
+    states with components in [-2, 2], not all zero. It shrinks to diagonal forms, a vector field of
+    zero, and a state with a single 1 and otherwise zeros.
 
     **Raises:**
 
-    `ValueError` for other numbers of integrals, or too small a dimension.
+    `ValueError` for other numbers of integrals, or if the dimension is too small.
 
     !!! example
 
@@ -116,8 +116,8 @@ def quadratic_systems(dimension: int, *, integrals: int = 1) -> st.SearchStrateg
 
 
 def _definite(b: np.ndarray) -> np.ndarray:
-    """Symmetric and diagonally dominant. The diagonals differ, or the gradients would be parallel
-    at every state where `b` is zero."""
+    """Symmetric and diagonally dominant. The diagonals differ; otherwise the gradients would be
+    parallel at every state if `b` is zero."""
     n = b.shape[-1]
     diagonals = np.stack([1 + k * np.arange(n) for k in range(len(b))])
     return (b + np.swapaxes(b, 1, 2)) / (2 * n) + diagonals[:, :, None] * np.eye(n)

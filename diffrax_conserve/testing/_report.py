@@ -1,4 +1,4 @@
-"""What an assertion says when it fails: which constraint, where, by how much, what to look at."""
+"""The message of a failed assertion: which constraint, where, by how much, and likely causes."""
 
 import dataclasses
 from typing import Any
@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Bool, Real
 
-# More than these are counted, not shown.
+# The largest number of constraints that are shown; further ones are only counted.
 _SHOWN = 5
 # Residuals up to this many units of roundoff can come from roundoff alone.
 _ROUNDOFF_LIKE = 1e4
@@ -33,7 +33,7 @@ class Sample:
     eps: float
 
     def violations(self) -> Bool[np.ndarray, "lanes times"]:
-        """Where the constraint is not satisfied; NaN never satisfies."""
+        """Where the constraint is not satisfied. NaN never satisfies it."""
         good = np.isfinite(self.limit) & (np.abs(self.residual) <= self.limit) & self.finite
         return ~good
 
@@ -65,7 +65,7 @@ def report_constraints(samples: list[Sample]) -> None:
 
 
 def unsuccessful(result: dfx.RESULTS, lane: tuple[int, ...], failed: int, total: int) -> str:
-    """The message about a solve that says itself that it failed."""
+    """The message about a solve that reports a failure."""
     which = f" in {failed} of {total} lanes, first in lane {lane}" if lane else ""
     message = dfx.RESULTS[result].strip()
     return (
@@ -90,7 +90,7 @@ def _describe(sample: Sample) -> list[str]:
     bad = sample.violations()
     with np.errstate(invalid="ignore", divide="ignore"):
         units = np.abs(sample.residual) / (sample.eps * np.where(sample.scale > 0, sample.scale, 1))
-    # NaN is the worst of all.
+    # NaN counts as the largest.
     ranking = np.where(bad, np.where(np.isnan(units), np.inf, units), -1)
     first = tuple(map(int, np.argwhere(bad)[0]))
     worst = tuple(map(int, np.unravel_index(np.argmax(ranking), ranking.shape)))

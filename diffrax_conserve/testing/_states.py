@@ -22,11 +22,11 @@ _TABLE_SIZE = 256
 
 
 def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.SearchStrategy[Any]:
-    """States like a given one, with bounded components.
+    """States shaped like a given one, with bounded components.
 
     **Arguments:**
 
-    - `like`: a PyTree of floating-point arrays, whose structure, shapes and dtypes are drawn.
+    - `like`: a PyTree of floating-point arrays, which defines structure, shapes and dtypes.
     - `magnitude`: the largest absolute value of a component.
 
     **Returns:**
@@ -62,7 +62,7 @@ def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.Se
                 "write for example `np.zeros(3)`."
             )
     elements = rounded(magnitude)
-    # Drawn as Python numbers: rounding to float32 must not lead out of the bound's own rounding.
+    # Drawn in float64 and then rounded, so that a float32 component is at most the rounded bound.
     arrays = [
         hnp.arrays(np.float64, jnp.shape(x), elements=elements).map(
             lambda a, dtype=jnp.result_type(x): a.astype(dtype)
@@ -79,9 +79,9 @@ def system_states(
 
     **Arguments:**
 
-    - `system`: an [`diffrax_conserve.systems.AbstractSystem`][], whose `sample` is called
-        once, for all of them, so that nothing is compiled while a test draws.
-    - `dtype`: of the states. Default: that of `system.y0`.
+    - `system`: an [`diffrax_conserve.systems.AbstractSystem`][]. Its `sample` is called once for
+        all states, so that nothing is compiled while a test draws.
+    - `dtype`: the dtype of the states. Default: that of `system.y0`.
 
     **Returns:**
 
@@ -108,7 +108,7 @@ def system_states(
     table = jtu.tree_map(
         lambda x: np.asarray(x, x.dtype if dtype is None else dtype), _table(system)
     )
-    # Copies, so that a test which writes to its input does not change what others draw.
+    # Copies, so that a test that modifies its input does not affect other draws.
     return st.integers(0, _TABLE_SIZE - 1).map(
         lambda index: jtu.tree_map(lambda x: x[index].copy(), table)
     )
@@ -125,13 +125,13 @@ def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[A
 
     **Arguments:**
 
-    - `names`: from which to draw. Default: all of `diffrax_conserve.systems.names()`.
+    - `names`: the names to draw from. Default: all of `diffrax_conserve.systems.names()`.
 
     **Returns:**
 
     A strategy of [`diffrax_conserve.systems.AbstractSystem`][]s. It shrinks to the first name.
 
-    Every system is compiled anew: for a test with compiled solves prefer
+    Solves are compiled again for every system: for a test with compiled solves prefer
     `pytest.mark.parametrize`, which also names the system in the report.
 
     !!! example

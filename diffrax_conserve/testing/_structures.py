@@ -1,4 +1,4 @@
-"""A strategy for PyTree structures: one state, packed in many ways."""
+"""A strategy for PyTree structures that repack one state in many ways."""
 
 import math
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from .._manifold import Constraint, FirstIntegral, is_entry
 
 @final
 class Restructuring(eqx.Module):
-    """The components of a state in another PyTree: other nesting, other shapes, the same numbers.
+    """The components of a state in another PyTree, with other nesting and shapes and the same
+    numbers.
 
-    Whatever is true of a state is true of the repacked one, so code that handles any PyTree gives
-    the same numbers for both.
+    Code that handles any PyTree must give the same numbers for a state and the repacked one.
 
     !!! example
 
@@ -79,7 +79,7 @@ class Restructuring(eqx.Module):
 
 
 class _Shape(tuple):
-    """A shape that is a leaf, and prints as one."""
+    """A shape that prints compactly, like a leaf."""
 
     def __repr__(self) -> str:
         return f"<{'×'.join(map(str, self)) or 'scalar'}>"
@@ -101,12 +101,12 @@ def restructurings(
 ) -> st.SearchStrategy[Restructuring]:
     """Ways to repack a state as another PyTree.
 
-    Each structure is compiled anew, so draw few: `@settings(max_examples=5)`.
+    Each structure triggers a compilation, so draw few: `@settings(max_examples=5)`.
 
     **Arguments:**
 
     - `like`: a PyTree of floating-point arrays, all of one dtype.
-    - `max_depth`: how deep tuples, lists and dictionaries may be nested.
+    - `max_depth`: the largest nesting depth of tuples, lists and dictionaries.
 
     **Returns:**
 
@@ -114,7 +114,8 @@ def restructurings(
 
     **Raises:**
 
-    `ValueError` if the leaves of `like` have different dtypes, which a repacked leaf could mix.
+    `ValueError` if the leaves of `like` have different dtypes, because a repacked leaf could
+    contain several of them.
     """
     dtypes = {jnp.result_type(x) for x in jtu.tree_leaves(like)}
     if len(dtypes) != 1:

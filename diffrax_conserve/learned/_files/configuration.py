@@ -1,4 +1,4 @@
-"""The header of a file: the configuration of a network, from which it is built again."""
+"""The header of a file: the configuration from which a network is rebuilt."""
 
 import math
 import types
@@ -28,7 +28,7 @@ from .._networks import (
 )
 
 _CORES = {core.__name__: core for core in (Product, Concatenated, Gated)}
-# The parts that hold functions: a file names the system of the catalogue that they belong to.
+# The parts that contain functions. A file stores the name of the system to which they belong.
 PARTS = ("layer", "taylor", "frame")
 
 
@@ -67,7 +67,7 @@ def describe(model: Any) -> dict[str, Any]:
 
 
 def _describe_windows(pinn: PINN) -> int | list[float]:
-    """Their number, or where they meet if they are not of equal length."""
+    """The number of windows, or their interior boundaries if they are not of equal length."""
     same = PINN(pinn.y0, pinn.t0, pinn.t1, windows=pinn.windows, width=1, depth=1, key=jr.key(0))
     return pinn.windows if same.edges == pinn.edges else list(pinn.edges[1:-1])
 
@@ -95,7 +95,7 @@ def _describe_system(system: AbstractSystem | None) -> dict[str, Any] | None:
 
 
 def part_systems(model: PINN | DeepONet) -> dict[str, AbstractSystem]:
-    """The systems of the catalogue that the parts of a network belong to, by part."""
+    """For each part of a network, the system of the catalogue to which it belongs."""
     layer, taylor, frame = (getattr(model, name, None) for name in PARTS)
     found = {
         "layer": None if layer is None else _layer_system(layer),
@@ -106,7 +106,7 @@ def part_systems(model: PINN | DeepONet) -> dict[str, AbstractSystem]:
 
 
 def _layer_system(layer: ConservativeLayer) -> AbstractSystem | None:
-    """The system whose manifold the layer has."""
+    """The system to whose manifold the layer projects."""
     entries = jtu.tree_leaves(layer.manifold, is_leaf=is_entry)
     owner = _owner(entries[0].fn)
     if owner is None or layer.args is not None:
@@ -115,16 +115,16 @@ def _layer_system(layer: ConservativeLayer) -> AbstractSystem | None:
 
 
 def _taylor_system(taylor: Taylor) -> AbstractSystem | None:
-    """The system whose vector field the polynomial has."""
+    """The system whose vector field the polynomial uses."""
     return _owner(taylor.vector_field) if taylor.args is None else None
 
 
 def _owner(function: Any) -> AbstractSystem | None:
-    """The system of the catalogue that `function` is a method of."""
+    """The system of the catalogue of which `function` is a method."""
     owner = getattr(function, "__self__", None)
     if not isinstance(owner, AbstractSystem):
         return None
-    # Only what `systems.get` builds again.
+    # Only a system that `systems.get` can rebuild.
     known = owner.name in systems.names() and type(systems.get(owner.name)) is type(owner)
     return owner if known else None
 
@@ -148,7 +148,7 @@ def _describe_state(y: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Those of the packages that a file depends on."""
+    """The versions of the packages on which a file depends."""
     return {name: _version(name) for name in ("diffrax-conserve", "diffrax", "equinox", "jax")}
 
 
@@ -161,7 +161,8 @@ def _version(name: str) -> str:
 
 # ---- Reading ----
 
-# No network is larger. They bound what a file can make this package compute and allocate.
+# Limits on what a malicious or damaged file can make this package compute and allocate. They are
+# larger than needed for any network.
 _COUNT_MAX, _DEPTH_MAX, _NESTING_MAX, _LEAVES_MAX = 100_000, 200, 20, 300
 _DTYPES = ("float64", "float32", "float16", "bfloat16")
 
@@ -180,7 +181,8 @@ def check_header(header: Any) -> None:
 
 
 def check_sizes(header: dict[str, Any], size: int) -> None:
-    """Raises `ValueError` unless all described arrays are arrays that `size` bytes can hold."""
+    """Raises `ValueError` unless the arrays are described correctly and each fits into `size`
+    bytes."""
     leaves = _state_leaves(header["config"]["state"])
     leaves += _state_leaves(header["config"].get("args"))
     for name in PARTS:
@@ -196,7 +198,8 @@ def check_sizes(header: dict[str, Any], size: int) -> None:
 
 
 def _check(found: Any, name: str, entries: dict[str, Any]) -> None:
-    """Raises unless `found` has these entries, each of a type or as a function says."""
+    """Raises unless `found` has exactly these entries, each of the given type or accepted by the
+    given function."""
     if not isinstance(found, dict) or set(found) != set(entries):
         raise ValueError(f"{name} must be an object with the entries {', '.join(entries)}")
     for key, kind in entries.items():
@@ -289,7 +292,7 @@ def _state_leaves(description: Any, nesting: int = 0) -> list[Any]:
 
 
 def _state_struct(description: Any) -> Any:
-    """A state of shapes and dtypes."""
+    """The state with `jax.ShapeDtypeStruct`s as leaves."""
     match description:
         case None:
             return None
@@ -304,7 +307,7 @@ def _state_struct(description: Any) -> Any:
 
 
 def system_structs(header: Any) -> dict[str, AbstractSystem]:
-    """The systems that the parts belong to, with shapes and dtypes as parameters."""
+    """The systems to which the parts belong, with `jax.ShapeDtypeStruct`s as parameters."""
     found = {}
     for name in PARTS:
         described = None if header[name] is None else header[name]["system"]
@@ -317,9 +320,10 @@ def system_structs(header: Any) -> dict[str, AbstractSystem]:
 
 
 def network_struct(header: Any, make_frame: Callable[[Any], MakeFrame | None], system: Any) -> Any:
-    """The network with shapes and dtypes in the place of arrays, without layer and polynomial.
+    """The network with `jax.ShapeDtypeStruct`s in the place of arrays, without layer and
+    polynomial.
 
-    Nothing is computed, and nothing is allocated. `make_frame` is called with `system`.
+    Nothing is computed or allocated. `make_frame` is called with `system`.
     """
 
     def build(state: Any, args: Any, system: Any) -> PINN | DeepONet:

@@ -23,13 +23,13 @@ PathLike = str | os.PathLike[str]
 
 _MAGIC = b"diffrax-conserve network"
 _VERSION = 3
-# Arrays that zlib makes smaller than this are not compressed, so that no small file takes much
-# memory.
+# The largest accepted compression ratio. Arrays that compress better are stored uncompressed, so
+# that no small file can unpack to a large amount of memory.
 _RATIO_MAX = 16
 
 
 def write(path: PathLike, header: dict[str, Any], body: bytes) -> None:
-    """Replaces the file as a whole. The header must be expressible in JSON."""
+    """Writes the file atomically. The header must be expressible in JSON."""
     compressed = zlib.compress(body, 9)
     size = len(body) if len(body) <= _RATIO_MAX * len(compressed) else None
     try:
@@ -45,7 +45,7 @@ def write(path: PathLike, header: dict[str, Any], body: bytes) -> None:
 
 
 def read(path: PathLike) -> tuple[Any, bytes]:
-    """The header, which may be any JSON, and what follows it."""
+    """The header, which may be any JSON value, and the bytes after it."""
     content = Path(path).read_bytes()
     first, _, rest = content.partition(b"\n")
     words = first[len(_MAGIC) : 200].split()
@@ -80,7 +80,7 @@ def read(path: PathLike) -> tuple[Any, bytes]:
 
 
 def unpacked_size(header: dict[str, Any], body: bytes) -> int:
-    """How many bytes the arrays have. Raises `ValueError` if they are too many for the file."""
+    """The size of the arrays in bytes. Raises `ValueError` if it is too large for the file."""
     size = header["size"]
     if size is None:
         return len(body)
@@ -101,10 +101,10 @@ def unpack(header: dict[str, Any], body: bytes) -> bytes:
 
 
 def refuse(path: PathLike, reason: Exception | str) -> NoReturn:
-    """Raises the error for a file that has the right checksum, and contents that make no sense."""
+    """Raises the error for a file with the right checksum but invalid contents."""
     error = reason if isinstance(reason, Exception) else None
     while isinstance(reason, Exception) and isinstance(reason.__cause__, Exception):
-        reason = reason.__cause__  # equinox tells only at which leaf
+        reason = reason.__cause__  # equinox's own message only names the leaf
     raise ValueError(
         f"The file {path} is malformed, though its checksum is right: {str(reason)[:300]}. "
         "`diffrax_conserve.save` does not write such files."
@@ -114,7 +114,7 @@ def refuse(path: PathLike, reason: Exception | str) -> NoReturn:
 def read_leaf(file: io.BytesIO, like: Any) -> Any:
     """The next array of a file, for `equinox.tree_deserialise_leaves`.
 
-    Its size is compared with that of `like` before memory is allocated.
+    Its shape is compared with that of `like` before memory is allocated.
     """
     if np.lib.format.read_magic(file) != (1, 0):
         raise ValueError("an array has another version of numpy's format")

@@ -14,7 +14,7 @@ def pretrained_path(name: str) -> Path:
 
     **Arguments:**
 
-    - `name`: as of [`diffrax_conserve.load_pretrained`][].
+    - `name`: as for [`diffrax_conserve.load_pretrained`][].
 
     **Raises:**
 
@@ -36,7 +36,8 @@ def load_pretrained(name: str) -> PINN | DeepONet | Transformed | Repeated:
     trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
     trained by [`diffrax_conserve.learned.second_order`][]. `pollu` is a flow map of stiff
     chemistry.
-    [`diffrax_conserve.learned.read_info`][] tells the command that made it and its measured errors.
+    [`diffrax_conserve.learned.read_info`][] returns the command that made the network and its
+    measured errors.
 
     **Arguments:**
 

@@ -40,21 +40,20 @@ def save(
 ) -> None:
     """Writes a network with its configuration into one file.
 
-    The file is replaced as a whole: a reader sees the old one or the new one. It keeps its mode,
-    and a symbolic link to it stays one.
+    The file is replaced atomically: a reader sees either the old or the new one. Its mode is kept,
+    and so is a symbolic link to it.
 
     **Arguments:**
 
     - `path`: where to write.
-    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter
-        perhaps in a [`diffrax_conserve.learned.Transformed`][] with a
-        [`diffrax_conserve.learned.BoxCox`][], and that in a
-        [`diffrax_conserve.learned.Repeated`][]. A conservative layer, a Taylor
-        polynomial and a frame hold functions, which no file can hold. If they belong to a system of
-        the catalogue, the file names it; if not, give them again to [`diffrax_conserve.load`][].
-    - `info`: what else to note, such as the system, the sampling domain, the recipe and the
-        measured errors: anything that JSON can express.
-        [`diffrax_conserve.learned.read_info`][] reads it.
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. A `DeepONet` may
+        be wrapped in a [`diffrax_conserve.learned.Transformed`][] with a
+        [`diffrax_conserve.learned.BoxCox`][], and in a [`diffrax_conserve.learned.Repeated`][]. A
+        conservative layer, a Taylor polynomial and a frame contain functions, which cannot be
+        stored. If they belong to a system of the catalogue, its name is stored; otherwise pass them
+        again to [`diffrax_conserve.load`][].
+    - `info`: further information that JSON can express, such as the system, the sampling domain,
+        the recipe and the measured errors. [`diffrax_conserve.learned.read_info`][] returns it.
 
     **Raises:**
 
@@ -108,7 +107,7 @@ def load(
     **Arguments:**
 
     - `path`: the file.
-    - `layer`: the conservative layer, where the file cannot hold it: see
+    - `layer`: the conservative layer, if it is not stored in the file: see
         [`diffrax_conserve.save`][].
     - `taylor`, `frame`: likewise the Taylor polynomial, and the function that finds the frame.
 
@@ -148,7 +147,7 @@ def load(
 
 
 def read_info(path: PathLike) -> dict[str, Any]:
-    """What a file says about its network, without building it.
+    """The header of a file, without building its network.
 
     **Arguments:**
 
@@ -198,7 +197,7 @@ class _Contents(NamedTuple):
 
 
 def _like(header: Any, frame: MakeFrame | None) -> tuple[_Contents, Any]:
-    """The shapes and dtypes of the arrays of a file, and all of its network that is no array."""
+    """The shapes and dtypes of the arrays of a file, and the static part of its network."""
     structs = system_structs(header)
 
     def make_frame(system: Any) -> MakeFrame | None:
@@ -217,7 +216,7 @@ def _shapes(contents: _Contents) -> Any:
 
 
 def _check_part(path: PathLike, name: str, found: Any, given: Any) -> None:
-    """Raises if a part is given that the network lacks, or is not given but is needed."""
+    """Raises if a part is given that the network does not have, or a required part is not given."""
     what, example = _PARTS[name]
     if found is None and given is not None:
         raise ValueError(f"The network in {path} has no {what}: leave `{name}` out.")
@@ -237,18 +236,18 @@ def _part(found: Any, name: str, systems: dict[str, Any]) -> Any:
     return systems[name].frame
 
 
-# What the parts that hold functions are called, and how to build them again.
+# For each part that contains functions: its name in messages, and an expression that builds it.
 _PARTS = {
     "layer": ("conservative layer", "ConservativeLayer(manifold, steps={steps})"),
     "taylor": ("Taylor polynomial", "Taylor(vector_field, {order})"),
     "frame": ("frame", "frame"),
 }
-# Where in a network they are.
+# The attribute path of each part in a network.
 _PLACES = {"layer": "layer", "taylor": "taylor", "frame": "domain.make"}
 
 
 def _without(model: PINN | DeepONet) -> Any:
-    """The network without those parts that hold functions."""
+    """The network without the parts that contain functions."""
     names = [name for name in PARTS if getattr(model, name, None) is not None]
 
     def where(model: Any) -> list[Any]:

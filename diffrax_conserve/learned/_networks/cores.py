@@ -1,4 +1,4 @@
-"""What the network of a flow map does with its two inputs, the initial state and the step.
+"""Architectures for the network of a flow map, with two inputs: the initial state and the step.
 
 Each core maps the normalised initial state, a vector of `n` numbers, and the normalised step to a
 vector of `m` numbers.
@@ -16,7 +16,7 @@ from .mlp import MLP, Activation
 
 
 class Sizes(NamedTuple):
-    """The sizes and the activation function of a network: how to build it again."""
+    """The sizes and the activation function of a network, from which it can be rebuilt."""
 
     width: int
     depth: int
@@ -40,7 +40,8 @@ class AbstractCore(eqx.Module):
 
     @abc.abstractmethod
     def output_layer(self) -> MLP:
-        """The network whose last layer the output is linear in, whatever the weights before it."""
+        """The network in whose last layer the output is linear, for all values of the other
+        weights."""
 
 
 @final
@@ -92,8 +93,8 @@ class Concatenated(AbstractCore):
 class Gated(AbstractCore):
     """A network of both inputs, whose hidden layers interpolate between two encodings of them.
 
-    `z ← a * z̃ + b * (1 - z̃)` with `z̃` the output of the layer for `z`, so that the input enters
-    every layer by a product.
+    `z ← a * z̃ + b * (1 - z̃)` with the output `z̃` of the layer for `z`. The input thus enters
+    every layer multiplicatively.
 
     ??? cite "Reference"
 

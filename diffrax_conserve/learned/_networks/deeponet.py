@@ -30,16 +30,15 @@ class DeepONet(AbstractFlowMap):
     G_j(u_0)(h) = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0) \, \tau_{jl}(h),$$
 
     with a branch network $b$ and a trunk network $\tau$, both fully connected, and steps $h$ up to
-    $\Delta$ = `max_step`; $u(0) = u_0$ whatever the weights. Longer times are made of several
-    steps. With a `layer`, the output is moved to the manifold of the values at $u_0$.
+    $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. Longer times need several steps. With a
+    `layer`, the output is projected to the manifold of the conserved values at $u_0$.
 
-    Other cores than this product take the state and the step together:
+    Two other cores take the state and the step together and are more accurate at the same size:
     [`diffrax_conserve.learned.Concatenated`][] is a fully connected network,
-    [`diffrax_conserve.learned.Gated`][] has the input in each of its layers. They are more accurate
-    at the same size. With `taylor` the network is
-    $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see [`diffrax_conserve.learned.Taylor`][]. With a
-    `frame` it commutes with the symmetries of the equations: see
-    [`diffrax_conserve.learned.Frame`][].
+    [`diffrax_conserve.learned.Gated`][] feeds the input into each of its layers. With `taylor` the
+    network is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see
+    [`diffrax_conserve.learned.Taylor`][]. With a `frame` it commutes with the symmetries of the
+    equations: see [`diffrax_conserve.learned.Frame`][].
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -121,7 +120,7 @@ class DeepONet(AbstractFlowMap):
             self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`.
+        """The state at time `h` after the state `y0`.
 
         Called as `(y0, h)`, or with an `args_domain` as `(y0, args, h)`.
         """
@@ -139,7 +138,7 @@ class DeepONet(AbstractFlowMap):
         return self.layer(candidate, values, h, self.radius(), schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
-        """The same before the conservative layer."""
+        """The output before the conservative layer."""
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
@@ -155,7 +154,7 @@ class DeepONet(AbstractFlowMap):
         return unflatten(start + fraction ** (self.order + 1) * learned, y0)
 
     def _known(self, args: list[Args], dtype: Any) -> Float[Array, " p"]:
-        """The `args` as the network sees them."""
+        """The `args` as inputs of the network."""
         if self.args_domain is None:
             return jnp.zeros(0, dtype)
         found = checked_args(self.args_domain, args[0])
@@ -164,7 +163,8 @@ class DeepONet(AbstractFlowMap):
     def _learned(
         self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""], known: Float[Array, " p"]
     ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-        """The fraction of the longest step, and what the network adds."""
+        """The step as a fraction of the longest one, and the output of the network in units of the
+        state."""
         if isinstance(self.domain, Box):
             fraction = h / self.max_step
             return fraction, self.scale * self._network(start, known, h, fraction)
@@ -186,12 +186,12 @@ class DeepONet(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order that it has whatever its weights: that of its Taylor polynomial."""
+        """The order for all values of the weights, which is that of the Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
 
     @property
     def state(self) -> Y:
-        """A state of the structure, shapes and dtypes of those it is for."""
+        """A state with the structure, shapes and dtypes that the network expects."""
         return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
 
     @property
@@ -206,46 +206,49 @@ class DeepONet(AbstractFlowMap):
         return self.core
 
     def linear_weights(self) -> tuple[Any, ...]:
-        # After a conservative layer the output is not linear in them.
+        # With a conservative layer the output is not linear in any weights.
         if self.layer is not None:
             return ()
         net = self.core.output_layer()
         return net.weights[-1], net.biases[-1]
 
     def radius(self) -> Float[Array, ""]:
-        """How far the conservative layer may move a state in one iteration."""
+        """The largest distance by which the conservative layer may move a state in one
+        iteration."""
         return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
-- `states`: initial states as they will occur, stacked along a leading axis: any PyTree of real
-    arrays. Their structure is that of the states to come, their mean and their standard deviation
-    normalise the inputs, and the box around them is the `domain` of the flow map.
+- `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
+    They define the structure of a state; their mean and standard deviation normalise the inputs,
+    and the box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
-- `width`, `depth`: units in each hidden layer, and hidden layers, of both networks.
+- `width`, `depth`: the number of units in each hidden layer, and of hidden layers, in both
+    networks.
 - `latent`: the number $L$ of products in each component.
 - `core`: the kind of network: [`diffrax_conserve.learned.Product`][],
     [`diffrax_conserve.learned.Concatenated`][] or [`diffrax_conserve.learned.Gated`][]; the last
     two do not use `latent`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `normalise`: whether the branch sees $(u_0 - m)/S$ with the mean $m$ and the deviation $S$ of
-    `states`, and the trunk $h$ scaled to $[-1, 1]$. Otherwise both are raw, and $S = 1$.
+- `normalise`: whether the branch gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
+    $S$ of `states`, and the trunk gets $h$ scaled to $[-1, 1]$. Otherwise both inputs are not
+    scaled, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then
-    sees the frame's inputs, and `normalise` is for these; the domain consists of all states whose
-    inputs are in the box around those of `states` and whose clock is not faster than theirs.
+    gets the inputs of the frame, to which `normalise` applies; the domain consists of all states
+    whose inputs are in the box around those of `states` and whose clock is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 - `args_domain`: the smallest and the largest `args` of the vector field, as a
-    [`diffrax_conserve.learned.Box`][]. The network takes them as inputs, and so does the
-    polynomial of `taylor`. Default: it is for one vector field.
+    [`diffrax_conserve.learned.Box`][]. The network takes `args` as inputs, and so does the
+    polynomial of `taylor`. Default: a network for fixed `args`.
 
 **Raises:**
 
-`ValueError` or `TypeError` if a size, the step, the states, the frame or `args_domain` are not what
-they must be, or if there is a layer beside a frame or an `args_domain`.
+`ValueError` or `TypeError` if a size, the step, the states, the frame or `args_domain` is invalid,
+or if a layer is combined with a frame or an `args_domain`.
 """
 
 
@@ -279,7 +282,7 @@ def _vectors(states: Y) -> Float[Array, "samples n"]:
 def _framed(
     frame: MakeFrame, states: Y, layer: ConservativeLayer | None
 ) -> tuple[FramedBox, Float[Array, "samples k"], int]:
-    """The domain, the inputs of all states, and how many functions are to be learned."""
+    """The domain, the inputs for all states, and the number of functions to be learned."""
     if layer is not None:
         raise ValueError(
             "A flow map with a `frame` cannot have a `layer`, which measures how far it may go in "

@@ -36,9 +36,9 @@ class AbstractDomain(eqx.Module):
 class Box(AbstractDomain):
     r"""The states between two corners, $l \le y \le u$ in every component.
 
-    The `domain` of a flow map: the option `outside` of [`diffrax_conserve.DeepONetSolver`][] says
-    what happens to a step that starts outside it. Any Module with a method `contains(y)`, which
-    returns a boolean scalar, can take its place.
+    The `domain` of a flow map: the option `outside` of [`diffrax_conserve.DeepONetSolver`][]
+    determines what happens to a step that starts outside it. Any Module with a method
+    `contains(y)`, which returns a boolean scalar, can take its place.
 
     !!! example
 
@@ -111,13 +111,13 @@ class Box(AbstractDomain):
         return jnp.asarray(True)
 
     def sample(self, key: PRNGKeyArray) -> Y:
-        """A point of the box, uniformly."""
+        """A point of the box, drawn from the uniform distribution."""
         lower, treedef = jtu.tree_flatten(self.lower)
         corners = zip(jr.split(key, len(lower)), lower, jtu.tree_leaves(self.upper), strict=True)
         return treedef.unflatten([jr.uniform(k, a.shape, a.dtype, a, b) for k, a, b in corners])
 
     def centred(self, y: Y) -> Y:
-        """`y` in units in which the box reaches from -1 to 1."""
+        """`y`, shifted and scaled such that the box is [-1, 1] in every component."""
 
         def leaf(x: Array, a: Array, b: Array) -> Array:
             return (2 * x - a - b) / jnp.where(b > a, b - a, 1)
@@ -131,15 +131,15 @@ Box.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`ValueError` or `TypeError` if they are not alike, or not real.
+`ValueError` or `TypeError` if their structures or shapes differ, or if they are not real.
 """
 
 
 @final
 class FramedBox(AbstractDomain):
-    """The states whose frames are like those of the states that a flow map was made with.
+    """The states whose frames resemble those of the states with which a flow map was built.
 
-    The inputs of a frame are in a box, and its clock is at most as fast as the fastest one.
+    The inputs of the frame are in a box, and its clock is at most the largest one.
     """
 
     make: MakeFrame
@@ -152,7 +152,7 @@ class FramedBox(AbstractDomain):
         frames = jax.vmap(lambda y: frame_at(make, y))(states)
         clocks = jnp.broadcast_to(frames.clock, frames.inputs.shape[:1])
         box = Box.around((frames.inputs, clocks))
-        # A symmetry leaves the inputs of a state unchanged only up to roundoff.
+        # A symmetry changes the inputs of a state by roundoff, so the box is slightly enlarged.
         slack = jtu.tree_map(lambda a, b: _SLACK * (b - a), box.lower, box.upper)
         lower = (box.lower[0] - slack[0], jnp.zeros_like(box.lower[1]))
         upper = (box.upper[0] + slack[0], box.upper[1] + slack[1])
@@ -160,9 +160,9 @@ class FramedBox(AbstractDomain):
         return cls(make, Box(lower, upper), example)
 
     def extended(self, states: Y) -> "FramedBox":
-        """The same with the inputs of `states`.
+        """The set extended by the inputs of `states`.
 
-        The largest clock stays: the network measures its time by it.
+        The largest clock is unchanged, because the network scales time by it.
         """
         seen = FramedBox.around(self.make, states).box
         inputs = self.box.lower[0], self.box.upper[0]

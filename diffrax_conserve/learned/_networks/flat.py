@@ -1,4 +1,4 @@
-"""States as vectors: what a network reads and writes."""
+"""Conversion of states to vectors, the inputs and outputs of a network."""
 
 import math
 
@@ -11,7 +11,7 @@ from ..._tree import working_dtype
 
 
 def flatten(y: Y) -> Float[Array, " n"]:
-    """All components of `y` in one vector, of the dtype that holds every leaf."""
+    """All components of `y` in one vector, of a dtype that represents every leaf."""
     dtype = working_dtype(y)
     leaves = [jnp.asarray(x).astype(dtype).reshape(-1) for x in jtu.tree_leaves(y)]
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
@@ -44,12 +44,12 @@ def as_state(y: Y) -> Y:
 
 
 def _floating(leaf: ArrayLike) -> Array:
-    """`leaf` as an array of a definite floating-point type."""
+    """`leaf` as an array with a floating-point dtype."""
     dtype = jnp.result_type(leaf)
     return jnp.asarray(leaf, dtype if jnp.issubdtype(dtype, jnp.floating) else float)
 
 
 def stacked_vectors(ys: Y) -> Float[Array, "count n"]:
-    """States that are stacked along a leading axis, as vectors."""
+    """States stacked along a leading axis, as the rows of a matrix."""
     leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(ys)]
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)

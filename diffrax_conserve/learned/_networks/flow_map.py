@@ -1,4 +1,4 @@
-"""Flow maps: what solvers, sweeps, policies and `fit` ask of one."""
+"""Flow maps: the interface that solvers, sweeps, policies and `fit` use."""
 
 import abc
 from collections.abc import Callable
@@ -21,24 +21,25 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
-    One that has learned a family of equations is called as `(y0, args, h)`, with the `args` of the
-    vector field, and has an attribute `args_domain`.
+    A flow map of a family of equations is called as `(y0, args, h)`, with the `args` of the vector
+    field, and has an attribute `args_domain`.
 
-    [`diffrax_conserve.DeepONet`][] is one. [`diffrax_conserve.learned.FlowMap`][] makes one of any
-    function; solvers and [`diffrax_conserve.fit`][] do that by themselves with a Module that is
-    called as `(y0, h) -> y` and has an attribute `max_step`, and perhaps `order` and `domain`.
+    [`diffrax_conserve.DeepONet`][] is a flow map. [`diffrax_conserve.learned.FlowMap`][] makes one
+    from any function; solvers and [`diffrax_conserve.fit`][] do this automatically for a Module
+    that is called as `(y0, h) -> y` and has an attribute `max_step`, and optionally `order` and
+    `domain`.
 
     **Attributes:**
 
     - `max_step`: the longest step.
-    - `order`: the error of one step falls as $h^{q+1}$ with $q$ = `order`, whatever the weights.
+    - `order`: the error of one step is $O(h^{q+1})$ with $q$ = `order`, for all weights.
     - `domain`: the states that the flow map has learned, with a method `contains(y)`; or `None`.
-    - `layer`: the conservative layer that the output has passed, or `None`.
-    - `args_domain`: the `args` that it has learned, a [`diffrax_conserve.learned.Box`][]. A
-        subclass that takes none need not have it.
+    - `layer`: the conservative layer of the network, or `None`.
+    - `args_domain`: the `args` that it has learned, a [`diffrax_conserve.learned.Box`][]. Optional
+        for a subclass that takes no `args`.
     """
 
-    # `Any`, so that a subclass may be more precise, or have a property.
+    # `Any`, so that a subclass may use a more precise type or a property.
     max_step: eqx.AbstractVar[Any]
     order: eqx.AbstractVar[int]
     domain: eqx.AbstractVar[Any]
@@ -47,17 +48,16 @@ class AbstractFlowMap(AbstractTrainable):
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`.
 
-        A training passes `schedule`, the iterations of the conservative layer and the weight of
-        the last one.
+        `fit` passes `schedule`, the number of iterations of the conservative layer and the weight
+        of the last one.
         """
 
     @abc.abstractmethod
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        """A rate of change of the solution through `y0`, in the units that the loss is measured
-        in."""
+        """A rate of change of the solution through `y0`, in the units of the loss."""
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
-        """The differences of states, in the units that those from data are measured in."""
+        """The differences of states, in the units in which states are compared with data."""
         return stacked_vectors(jtu.tree_map(lambda a, b: a - b, ys, others))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
@@ -69,7 +69,7 @@ class AbstractFlowMap(AbstractTrainable):
     def states(
         self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
     ) -> PyTree[Array]:
-        # The schedule is not batched: iterations that it leaves out are not computed.
+        # The schedule is not batched, so that iterations beyond it are not computed.
         return jax.vmap(lambda y0, t: self(y0, t, schedule=schedule))(points.y0s, ts)
 
     def starts(self, points: Points) -> Points:
@@ -81,7 +81,7 @@ class AbstractFlowMap(AbstractTrainable):
 
 @final
 class FlowMap(AbstractFlowMap):
-    """A flow map made of a function `(y0, h) -> y`.
+    """A flow map made from a function `(y0, h) -> y`.
 
     !!! example
 
@@ -100,7 +100,7 @@ class FlowMap(AbstractFlowMap):
     domain: Any
     args_domain: Box | None
 
-    # Written out, because type checkers take the abstract fields of the base class for arguments.
+    # Written out, because type checkers treat the abstract fields of the base class as arguments.
     def __init__(
         self,
         function: Callable[..., Any],
@@ -152,15 +152,15 @@ FlowMap.__init__.__doc__ = r"""**Arguments:**
 - `function`: called as `(y0, h) -> y`, or with an `args_domain` as `(y0, args, h) -> y`.
     [`diffrax_conserve.fit`][] trains all its arrays.
 - `max_step`: the longest step.
-- `order`: its error in one step falls as $h^{q+1}$ with $q$ = `order`. Default: 0.
-- `domain`: the states that it is for: a [`diffrax_conserve.learned.Box`][], or a Module with a
-    method `contains(y)`.
-- `args_domain`: the `args` that it is for, a [`diffrax_conserve.learned.Box`][]. Default: it takes
-    none.
+- `order`: the error of one step is $O(h^{q+1})$ with $q$ = `order`. Default: 0.
+- `domain`: the states for which it is valid: a [`diffrax_conserve.learned.Box`][], or a Module with
+    a method `contains(y)`.
+- `args_domain`: the `args` for which it is valid, a [`diffrax_conserve.learned.Box`][]. Default:
+    the function takes no `args`.
 
 **Raises:**
 
-`TypeError` if `function`, `domain` or `args_domain` is not that.
+`TypeError` if `function`, `domain` or `args_domain` is not of this kind.
 """
 
 
@@ -185,7 +185,7 @@ def args_domain_of(model: Any) -> Box | None:
 
 
 def check_args_domain(domain: Any) -> None:
-    """Raises unless `domain` is `None` or a box, from which a training can draw."""
+    """Raises unless `domain` is `None` or a box, from which `fit` can draw."""
     if domain is not None and not isinstance(domain, Box):
         raise TypeError(
             f"`args_domain` is {domain!r}, but it must be the smallest and the largest `args`: "
@@ -194,7 +194,7 @@ def check_args_domain(domain: Any) -> None:
 
 
 def checked_args(domain: Box, args: Args) -> Args:
-    """`args` as arrays; raises unless they are of the structure and shapes of the domain's."""
+    """`args` as arrays; raises unless they have the structure and shapes of those of the domain."""
     expected, got = (tree_shapes(x) for x in (domain.lower, args))
     if got != expected:
         raise ValueError(
@@ -205,7 +205,8 @@ def checked_args(domain: Box, args: Args) -> Args:
 
 
 def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
-    """The inverse of `as_flow_map`: of the kind of `model`, with the domain of `flow_map`."""
+    """The inverse of `as_flow_map`: a module of the kind of `model`, with the domain of
+    `flow_map`."""
     if isinstance(model, AbstractFlowMap):
         return flow_map
     assert isinstance(flow_map, FlowMap)
@@ -216,5 +217,5 @@ def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
 
 
 def has_arrays(tree: Any) -> bool:
-    """Whether there is a floating-point array in `tree`, which a training could change."""
+    """Whether `tree` has a floating-point array, which could be trained."""
     return any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(tree))

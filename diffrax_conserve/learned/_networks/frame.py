@@ -13,30 +13,30 @@ from .flat import flatten
 
 @final
 class Frame(eqx.Module):
-    r"""A state as seen from a frame that moves with it.
+    r"""The representation of a state in a moving frame.
 
-    Translations, rotations, permutations or changes of scale may map solutions to solutions. Then a
-    flow map need not be learned for all states that they map to each other. A *frame* is a function
-    of one state that returns
+    If symmetries such as translations, rotations, permutations or changes of scale map solutions to
+    solutions, a flow map need be learned for only one of the states that they map to each other. A
+    *frame* is a function of one state that returns
 
-    - `inputs`: a vector of $k$ numbers that the symmetries do not change, and that tell two states
-        apart unless a symmetry maps one to the other;
-    - `basis`: a matrix $B$ of as many rows as the state has numbers, whose $m$ columns turn with
-        the state: they span all directions that a solution can leave it in;
-    - `clock`: how many of its own units of time pass in one unit of time. One, unless a change of
-        scale is among the symmetries.
+    - `inputs`: a vector of $k$ invariants of the symmetries, which differ for two states unless a
+        symmetry maps one to the other;
+    - `basis`: a matrix $B$ with a row for each component of the state, whose $m$ columns are
+        transformed like the state and span all directions in which a solution can leave it;
+    - `clock`: the number of the frame's own units of time per unit of time; 1 unless the symmetries
+        include a change of scale.
 
-    A [`diffrax_conserve.DeepONet`][] with it learns $m$ functions of $k + 1$ numbers instead of $n$
-    of $n + 1$, the inputs and the own time $\tau$ = `clock` $h$:
+    With a frame, a [`diffrax_conserve.DeepONet`][] learns $m$ functions of $k + 1$ numbers, the
+    inputs and the own time $\tau$ = `clock` $h$, instead of $n$ functions of $n + 1$ numbers:
 
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
-    and commutes with the symmetries whatever its weights. States that only differ by their scale
-    are the same to it, seen for a longer time; $\tau_{\max}$ is the longest among the states that
-    it was made with.
+    and commutes with the symmetries for all weights. States that differ only in scale have the same
+    inputs and different own times; $\tau_{\max}$ is the largest own time of `max_step` among the
+    states with which it was built.
 
-    [`diffrax_conserve.systems.PointVortices`][] has one, its method `frame`, which returns the
-    three in a tuple.
+    An example is the method `frame` of [`diffrax_conserve.systems.PointVortices`][], which returns
+    the three as a tuple.
 
     !!! example
 
@@ -69,8 +69,8 @@ class Frame(eqx.Module):
     clock: RealScalarLike = 1.0
 
     def measure(self, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        """A change of the state in a unit of time, as the coefficients of the columns of `basis`
-        in a unit of the frame's own time."""
+        """Converts a rate of change of the state to coefficients of the columns of `basis`, per
+        unit of the frame's own time."""
         gram = self.basis.T @ self.basis
         return jnp.linalg.solve(gram, self.basis.T @ rate) / self.clock
 
@@ -80,7 +80,7 @@ Frame.__init__.__doc__ = r"""**Arguments:**
 - `inputs`, `basis`, `clock`: as above.
 """
 
-# A state to its `Frame`, or to the tuple `(inputs, basis, clock)`.
+# A function from a state to its `Frame`, or to the tuple `(inputs, basis, clock)`.
 MakeFrame = Callable[[Any], Any]
 
 

@@ -32,21 +32,21 @@ class ConservativeLayer(eqx.Module):
     r"""Moves the output of a network towards the manifold, by `steps` iterations.
 
     For the output $\hat y$, with the constraint Jacobian $G$ and the residual $g$, the result is
-    $y = \hat y + G(\hat y)^\top \lambda$, where the multipliers start at zero and are improved by
+    $y = \hat y + G(\hat y)^\top \lambda$, where the multipliers start at zero and are updated by
 
     $$\lambda \leftarrow \lambda - (G(y) G(\hat y)^\top + \mu I)^{-1} g(y).$$
 
-    That is Newton's method in $\lambda$, with rows scaled to norm one and a damping
-    $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale; an iteration
-    never moves a state further than `radius`, since near a point where $G$ vanishes it would go
-    arbitrarily far.
+    This is Newton's method in $\lambda$, with rows scaled to norm one and a damping
+    $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale. An iteration
+    moves a state by at most `radius`; otherwise the step would be arbitrarily long near a point
+    where $G$ vanishes.
 
-    The layer is part of the network: a derivative of the network, with respect to time as well as
-    to its weights, is one through the layer. It follows from the implicit function theorem for
-    $g(y) = r$ with $r$ the residual that the iterations leave; no iteration is unrolled.
+    The layer is part of the network: derivatives of the network with respect to time and weights
+    include the layer. They follow from the implicit function theorem for $g(y) = r$, where $r$ is
+    the remaining residual; no iteration is unrolled.
 
-    The iterations are few: the output is near the manifold, and on it to roundoff only where the
-    network itself is close. To be exactly on it, wrap the solver in
+    With few iterations, the output is near the manifold, and on it to roundoff only if the output
+    of the network is already close. For a state exactly on the manifold, wrap the solver in
     [`diffrax_conserve.ManifoldProjection`][].
 
     !!! example
@@ -64,8 +64,8 @@ class ConservativeLayer(eqx.Module):
 
     ??? cite "Reference"
 
-        E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1, which freezes $G(y)$ at
-        $\hat y$ too and does not damp; that needs an output which is close already.
+        E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1, which also freezes $G(y)$ at
+        $\hat y$ and does not damp, and therefore needs an output that is already close.
     """
 
     manifold: Manifold
@@ -103,7 +103,7 @@ class ConservativeLayer(eqx.Module):
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
         start = _stored(split(candidate), p)
-        # Whatever the functions close over becomes part of `residual`'s PyTree.
+        # Arrays over which the functions close become part of `residual`'s PyTree.
         residual = eqx.filter_closure_convert(lambda y: function(_stored(y, p)), start)
         fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
         y, _ = _conserve(residual, start, fixed, steps=self.steps)
@@ -154,14 +154,14 @@ def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) ->
 
 @_conserve.def_jvp
 def _conserve_jvp(primals, tangents, *, steps):
-    """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = r`, the residual that is left.
+    """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = r` with the remaining residual `r`.
 
     With `λ` held, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual. Then
     `λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`. Where the first iteration is not complete (`p = 0`, or `p = 1` with
     `s < 1`) the multipliers are `s` times those of a complete one, and so is their tangent.
 
-    The linear solve is differentiated implicitly too: a second derivative, which every loss with a
-    time derivative needs, then costs products with `G`, not derivatives of its rows.
+    The linear solve is differentiated implicitly too. Second derivatives, which every loss with a
+    time derivative needs, then cost products with `G` instead of derivatives of its rows.
     """
     residual, candidate, fixed = primals
     t_residual, t_candidate, _ = tangents
@@ -199,10 +199,10 @@ def _conserve_jvp(primals, tangents, *, steps):
 
 
 def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:
-    """`tree`, behind a condition that makes XLA store it and its cotangent.
+    """`tree`, passed through a `cond` that makes XLA store it and its cotangent.
 
-    Otherwise XLA repeats their computation in each loop that uses them, and, where scalars are
-    stacked to an array, for each element.
+    Otherwise XLA repeats their computation in each loop that uses them, and for each element where
+    scalars are stacked to an array.
     """
     return lax.cond(p >= 0, lambda x: x, lambda x: jtu.tree_map(jnp.zeros_like, x), tree)
 

@@ -22,9 +22,10 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 @final
 class Window(AbstractTrainable):
-    """A network for the solution through one state, from the time `start` on, for a time `length`.
+    """A network for the solution through one state, on the interval from `start` to `start +
+    length`.
 
-    A `PINN` is one of these, or several that follow each other.
+    A `PINN` consists of one or several consecutive windows.
     """
 
     net: MLP
@@ -50,7 +51,8 @@ class Window(AbstractTrainable):
         return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
 
     def radius(self) -> Float[Array, ""]:
-        """How far the conservative layer may move a state in one iteration."""
+        """The largest distance by which the conservative layer may move a state in one
+        iteration."""
         return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
@@ -62,7 +64,7 @@ class Window(AbstractTrainable):
         self, points: Points, ts: Float[Array, " points"], schedule: LayerSchedule | None
     ) -> PyTree[Array]:
         del points
-        # The schedule is not batched: iterations that it leaves out are not computed.
+        # The schedule is not batched, so that iterations beyond it are not computed.
         return jax.vmap(self, in_axes=(0, None))(ts, schedule)
 
     def starts(self, points: Points) -> Points:
@@ -77,7 +79,7 @@ class Window(AbstractTrainable):
         return self.net
 
     def linear_weights(self) -> tuple[Any, ...]:
-        # After a conservative layer the output is not linear in them.
+        # With a conservative layer the output is not linear in any weights.
         return () if self.layer is not None else (self.net.weights[-1], self.net.biases[-1])
 
 
@@ -87,12 +89,12 @@ class PINN(eqx.Module):
 
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
-    with a fully connected network $N$, so that $u(t_0) = u_0$ whatever the weights. With a `layer`,
-    the output is moved to the manifold of the values at $(t_0, u_0)$.
+    with a fully connected network $N$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
+    output is projected to the manifold of the conserved values at $(t_0, u_0)$.
 
-    A long interval is cut into `windows`, each with a network of its own that starts where the last
-    one ends: small networks on short intervals are far easier to train than a large one on a long
-    interval.
+    A long interval can be divided into `windows`, each with its own network that starts where the
+    last one ends: small networks on short intervals are far easier to train than a large one on a
+    long interval.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.PINNSolver`][].
 
@@ -114,10 +116,10 @@ class PINN(eqx.Module):
         that of I. E. Lagaris, A. Likas and D. I. Fotiadis, IEEE Trans. Neural Networks 9 (1998).
     """
 
-    nets: MLP  # every array has a leading axis of the windows, here and in `y0s`
+    nets: MLP  # here and in `y0s` every array has a leading axis over the windows
     layer: ConservativeLayer | None
     y0s: Y
-    edges: tuple[float, ...] = eqx.field(static=True)  # where windows start, and the end
+    edges: tuple[float, ...] = eqx.field(static=True)  # the starts of the windows, and the end
     sizes: Sizes = eqx.field(static=True)
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
@@ -183,13 +185,13 @@ class PINN(eqx.Module):
         return self.edges[-1]
 
     def window(self, index: IntScalarLike) -> Window:
-        """The network on the interval of this number."""
+        """The window with this index."""
         net, y0 = jtu.tree_map(lambda x: x[index], (self.nets, self.y0s))
         edges = jnp.asarray(self.edges, self.scale.dtype)
         return self.window_of(net, y0, edges[index], edges[index + 1])
 
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
-        """A window like those of this network."""
+        """A window with the options of this network."""
         dtype = self.scale.dtype
         return Window(
             net=net,
@@ -202,7 +204,7 @@ class PINN(eqx.Module):
         )
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
-        """A network of the same kind with these windows."""
+        """A network with the same options and these windows."""
         width, depth, _, activation = self.sizes
         found = jtu.tree_map(jnp.asarray, (nets, y0s, self.scale))
 
@@ -237,21 +239,21 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `y0`: the initial state $u_0$, any PyTree of real arrays.
 - `t0`, `t1`: the interval of time.
 - `key`: a random key, for the initial weights.
-- `windows`: into how many equal intervals it is cut, each with a network of its own; or the times
-    between `t0` and `t1` at which it is cut.
-- `width`, `depth`: units in each hidden layer, and hidden layers.
+- `windows`: the number of equal intervals, each with its own network; or the times between `t0` and
+    `t1` that separate the intervals.
+- `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `slope`: the standard deviation of the initial slopes of the first layer, whose units are then
-    centred everywhere in the interval. Default: Glorot's initial weights, with which all units are
-    nearly straight lines in time, and so nearly the same. Levenberg-Marquardt needs about 2.
-- `normalise`: whether $N$ sees time scaled to $[-1, 1]$ and $S$ holds the largest component of each
-    leaf of $u_0$. Otherwise $N$ sees $t$, and $S = 1$.
+- `slope`: the standard deviation of the initial slopes of the first layer, whose units then have
+    centres spread over the interval. Default: Glorot initialisation, with which all units are
+    nearly linear in time, and so nearly the same. Levenberg-Marquardt needs about 2.
+- `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
+    leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 
 **Raises:**
 
-`ValueError` or `TypeError` if a size or the interval has a wrong value.
+`ValueError` or `TypeError` if a size or the interval is invalid.
 """
 
 

@@ -20,9 +20,9 @@ class Repeated(AbstractFlowMap):
     r"""The flow map of steps that are `count` times as long: $u(h) = \Phi_{h/k} \circ \dots \circ
     \Phi_{h/k}(u_0)$.
 
-    A flow is easier to learn over shorter steps. Where the longest is fixed from outside, learn a
-    fraction of it and repeat that. Train the inner flow map; the repeated one has no weights of its
-    own. It costs as much as `count` steps.
+    A flow is easier to learn over shorter steps. If the longest step is prescribed, learn a
+    fraction of it and repeat that. Train the inner flow map: the repeated one has no weights of its
+    own. It costs as much as `count` steps of the inner one.
 
     !!! example
 
@@ -67,22 +67,23 @@ class Repeated(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the inner flow map."""
+        """The order of the inner flow map."""
         return self.flow_map.order
 
     @property
     def domain(self) -> Any:
-        """That of the inner flow map, or `None`. Only the start of a step is compared with it."""
+        """The domain of the inner flow map, or `None`. Only the start of the whole step is
+        tested."""
         return self.flow_map.domain
 
     @property
     def args_domain(self) -> Any:
-        """That of the inner flow map, or `None`."""
+        """The `args_domain` of the inner flow map, or `None`."""
         return args_domain_of(self.flow_map)
 
     @property
     def layer(self) -> None:
-        """None: the inner flow map applies its own in each step."""
+        """`None`, because the inner flow map applies its own layer in each step."""
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         return self.flow_map.measure(y0, rate)
@@ -98,9 +99,9 @@ Repeated.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that
     [`diffrax_conserve.DeepONetSolver`][] takes.
-- `count`: how many of its steps make one.
+- `count`: the number of inner steps in one step.
 
 **Raises:**
 
-`ValueError` or `TypeError` if they are not that.
+`ValueError` or `TypeError` if an argument is not of this kind.
 """

@@ -1,4 +1,4 @@
-"""The Taylor polynomial of a flow, the part of a flow map that need not be learned."""
+"""The Taylor polynomial of a flow, the known part of a flow map."""
 
 import math
 from collections.abc import Callable
@@ -21,10 +21,10 @@ class Taylor(eqx.Module):
     u'(0) = f(u_0), \quad u''(0) = f'(u_0) f(u_0), \quad \dots$$
 
     A [`diffrax_conserve.DeepONet`][] with it learns the remainder, $u(h) = T_q(u_0, h) +
-    (h/\Delta)^{q+1} S N(u_0, h)$. With $q = 1$ its initial slope is exact. It is then a method of
-    order $q$ whatever its weights, so that smaller steps help. Its cost doubles with each order,
-    which is worth it only while the polynomial itself is sensible: $h$ times the rate of change of
-    $f$ not much above one.
+    (h/\Delta)^{q+1} S N(u_0, h)$. With $q =
+    1$ its initial slope is exact. The network is then a method of order $q$ for all weights, so
+    that smaller steps reduce the error. Its cost doubles with each order, which pays only if the
+    polynomial itself is accurate: $h$ times the rate of change of $f$ should not be much above one.
 
     !!! example
 
@@ -74,7 +74,7 @@ Taylor.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` for a wrong `vector_field` or `order`.
+`TypeError` or `ValueError` if `vector_field` or `order` is invalid.
 """
 
 

@@ -1,4 +1,4 @@
-"""What `fit` trains: a flow map, or one window of a PINN."""
+"""The interface that `fit` trains: a flow map, or one window of a PINN."""
 
 import abc
 from collections.abc import Callable
@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..._custom_types import Y
 
-# `(key, count, first, last)` to times.
+# A function from `(key, count, first, last)` to times.
 Times = Callable[[PRNGKeyArray, int, Any, Any], Float[Array, " points"]]
-# A random key to an initial state.
+# A function from a random key to an initial state.
 Sampler = Callable[[PRNGKeyArray], Any]
 # The iterations of a conservative layer and the weight of the last one, `(p, s)`.
 LayerSchedule = tuple[Int[Array, ""], Float[Array, ""]]
@@ -22,11 +22,11 @@ class Points(NamedTuple):
 
     ts: Float[Array, " points"]
     y0s: Any  # with a leading axis; None for a window
-    pairs: Any = None  # of states in data, as many as there are points
+    pairs: Any = None  # pairs of states from data, one for each point
 
 
 class AbstractTrainable(eqx.Module):
-    """A network whose states are functions of time, which `fit` makes solutions."""
+    """A network whose states are functions of time, which `fit` trains to be solutions."""
 
     layer: eqx.AbstractVar[Any]  # a `ConservativeLayer`, or None
 
@@ -46,7 +46,7 @@ class AbstractTrainable(eqx.Module):
 
     @abc.abstractmethod
     def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
-        """Rates of change of the states as vectors, in the units that the loss is measured in."""
+        """Rates of change of the states as vectors, in the units of the loss."""
 
     @abc.abstractmethod
     def weights(self) -> Any:
@@ -54,4 +54,4 @@ class AbstractTrainable(eqx.Module):
 
     @abc.abstractmethod
     def linear_weights(self) -> Any:
-        """The weights that the output is linear in, in a tuple, which may be empty."""
+        """The weights in which the output is linear, as a tuple, which may be empty."""

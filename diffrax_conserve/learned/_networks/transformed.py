@@ -34,9 +34,9 @@ class AbstractTransformation(eqx.Module):
 class BoxCox(AbstractTransformation):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
-    Its inverse is never negative. Small exponents spread magnitudes like a logarithm, and zero
-    is a number. With an exponent of 0 it is the logarithm, for positive states. Exponents of 1/4
-    or 1/8 are square roots, which cost a tenth of other powers.
+    Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
+    of zero is finite. With an exponent of 0 it is the logarithm, for positive states. Exponents
+    such as 1/4 or 1/8 are computed by square roots, at a tenth of the cost of other powers.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -53,13 +53,13 @@ class BoxCox(AbstractTransformation):
         p = self.exponent
         if p == 0:
             return jtu.tree_map(jnp.exp, z)
-        # A whole number is a product of a few factors.
+        # An integer power is a product of a few factors.
         power = round(1 / p) if 1 / p == round(1 / p) else 1 / p
         return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** power, z)
 
 
 def _root(x: Array, exponent: float) -> Array:
-    """`x` to a positive power, by square roots where that is possible."""
+    """`x` to a positive power, by square roots if the exponent is a power of 1/2."""
     halvings = -math.log2(exponent)
     if halvings != round(halvings):
         return x**exponent
@@ -74,7 +74,7 @@ BoxCox.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`ValueError` if it is not.
+`ValueError` if `exponent` is outside this range.
 """
 
 
@@ -99,11 +99,11 @@ Scale.__init__.__doc__ = """**Arguments:**
 
 @final
 class Transformed(AbstractFlowMap):
-    r"""A flow map that steps in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
+    r"""A flow map in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
 
-    Chemical species over ten orders of magnitude are learned as powers or logarithms, so that the
-    small ones count; then they are never negative. The initial state is exact. Losses from data
-    are measured in the coordinates, defects too.
+    Chemical concentrations that span ten orders of magnitude are learned as powers or logarithms,
+    so that small ones count and none is negative. The initial state is exact. Both data losses and
+    defects are measured in these coordinates.
 
     !!! example
 
@@ -139,7 +139,8 @@ class Transformed(AbstractFlowMap):
         there = self.transformation.inverse(z1)
 
         def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
-            # Roundoff of there and back is not a step. The derivatives are those of `y`.
+            # Where the step changes nothing, the roundoff of the transformation and its inverse is
+            # removed. The derivatives are those of `y`.
             exact = lax.stop_gradient(y0) + (y - lax.stop_gradient(y))
             return jnp.where(z0 == z1, exact, y).astype(y0.dtype)
 
@@ -152,7 +153,7 @@ class Transformed(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the inner flow map."""
+        """The order of the inner flow map."""
         return self.flow_map.order
 
     @property
@@ -163,12 +164,12 @@ class Transformed(AbstractFlowMap):
 
     @property
     def args_domain(self) -> Any:
-        """That of the inner flow map, or `None`. `args` are not transformed."""
+        """The `args_domain` of the inner flow map, or `None`. `args` are not transformed."""
         return args_domain_of(self.flow_map)
 
     @property
     def layer(self) -> None:
-        """None: what the inner flow map has is not a manifold of states."""
+        """`None`, because the manifold of an inner layer is in other coordinates."""
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
         return flatten(jax.jvp(self.transformation, (y0,), (unflatten(rate, y0),))[1])
@@ -194,11 +195,11 @@ Transformed.__init__.__doc__ = """**Arguments:**
 
 @final
 class TransformedDomain(eqx.Module):
-    """The states whose coordinates are in a domain."""
+    """The states whose coordinates are in the `inner` domain."""
 
     inner: Any
     transformation: AbstractTransformation
 
     def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is such a state."""
+        """Whether the coordinates of `y` are in the inner domain."""
         return self.inner.contains(self.transformation(y))

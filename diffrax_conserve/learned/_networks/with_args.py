@@ -1,4 +1,5 @@
-"""Flow maps of a family of equations: for one of its members, and as one flow map of all."""
+"""Flow maps of a family of equations: one member of the family, and the family as a single flow
+map."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -17,13 +18,13 @@ from .trainable import LayerSchedule, Sampler
 
 
 def at_args(flow_map: AbstractFlowMap, args: Args) -> AbstractFlowMap:
-    """The flow map `(y0, h) -> y` for these `args`; the same one if it takes none."""
+    """The flow map `(y0, h) -> y` for these `args`; `flow_map` itself if it takes no `args`."""
     domain = args_domain_of(flow_map)
     return flow_map if domain is None else AtArgs(flow_map, checked_args(domain, args))
 
 
 class _AbstractOfFamily(AbstractFlowMap):
-    """What a flow map made of a family has from that."""
+    """A flow map that takes its properties from a family."""
 
     flow_map: eqx.AbstractVar[AbstractFlowMap]
 
@@ -34,12 +35,12 @@ class _AbstractOfFamily(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the family."""
+        """The order of the family."""
         return self.flow_map.order
 
     @property
     def layer(self) -> Any:
-        """That of the family."""
+        """The layer of the family."""
         return self.flow_map.layer
 
     def weights(self) -> Any:
@@ -67,7 +68,7 @@ class AtArgs(_AbstractOfFamily):
 
     @property
     def domain(self) -> "ArgsDomain":
-        """The states of the family's domain, or none if `args` are outside theirs."""
+        """The domain of the family, which contains no state if `args` are outside their domain."""
         known = args_domain_of(self.flow_map)
         assert known is not None
         return ArgsDomain(self.flow_map.domain, known, self.args)
@@ -78,23 +79,23 @@ class AtArgs(_AbstractOfFamily):
 
 @final
 class ArgsDomain(eqx.Module):
-    """The states of a domain, if `args` are in theirs."""
+    """The states of a domain if `args` are in their domain, otherwise no states."""
 
     states: Any  # or None
     known: Box
     args: Args
 
     def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is such a state."""
+        """Whether `args` and `y` are in their domains."""
         inside = self.known.contains(self.args)
         return inside if self.states is None else inside & self.states.contains(y)
 
 
 @final
 class OfPairs(_AbstractOfFamily):
-    """A family of flow maps as one flow map of the pairs `(y, args)`, whose `args` stay.
+    """A family of flow maps as a single flow map of the pairs `(y, args)`, with constant `args`.
 
-    So a training need not know of `args`: they are a part of the state.
+    For `fit`, `args` are then a part of the state.
     """
 
     flow_map: AbstractFlowMap
@@ -109,10 +110,10 @@ class OfPairs(_AbstractOfFamily):
 
     @property
     def domain(self) -> None:
-        """None: a training does not extend it."""
+        """`None`, because `fit` does not extend the domain of a family."""
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        # That of `args` is zero, and the last part.
+        # The last part is the rate of `args`, which is zero.
         return self.flow_map.measure(y0[0], rate[: flatten(y0[0]).size])
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:

@@ -20,8 +20,8 @@ from ..._tree import tree_sub
 class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
     """The polynomial through the states at the Chebyshev points of a step, as a Chebyshev series.
 
-    A series, not the barycentric formula: it has no division by zero at the points, so its time
-    derivative exists everywhere, as the root finder of an event needs it.
+    A series is used instead of the barycentric formula because it has no division by zero at the
+    points: the root finder of an event needs a time derivative that exists everywhere.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -34,7 +34,7 @@ class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
         length = self.t1 - self.t0
-        # A step of length zero, as at the padding of a solution, has one state.
+        # A step of length zero, as in the padding of a solution, has one state.
         nonzero = length != 0
         x = jnp.where(nonzero, 2 * (t0 - self.t0) / jnp.where(nonzero, length, 1) - 1, -1)
         return jtu.tree_map(lambda c: _clenshaw(c, x.astype(c.dtype)), self.coefficients)
@@ -51,7 +51,8 @@ def fractions(count: int, dtype: Any) -> Array:
 
 
 def coefficients(values: PyTree[Array]) -> PyTree[Array]:
-    """Those of the Chebyshev series through `values` at all points, stacked along an axis."""
+    """The coefficients of the Chebyshev series through `values`, which are stacked over the
+    points."""
     return jtu.tree_map(lambda v: _apply(to_coefficients(v.shape[0]), v), values)
 
 
@@ -95,9 +96,10 @@ def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
 
 @ft.cache
 def _integration(count: int) -> np.ndarray:
-    """Column `j` is for the polynomial that is one at point `j` and zero at the others."""
+    """The matrix from values at the points to integrals; column `j` belongs to the `j`-th Lagrange
+    polynomial."""
     x = 2 * chebyshev_points(count) - 1
-    # In `x` the interval is twice as long.
+    # The factor 1/2 is `ds/dx`.
     antiderivative = np.polynomial.chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
     basis = np.polynomial.chebyshev.chebvander(x, count)
     matrix = basis @ antiderivative @ to_coefficients(count)

@@ -1,4 +1,4 @@
-"""What the two learned solvers check alike, when they are traced."""
+"""The checks that the learned solvers share, made when they are traced."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +20,7 @@ def check_nodes(nodes: int) -> None:
 
 
 def check_learned_terms(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
-    """Raises if the solver is to solve another equation than the one it was trained for."""
+    """Raises if the solver is given the adjoint equations, for which it was not trained."""
     if is_backsolve(terms):
         raise ValueError(
             f"`{name}` cannot solve the adjoint equations of `diffrax.BacksolveAdjoint`: it was "

@@ -1,4 +1,4 @@
-r"""The error of a path through a step, from its defect: what a learned step gets wrong.
+r"""The error of a path through a step, computed from its defect.
 
 Let $p$ be the polynomial path, $F$ the polynomial through $f(p)$ at its points, and
 $\rho(c) = y_0 + h \int_0^c F - p(c)$ the integral of its defect. The error of the path is
@@ -6,9 +6,9 @@ $e = \rho + d$ with
 
 $$d' = h \left(f(p + \rho + d) - F\right), \qquad d(0) = 0,$$
 
-which is exact. $\rho$ is what a Picard sweep would change; alone it is too small by factors where
-$h \|\partial f\|$ is large. Neither a derivative of $f$ nor one of the network is needed, and no
-difference of neighbouring points is taken, so roundoff is that of the states.
+which is exact. $\rho$ is the change by a Picard sweep; by itself it underestimates the error by a
+large factor where $h \|\partial f\|$ is large. No derivative of $f$ or of the network and no
+difference of neighbouring points is needed, so the roundoff is that of the states.
 
 To first order in $e$ that is the linearised defect equation $e' = \partial f\, e + (f(p) - p')$.
 """
@@ -21,7 +21,7 @@ from jaxtyping import Array, Inexact
 from .chebyshev import at, fractions, integrals
 from .sweeps import Increment, Path
 
-# Steps of RK4 for `d`. The truncation is relative to the error: 4 give two digits of it.
+# Steps of RK4 for `d`. Their truncation error is relative to the estimate: 4 steps give two digits.
 _SUBSTEPS = 4
 
 
@@ -30,7 +30,7 @@ def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
     real = jnp.finfo(path.dtype).dtype
     values = vmap(increment)(fractions(path.shape[0], real), path)
     rho = path[0] + integrals(values) - path
-    # The stages of all substeps: their starts, middles and ends.
+    # The stages of all substeps: at their starts, midpoints and ends.
     places = tuple(i / (2 * _SUBSTEPS) for i in range(2 * _SUBSTEPS + 1))
     states, fields = at(places, path + rho), at(places, values)
     times = jnp.asarray(places, real)

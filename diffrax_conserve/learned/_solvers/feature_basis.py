@@ -1,10 +1,10 @@
-"""An orthonormal basis of random tanh features on the unit interval, and what a step needs of it.
+"""An orthonormal basis of random tanh features on the unit interval, with the tables for a step.
 
-Random features are nearly dependent: the singular values of fifty of them fall to roundoff within
-twenty. So what a step fits are not the features but the leading directions of their span, computed
-here once, in numpy and in double precision. A direction is a Legendre series, which is integrated
-exactly; to integrate the features themselves with coefficients that undo the small singular values
-would lose the digits that these have lost.
+Random features are nearly dependent: of the singular values of fifty features, only the first
+twenty are above roundoff. A step therefore fits the leading directions of their span, which are
+computed here once, in numpy and double precision. A direction is a Legendre series and is
+integrated exactly. Integrating the features instead, with coefficients that compensate the small
+singular values, would lose digits by cancellation.
 """
 
 import functools as ft
@@ -16,19 +16,21 @@ from numpy.polynomial import legendre
 
 from .chebyshev import chebyshev_points, to_coefficients
 
-# Of a Legendre series, and of the Gauss rule that finds it: far more than any feature needs.
+# The length of the Legendre series, and of the Gauss rule that computes them: far more than any
+# feature needs.
 _DEGREES = 80
-# Directions that are exact: the constant (a bias) and the straight line (a skip connection).
+# The number of exact directions: the constant (a bias) and the linear function (a skip connection).
 _EXACT = 2
-# Neurons drawn for each direction kept: fewer, and the directions depend on the draw.
+# The number of neurons drawn for each direction: with fewer, the directions would depend on the
+# draw.
 _NEURONS = 4
 
 
 class FeatureBasis(NamedTuple):
     """Tables of an orthonormal basis `q_k` of slopes on [0, 1], the constant first.
 
-    The first `size` of its members span the solution, all of them its error. Columns belong to
-    members, rows to the Gauss points `fractions`.
+    The first `size` members span the solution, all of them its error. In `slopes` and `integrals`,
+    columns belong to members and rows to the Gauss points `fractions`.
     """
 
     size: int
@@ -41,18 +43,19 @@ class FeatureBasis(NamedTuple):
 
 @ft.cache
 def feature_basis(count: int, seed: int) -> FeatureBasis:
-    """The basis with `count` members for the solution and half as many again for its error."""
+    """The basis with `count` members for the solution and 1.5 times as many for its error."""
     return tabulate(count, _directions(count + -(-count // 2), seed))
 
 
 def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureBasis:
-    """The tables of a basis that is given by its Legendre coefficients, in `2 s - 1`."""
+    """The tables of a basis with the given Legendre coefficients, in `2 s - 1`."""
     integrated = legendre.legint(members, lbnd=-1, axis=0) / 2
 
     points, weights = legendre.leggauss(2 * count)
     slopes = legendre.legval(points, members).T
     root = np.sqrt(weights / 2)[:, None]
-    # The members are orthonormal for the Gauss rule too, up to roundoff; the fit removes that.
+    # The members are orthonormal for the Gauss rule up to roundoff, which the pseudoinverse
+    # removes.
     fit = np.linalg.pinv(root * slopes) * root.T
 
     nodes = 2 * count + 8
@@ -81,10 +84,10 @@ def _directions(wide: int, seed: int) -> Float[np.ndarray, "degrees wide"]:
 
 
 def _slopes(s: np.ndarray, wide: int, seed: int) -> Float[np.ndarray, "points neurons"]:
-    """`d/ds` of `s tanh(a (s - c))`, what a neuron adds to a network with an exact initial state.
+    """`d/ds` of `s tanh(a (s - c))`, the term of a neuron in a network with an exact initial state.
 
-    The steepness `a` grows with the number of directions, such that the last of them stand out of
-    roundoff. Flatter features span nearly polynomials, and steeper ones are worse on smooth
+    The steepness `a` grows with the number of directions, so that the last ones are above roundoff.
+    Flatter features nearly span polynomials, and steeper ones are less accurate for smooth
     solutions.
     """
     rng = np.random.default_rng(seed)

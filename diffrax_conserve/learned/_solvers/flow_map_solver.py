@@ -35,45 +35,46 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
-    controller (give that `dtmax=flow_map.max_step`, so that it does not try) and fails with fixed
-    steps; a solve backwards in time is refused at run time.
+    controller (pass it `dtmax=flow_map.max_step` to avoid such attempts) and fails with fixed
+    steps; a solve backwards in time is an error at run time.
 
     **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
     $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
 
     $$u \leftarrow y_n + h \int f(t, u, args) \quad \text{(Picard)}$$
 
-    with the vector field of the term, at all points in parallel, or by as many Newton iterations
-    for the fixed point, each with a dense linear system of the size of the state times `nodes`.
-    A Picard sweep multiplies the error by about $h \|\partial f\|$ over the number of the sweep
-    and makes a flow map of order $q$ a method of order $q + k$; a Newton iteration squares it.
+    with the vector field of the term, at all points in parallel, or by `k` Newton iterations for
+    the fixed point, each with a dense linear system of the size of the state times `nodes`. The
+    $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$, and `k` sweeps make a
+    flow map of order $q$ a method of order $q + k$; a Newton iteration squares the error.
 
-    **Error estimate.** Without sweeps it is the solution of the error's own differential equation,
-    driven by the defect $u' - f(u)$: 12 states of the flow map and 28 evaluations of $f$, none of
-    which is computed with fixed steps. With sweeps it is what the last one changed, for nothing.
-    So [`diffrax.PIDController`][] can drive a learned solver. Smaller steps help if the error falls
-    with them faster than the step: with sweeps, or with a flow map of order 1 or more.
+    **Error estimate.** Without sweeps it is the solution of the differential equation of the error,
+    driven by the defect $u' - f(u)$. This costs 12 states of the flow map and 28 evaluations of
+    $f$, none of which is computed with fixed steps. With sweeps it is the change by the last one,
+    at no extra cost. So [`diffrax.PIDController`][] can control a learned solver. Smaller steps
+    reduce the error of a solve if the error of a step falls faster than its length: with sweeps, or
+    with a flow map of order 1 or more.
 
-    **Leaving the domain.** A flow map gives no sign that it is wrong for states that it has not
-    learned. `outside` says what happens to a step that starts outside `flow_map.domain`, or whose
+    **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
+    `outside` determines what happens to a step that starts outside `flow_map.domain`, or whose
     estimated error has a component larger than `max_error`:
 
     - `None`: nothing, the default.
     - [`diffrax_conserve.learned.Report`][]`()`: it is counted, for
         [`diffrax_conserve.learned.domain_statistics`][].
     - [`diffrax_conserve.learned.Refuse`][]`()`: it is counted, and the solve fails.
-    - [`diffrax_conserve.learned.Replace`][]`(solver)`, or a diffrax solver by itself: that solver
-        takes the step, and it is counted.
+    - [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver: that solver takes
+        the step, and it is counted.
 
     Dense output follows the (corrected) path inside the step: it is the polynomial through its
-    states at the `nodes` points, which without sweeps are computed only where dense output, saved
-    times or an event ask for them. The weights are not copied.
+    states at the `nodes` points, which without sweeps are computed only if dense output, saved
+    times or an event need them. The weights are not copied.
 
-    Derivatives with respect to the initial state and the weights are those of what is computed. The
-    `args` of the solve are seen by the sweeps, the error estimate and the solver `outside`, and by
-    a flow map that has an `args_domain`; other flow maps have learned one vector field. With `args`
-    outside that domain every step is outside. Inside [`diffrax_conserve.ManifoldProjection`][] the
-    manifold sees them too.
+    Derivatives with respect to the initial state and the weights are those of the computed
+    solution. The `args` of the solve are passed to the sweeps, the error estimate and the solver
+    `outside`, and to a flow map with an `args_domain`; other flow maps have learned one vector
+    field. If `args` are outside that domain, every step is outside. In a
+    [`diffrax_conserve.ManifoldProjection`][] the manifold gets them too.
 
     !!! example
 
@@ -156,15 +157,15 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     def error_order(self, terms: dfx.AbstractTerm) -> int:
         del terms
-        # The change by the last sweep is the error before it.
+        # The change by the last sweep estimates the error before it.
         return self._local_order(max(self.corrections - 1, 0))
 
     def _local_order(self, sweeps: int) -> int:
-        """The power of the step in the error of one step after so many sweeps."""
+        """The power of the step size in the error of one step after this many sweeps."""
         power = self.flow_map.order + 1
         for _ in range(sweeps):
             power = self.sweep.power(power)
-        # The error of the collocation itself has this power.
+        # The error of the collocation polynomial has this power.
         return min(power, self.nodes + 1) if sweeps else power
 
     def init(
@@ -212,7 +213,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     def _learned(
         self, flow_map: AbstractFlowMap, h: Array, y0: Y, increment: Increment
     ) -> StepResult:
-        """The step of the flow map, corrected."""
+        """The step of the flow map, after the correction sweeps."""
         _, unravel = ravel_pytree(y0)
         path = _path(flow_map, self.nodes, h, y0)
         if self.corrections == 0:
@@ -247,28 +248,28 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.DeepONet`][], any other
     [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module that is called as `(y0, h) -> y` and
-    has an attribute `max_step`. Such a Module may have an integer `order` $q$ (its error in one
-    step falls as $h^{q+1}$; default 0) and a `domain` with a method `contains(y)`, such as a
+    has an attribute `max_step`. Such a Module may have an integer `order` $q$ (the error of one
+    step is $O(h^{q+1})$; default 0) and a `domain` with a method `contains(y)`, such as a
     [`diffrax_conserve.learned.Box`][].
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
 - `sweep`: [`diffrax_conserve.learned.Picard`][]`()` or
     [`diffrax_conserve.learned.NewtonSweep`][]`()`.
 - `outside`: the policy for steps outside the domain.
-- `max_error`: the largest error of a component, in its own units, that makes a step count as
-    inside. Default: only the domain decides.
-- `check_field`: whether a solve is refused whose vector field at the initial state is not the slope
-    of the flow map for $h \to 0$, in the Euclidean norm: by more than 0.1 %, where that slope is
-    exact (`order` at least 1), else by more than 75 %. An error in a parameter, or another system,
-    is found at once if the flow map has a Taylor polynomial.
+- `max_error`: the largest estimated error of a component, in its own units, of a step that counts
+    as inside. Default: only the domain decides.
+- `check_field`: whether to raise an error if the vector field at the initial state differs from the
+    slope of the flow map for $h \to 0$, in the Euclidean norm, by more than 0.1 % if that slope is
+    exact (`order` at least 1), otherwise by more than 75 %. With a Taylor polynomial in the flow
+    map this detects a wrong parameter or another system at once.
 
 **Raises:**
 
-`TypeError` or `ValueError` if the flow map cannot be called so or returns another structure than
-the state's, if a number has a wrong value, or if `outside` asks about a domain that the flow
-map does not have. At run time an error in a solve backwards in time or of an equation that the flow
-map was not trained for, and a failed result for a step that is too long.
+`TypeError` or `ValueError` if the flow map has another signature or returns another structure than
+that of the state, if a number is invalid, or if `outside` needs a domain that the flow map does not
+have. At run time, an error in a solve backwards in time or of an equation for which the flow map
+was not trained, and a failed result for a step that is too long.
 """
 
-# The name of the solver for its usual flow map.
+# An alias, named after the usual flow map.
 DeepONetSolver = FlowMapSolver

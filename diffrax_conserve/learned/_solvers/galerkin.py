@@ -1,9 +1,9 @@
 """The equations of a step that fits random features, their solution and its error.
 
 With the basis `q_k` of slopes, `s` the fraction of the step and `u(s) = u0 + Σ_k d_k ∫_0^s q_k`,
-the `d_k` minimise the squared defect, `u' - h f(t0 + s h, u)`, over the slopes `u'` that the basis
-can follow: `d = P h f(t, u0 + Q d)` at the Gauss points, where `Q` integrates and `P` fits by least
-squares. There are more points than members.
+the `d_k` solve `d = P h f(t, u0 + Q d)`, where `Q` integrates, and `P` fits values at the Gauss
+points by least squares: `u'` is the best approximation of `h f(t0 + s h, u)` in the span of the
+basis. There are more points than members.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from .feature_basis import FeatureBasis
 Coefficients = Float[Array, "members n"]
 Errors = Float[Array, "wide n"]
 
-# Newton's method converges quadratically, or not at all: then a shorter step is cheaper.
+# If Newton's method has not converged by then, a shorter step is cheaper.
 _MAX_STEPS = 10
 
 
@@ -55,7 +55,7 @@ class StepEquations(NamedTuple):
     def solve_linear(
         self, jacobians: Float[Array, "points n n"], right: Coefficients
     ) -> Coefficients:
-        """`(1 - P h ∂f/∂u Q)⁻¹` applied to `right`, which has a row for each member to be used."""
+        """`(1 - P h ∂f/∂u Q)⁻¹` applied to `right`, which has one row for each member in use."""
         count, n = right.shape
         fit, integrals = self.basis.fit[:count], self.basis.integrals[:, :count]
         products = _multiply(
@@ -71,10 +71,11 @@ class StepEquations(NamedTuple):
 
 
 def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
-    """The coefficients, and whether Newton's method found them; if not, zero: the state stays,
-    where the vector field is known to be finite, as derivatives of a rejected step need it.
+    """The coefficients, and whether Newton's method converged. If not, they are zero: the state is
+    then constant, where the vector field is finite, so that derivatives of a rejected step are
+    finite.
 
-    The iteration is not differentiated: the equations are, by the implicit function theorem.
+    Derivatives follow from the implicit function theorem, not through the iteration.
     """
     slope = equations.increment(jnp.zeros((), equations.y0.dtype), equations.y0)
     rest = jnp.zeros((equations.basis.size - 1, slope.size), slope.dtype)
@@ -85,7 +86,7 @@ def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
         rows = jax.vmap(linear)(units).reshape(right.size, right.size)
         return jnp.linalg.solve(rows.T, right.ravel()).reshape(right.shape)
 
-    # The flag is a number, because its tangent is formed.
+    # The flag is a floating-point number, because `custom_root` forms its tangent.
     coefficients, found = lax.custom_root(
         equations.residual,
         start,
@@ -110,19 +111,19 @@ def _newton(
         unfinished = ~found & jnp.isfinite(size) & (count < _MAX_STEPS)
         return unfinished, coefficients - change, found, count + 1
 
-    # The condition is carried: a batched loop evaluates it in two places, which may round it in two
-    # ways.
+    # The condition is carried, because a batched loop evaluates it in two places, which may round
+    # differently.
     carry = (jnp.asarray(True), start, jnp.asarray(False), jnp.asarray(1))
     _, coefficients, found, _ = lax.while_loop(lambda carry: carry[0], iterate, carry)
     return jnp.where(found, coefficients, 0), found.astype(start.dtype)
 
 
 def error(equations: StepEquations, coefficients: Coefficients) -> Errors:
-    """The error of the solution over the step, in the wider basis, from the defect that it leaves.
+    """The error of the solution over the step, in the wider basis, from its defect.
 
     The linearised equation of the error, `e' = h ∂f/∂u e + h f - u'`, is solved on the same points:
-    one more linear system. Only the first member has an integral over the step, so the error at the
-    end is the first row.
+    one more linear system. Only the first member has a nonzero integral over the step, so the error
+    at the end is the first row.
     """
     states = equations.states(coefficients)
     slopes = _multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
@@ -135,18 +136,18 @@ def dense_series(
 ) -> Float[Array, "degrees n"]:
     """`u` over the step, as a Chebyshev series in `2 s - 1`.
 
-    At the end of a step a Galerkin method is far more accurate than inside. So what is known of the
-    error inside is added, and the end is left as it is.
+    A Galerkin method is far more accurate at the end of a step than inside. So the estimated error
+    is added inside the step, and the end is not changed.
     """
     inside = error.at[0].set(0).at[: len(coefficients)].add(coefficients)
     return _multiply(equations.basis.series, inside).at[0].add(equations.y0)
 
 
 def _multiply(table: np.ndarray, x: Array) -> Array:
-    """Never in the reduced precision that accelerators have for single-precision products."""
+    """`table @ x`, never in the reduced precision of accelerators for single-precision products."""
     return jnp.matmul(jnp.asarray(table, x.dtype), x, precision=lax.Precision.HIGHEST)
 
 
 def flatten(y: Y) -> tuple[Float[Array, " n"], Callable[[Array], PyTree[Array]]]:
-    """The state as a vector, and the way back, to the dtype of each leaf."""
+    """The state as a vector, and the inverse map, which restores the dtype of each leaf."""
     return jax.flatten_util.ravel_pytree(jtu.tree_map(jnp.asarray, y))

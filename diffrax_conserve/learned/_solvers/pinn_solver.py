@@ -22,18 +22,18 @@ from .checks import check_learned_terms, check_nodes, check_output
 class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
-    The vector field in the term is not evaluated: it is what the network was trained for. Steps may
-    have any length, and are there to be saved, projected or stopped by an event. The solve must
-    start on the network's solution, $y(t_0) = u(t_0)$, and stay inside its interval: another
-    initial state, or a time outside, is refused at run time. There is no error estimate, so use
-    fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
+    The vector field of the term is not evaluated, because the network was trained for it. Steps may
+    have any length; they determine where states are saved, projected or tested for events. The
+    solve must start on the network's solution, $y(t_0) = u(t_0)$, and stay inside its interval:
+    another initial state or a time outside is an error at run time. There is no error estimate, so
+    use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
     Dense output follows the network inside the step: it is the polynomial through its states at
-    `nodes` Chebyshev points, which are computed only where dense output, saved times or an event
-    ask for them. The weights are not copied.
+    `nodes` Chebyshev points, which are computed only if dense output, saved times or an event need
+    them. The weights are not copied.
 
-    The result does not depend on `y0`, which can only be the one it was trained for: the derivative
-    with respect to it is zero.
+    The result does not depend on `y0`, which must be the trained one: the derivative with respect
+    to `y0` is zero.
 
     !!! example
 
@@ -87,7 +87,7 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
         y0: Y,
         args: Args,
     ) -> Float[Array, "2"]:
-        """The interval of the network, once it is known that the solve starts on it."""
+        """The interval of the network, after a check that the solve starts on its solution."""
         del t1, args
         check_learned_terms(terms, "PINNSolver")
         check_output(self.pinn, (t0,), y0, "pinn")
@@ -133,19 +133,21 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
 PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `pinn`: a [`diffrax_conserve.PINN`][].
-- `nodes`: how many states of a step dense output goes through.
+- `nodes`: the number of states in a step that dense output interpolates.
 
 **Raises:**
 
-`TypeError` or `ValueError` if `pinn` is not one, or has another structure than the state; at run
-time an error if a time is outside the interval, or `y0` is not the network's initial state.
+`TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state; at run
+time an error if a time is outside the interval, or `y0` is not the state of the network at the
+initial time.
 """
 
 
 def _refuse_outside(
     t: Array, terms: dfx.AbstractTerm, interval: tuple[RealScalarLike, RealScalarLike], pinn: PINN
 ) -> Array:
-    """The time that the solver's `t` means, which must be in the interval up to roundoff."""
+    """The time of the vector field for the solver's `t`; a run-time error unless it is in the
+    interval up to roundoff."""
     time = t * time_direction(terms, t)
     first, last = interval
     slack = 1e-6 * (last - first) + 8 * jnp.finfo(time.dtype).eps * jnp.abs(time)

@@ -1,4 +1,4 @@
-"""Policies: what a solver does with a step that its flow map should not be trusted with."""
+"""Policies for steps that a flow map cannot be trusted with."""
 
 import abc
 import dataclasses
@@ -34,16 +34,16 @@ _INACCURATE = register(
 
 @final
 class DomainStatistics(eqx.Module):
-    """How many of the accepted steps were outside what the flow map has learned.
+    """The number of accepted steps outside the range that the flow map has learned.
 
     A step is outside if it starts outside the flow map's `domain`, or if its estimated error is
     above `max_error`. See the option `outside` of [`diffrax_conserve.DeepONetSolver`][].
 
     **Attributes:**
 
-    - `num_steps`: how many steps were taken.
-    - `num_outside`: how many of them were outside.
-    - `first_outside`: the time at which the first of these started; infinity if there is none.
+    - `num_steps`: the number of steps.
+    - `num_outside`: the number of them that were outside.
+    - `first_outside`: the time at which the first of them started; infinity if there is none.
     """
 
     num_steps: Int[Array, "..."]
@@ -85,7 +85,7 @@ class StepResult(eqx.Module):
 
 
 class StepInputs(eqx.Module):
-    """What a solver's `step` is called with."""
+    """The arguments of a solver's `step`."""
 
     terms: PyTree[dfx.AbstractTerm]
     t0: RealScalarLike
@@ -95,7 +95,7 @@ class StepInputs(eqx.Module):
 
 
 class AbstractPolicy(eqx.Module):
-    """What a solver does with a step that starts outside the domain, or is not accurate enough."""
+    """The treatment of a step that starts outside the domain, or is not accurate enough."""
 
     @abc.abstractmethod
     def __call__(
@@ -119,7 +119,7 @@ class Report(AbstractPolicy):
 class Refuse(AbstractPolicy):
     """Fails at the first such step.
 
-    An adaptive controller first rejects a step that is not accurate enough.
+    A step that is not accurate enough is first rejected by an adaptive controller.
     """
 
     def __call__(
@@ -177,7 +177,7 @@ Replace.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if it is none, or cannot take a step inside another solver.
+`TypeError` or `ValueError` if it is not a solver, or cannot take a step inside another solver.
 """
 
 
@@ -195,7 +195,7 @@ def _step_of(solver: dfx.AbstractSolver, inputs: StepInputs, nodes: int) -> Step
 
 
 def as_policy(outside: Any) -> AbstractPolicy | None:
-    """`outside`, where a diffrax solver stands for `Replace(solver)`."""
+    """`outside` as a policy; a diffrax solver becomes `Replace(solver)`."""
     if isinstance(outside, dfx.AbstractSolver):
         return Replace(outside)
     if outside is not None and not isinstance(outside, AbstractPolicy):
@@ -208,7 +208,8 @@ def as_policy(outside: Any) -> AbstractPolicy | None:
 
 
 def check_policy(outside: AbstractPolicy | None, max_error: Any, domain: Any) -> None:
-    """Raises unless a policy comes with a domain or an error bound, and an error bound with one."""
+    """Raises if a policy is given without a domain or an error bound, or an error bound without a
+    policy."""
     known = max_error is not None and not isinstance(max_error, jax.core.Tracer)
     if known and eqx.is_array_like(max_error) and not np.all(np.asarray(max_error) > 0):
         raise ValueError(f"`max_error` is {max_error}, but it must be positive, or `None`.")
@@ -232,15 +233,15 @@ def small_enough(error: Y, max_error: RealScalarLike) -> Bool[Array, ""]:
 
 
 def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
-    """How many steps of a learned solver were outside its flow map's domain.
+    """The number of steps of a learned solver outside its flow map's domain.
 
-    It is part of the state of a solver with a policy `outside`, so diffrax must be asked to return
-    that, by `SaveAt(solver_state=True)`.
+    It is part of the state of a solver with a policy `outside`, so `diffeqsolve` must return that
+    state, by `SaveAt(solver_state=True)`.
 
     **Arguments:**
 
-    - `sol`: what `diffrax.diffeqsolve` returned, with `saveat=SaveAt(..., solver_state=True)`; from
-        `jax.vmap` of it, a batch.
+    - `sol`: the solution from `diffrax.diffeqsolve` with `saveat=SaveAt(..., solver_state=True)`,
+        or a batch of them from `jax.vmap`.
 
     **Returns:**
 

@@ -1,4 +1,4 @@
-"""Random features, fitted anew in each step: a network that needs no training before the solve."""
+"""Random features, fitted in each step: a network that needs no training before the solve."""
 
 from collections.abc import Callable
 from typing import ClassVar, final
@@ -17,7 +17,7 @@ from .chebyshev import ChebyshevInterpolation
 from .feature_basis import feature_basis
 from .galerkin import StepEquations, dense_series, error, flatten, solve
 
-# With fewer there is no random one, with more they are not told apart in double precision.
+# With fewer features none is random; with more they cannot be distinguished in double precision.
 _FEWEST, _MOST = 3, 32
 
 
@@ -32,39 +32,39 @@ _UNSOLVED = register(
 class RandomFeatureSolver(dfx.AbstractSolver[None]):
     r"""Fits a network with random hidden neurons to the equations of each step.
 
-    A physics-informed network that is trained inside the solve, and to roundoff. In the step from
-    $t_0$ to $t_0 + h$, with $s$ the fraction of the step,
+    This is a physics-informed network that is trained to roundoff inside the solve. In the step
+    from $t_0$ to $t_0 + h$, with $s$ the fraction of the step,
 
     $$u(s) = u_0 + h s \Bigl(b + w s + \sum_j c_j \tanh(a_j (s - s_j))\Bigr),$$
 
-    where the $a_j$ and $s_j$ are random, and drawn once: the network is linear in what is fitted.
-    Of its span the `features` leading directions are kept; the rest cannot be told from them in
-    double precision. Their coefficients minimise the squared defect $u' - f(t, u)$ at twice as many
-    Gauss points, over the slopes that the network can follow: Newton's method solves
+    where the $a_j$ and $s_j$ are random and drawn once, so that the network is linear in the fitted
+    coefficients. The `features` leading directions of its span are kept; the others are dependent
+    on them in double precision. The slope of the network is fitted to $f(t, u)$ by least squares at
+    twice as many Gauss points: Newton's method solves
 
     $$u' = P f(t, u), \qquad P \text{ the least-squares fit by slopes of the network.}$$
 
-    **Accuracy.** A step can be long: 16 features follow half a turn of an oscillator to 2e-14, a
-    whole one to 1e-12 and two to 1e-9. Where accuracy counts, or the system is stiff, this solver
-    is fast; where neither does and $f$ is cheap, an explicit method is faster. See "Learned
-    solvers" for figures. Each step solves a few dense linear systems of `features` times the size
-    of the state, so the state should be small.
+    **Accuracy.** Steps can be long: with 16 features the error over half a period of an oscillator
+    is 2e-14, over a whole one 1e-12 and over two 1e-9. The solver is fast for high accuracy or
+    stiff systems; for low accuracy, non-stiff systems and cheap $f$ an explicit method is faster.
+    See "Learned solvers" for figures. Each step solves a few dense linear systems of `features`
+    times the size of the state, so the state should be small.
 
-    **Error estimate.** The defect that the fit leaves, carried to the end of the step by the
-    linearised equation. It is the true error of the step to within some per cent, down to roundoff,
+    **Error estimate.** The remaining defect, propagated to the end of the step by the linearised
+    equation. It agrees with the true error of the step to within some per cent, down to roundoff,
     so adaptive steps ([`diffrax.PIDController`][]) meet their tolerances. With fixed steps it is
     not computed.
 
     **Conservation.** As a least-squares fit of slopes (a continuous Galerkin method) the solver
-    keeps, for any features, the energy of every canonical Hamiltonian system, $y' = J \nabla H(y)$,
-    to the accuracy of the Gauss rule, which is soon that of roundoff, also where the error in the
-    state is large. Linear equations stay bounded where their exact solution does (to 1e-6 a step).
-    Very stiff components are not damped; near such transients steps get short. Other integrals are
-    kept inside [`diffrax_conserve.ManifoldProjection`][].
+    conserves, for any features, the energy of every canonical Hamiltonian system,
+    $y' = J \nabla H(y)$, to the accuracy of the Gauss rule. This soon reaches roundoff, also where
+    the error in the state is large. Solutions of linear equations stay bounded if the exact
+    solution does (to 1e-6 per step). Very stiff components are not damped; in such transients steps
+    become short. To conserve other integrals use [`diffrax_conserve.ManifoldProjection`][].
 
-    If Newton's method fails, an adaptive solve tries a shorter step, and one with fixed steps says
-    that it failed. Dense output is the network. Derivatives, forward and reverse and of any order,
-    are those of the solved equations.
+    If Newton's method fails, an adaptive solve tries a shorter step, and a solve with fixed steps
+    fails. Dense output is the network. Derivatives in forward and reverse mode, of any order, are
+    those of the solved equations.
 
     !!! example
 
@@ -115,8 +115,9 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
             )
 
     def order(self, terms: dfx.AbstractTerm) -> int:
-        """That of polynomials in the place of the features. Between a large error and roundoff it
-        is a good guide for step sizes; there is no power of `h` that the error follows."""
+        """The order of the method with polynomials instead of features. The error of random
+        features has no exact order, but this one gives good step sizes for errors well above
+        roundoff."""
         del terms
         return 2 * self.features
 
@@ -155,7 +156,7 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         coefficients, found = solve(equations)
         errors = error(equations, coefficients)
         series = dense_series(equations, coefficients, errors)
-        # The mean slope counts: the other members have a mean of zero.
+        # Only the first row changes the end of the step: the other members have a mean of zero.
         known = found & jnp.all(jnp.isfinite(errors[0]))
         return (
             unflatten(start + coefficients[0]),
@@ -171,15 +172,15 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 
 RandomFeatureSolver.__init__.__doc__ = r"""**Arguments:**
 
-- `features`: how many directions are fitted for each component of the state, from 3 to 32. More
-    allow longer steps and smaller errors, and linear systems of more unknowns: of a state of size
-    $n$, `features` $\cdot n$. In steps of 2 over 30 time units of an oscillator, 8, 12 and 16
-    leave errors of 6e-10, 6e-12 and 1e-13.
-- `seed`: of the random neurons. Results for two seeds differ by less than the tolerance of a
-    solve; compare two to see it.
+- `features`: the number of directions fitted for each component of the state, from 3 to 32. More
+    features allow longer steps and smaller errors, but the linear systems have `features` $\cdot n$
+    unknowns for a state of size $n$. For an oscillator over 30 time units in steps of 2, the errors
+    with 8, 12 and 16 features are 6e-10, 6e-12 and 1e-13.
+- `seed`: the seed of the random neurons. Results for two seeds differ by less than the tolerance of
+    a solve.
 
 **Raises:**
 
-`ValueError` if an argument is none of these; `TypeError`, when the solve is traced, if the terms
-are not `diffrax.ODETerm`s or the state is not real.
+`ValueError` if an argument is invalid; `TypeError`, when the solve is traced, if the terms are not
+`diffrax.ODETerm`s or the state is not real.
 """

@@ -1,4 +1,4 @@
-"""Steps of a flow map that are longer than it was trained for, or negative."""
+"""Checks for steps of a flow map that are negative or too long."""
 
 from typing import Any
 
@@ -33,8 +33,9 @@ def refuse_backwards(h: Array, terms: Any, max_step: Any) -> Array:
 
 
 def reject_too_long(step: StepResult, h: Array, t1: RealScalarLike, max_step: Any) -> StepResult:
-    """`step`, or a failure with an infinite error: an adaptive controller tries a smaller step."""
-    # The difference of two large times carries their roundoff.
+    """`step`, or for a step that is too long a failure with an infinite error, so that an adaptive
+    controller tries a smaller step."""
+    # The difference of two large times has their roundoff.
     slack = 1e-6 * max_step + 8 * jnp.finfo(h.dtype).eps * jnp.abs(t1)
     fits = h <= max_step + slack
     error = jtu.tree_map(lambda e: jnp.where(fits, e, jnp.inf), step.error)

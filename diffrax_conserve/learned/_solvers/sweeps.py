@@ -1,11 +1,11 @@
 r"""Collocation on the Chebyshev points of a step, by correction sweeps.
 
-A path $u$ through a step of length $h$ is held as its states at the fractions $c_i$, one row each.
-A solution has, at all of them,
+A path $u$ through a step of length $h$ is stored as its states at the fractions $c_i$, one row
+each. The collocation solution satisfies
 
 $$u(c_i) = y_0 + h \int_0^{c_i} f(u(c))\,dc,$$
 
-where the integral is that of the polynomial through the increments $h f$.
+at all points, where the integral is that of the polynomial through the increments $h f$.
 """
 
 import abc
@@ -52,7 +52,7 @@ class AbstractSweep(eqx.Module):
 
     @abc.abstractmethod
     def power(self, power: int) -> int:
-        """The power of the step in the error of the new path, given that of the old one."""
+        """The power of the step size in the error of the new path, given that of the old one."""
 
 
 @final
@@ -94,7 +94,7 @@ class NewtonSweep(AbstractSweep):
 def correct(
     sweep: AbstractSweep, increment: Increment, path: Path, count: int
 ) -> tuple[Path, Inexact[Array, " n"]]:
-    """The path after `count` sweeps, and what the last of them changed at the end of the step."""
+    """The path after `count` sweeps, and the change by the last of them at the end of the step."""
     previous = path
     for _ in range(count):
         previous, path = path, sweep(increment, path)

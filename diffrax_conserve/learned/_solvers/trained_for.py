@@ -1,4 +1,4 @@
-"""Whether a flow map was trained for the equation that is to be solved."""
+"""A check whether a flow map was trained for the equation that is to be solved."""
 
 from typing import Any
 
@@ -13,10 +13,11 @@ from ..._custom_types import Args, RealScalarLike, Y
 from .._networks import AbstractFlowMap
 from .sweeps import increment
 
-# The difference between the two slopes that is refused, relative to the larger one. That of a
+# The largest accepted difference of the two slopes, relative to the larger one. The slope of a
 # Taylor polynomial is exact, those of the paper's networks are off by up to 70 % in some states.
 _EXACT, _LEARNED = 1e-3, 0.75
-# What moves a state so little, relative to it and in the longest step, is no difference.
+# A difference that over the longest step moves the state by less than this, relative to its norm,
+# is ignored.
 _LITTLE = 1e-3
 
 
@@ -30,7 +31,7 @@ def refuse_another_field(
 ) -> None:
     """A run-time error unless the slope of the flow map at `y0` is the vector field there.
 
-    Nothing of it is differentiated.
+    The check is not differentiated.
     """
     start, _ = ravel_pytree(y0)
     length = jnp.asarray(t1 - t0)
@@ -64,7 +65,8 @@ def _norm(x: Array) -> Array:
 
 @jax.custom_batching.custom_vmap
 def _worst(wrong: Array, *norms: Array) -> tuple[Array, ...]:
-    """Its arguments; of a batch those of a lane that is wrong, so that the branch stays one."""
+    """Its arguments; in a batch those of a single lane, a wrong one if there is any, so that the
+    branch is not batched."""
     return wrong, *norms
 
 

@@ -1,4 +1,4 @@
-"""What `fit` refuses before anything is compiled."""
+"""The checks of the arguments of `fit`, made before compilation."""
 
 from typing import Any
 
@@ -56,7 +56,7 @@ def check_types(
 
 
 def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | None) -> None:
-    """Raises unless model, sampler and manifold fit each other."""
+    """Raises unless model, sampler, data and manifold are compatible."""
     if manifold is not None:
         check_manifold(manifold)
         refuse_rates(manifold, "a training")
@@ -91,7 +91,7 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
 
 
 def check_family(sample: Any, args: Args) -> None:
-    """Raises unless states and `args` of a flow map that takes `args` can be drawn."""
+    """Raises unless states and `args` can be drawn for a flow map that takes `args`."""
     if args is not None:
         raise ValueError(
             "`args` were given, but this flow map takes them as inputs: a training draws them "
@@ -106,7 +106,7 @@ def check_family(sample: Any, args: Args) -> None:
 
 
 def check_limits(state: Any, target: Any, seconds: Any) -> None:
-    """Raises unless what a training begins and ends with makes sense."""
+    """Raises unless the initial state and the limits of a training are valid."""
     if state is not None and not isinstance(state, FitState):
         raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
     for name, value in (("target", target), ("seconds", seconds)):
@@ -116,7 +116,8 @@ def check_limits(state: Any, target: Any, seconds: Any) -> None:
 def check_field(
     model: AbstractTrainable, vector_field: VectorField, args: Args, points: Points
 ) -> None:
-    """Raises unless the vector field fits the states, is finite, and does not ask for the time."""
+    """Raises unless the vector field fits the states, is finite, and for a flow map is
+    autonomous."""
     starts = model.starts(points)
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
     rate = eqx.filter_eval_shape(vector_field, starts.ts[0], y0, args)
@@ -154,7 +155,7 @@ def _stacked_rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> 
 
 
 def check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:
-    """Raises unless a pool can grow, and its states are those that model and manifold are for."""
+    """Raises unless a pool can grow and its states fit the model and the manifold."""
     if recipe.refresh is None or recipe.refresh >= recipe.epochs:
         raise ValueError(
             "A `Pool` grows when new points are drawn, but with "

@@ -14,7 +14,7 @@ from .._networks import AbstractFlowMap, LayerSchedule, Points, Sampler, Times
 
 
 class Pairs(NamedTuple):
-    """States, and what they have become after some time."""
+    """States, and the states on the same trajectories some time later."""
 
     hs: Float[Array, " points"]
     y0s: Any
@@ -23,15 +23,15 @@ class Pairs(NamedTuple):
 
 @final
 class Data(eqx.Module):
-    """Trajectories, and how far from each of their states the flow map can step."""
+    """Trajectories, and how far the flow map can step from each of their states."""
 
     ts: Float[Array, "trajectories times"]
     ys: Any
-    last: Int[Array, "trajectories times"]  # the latest state that one step leads to
-    deviation: Float[Array, " n"]  # of what steps change, as `compared` measures it
+    last: Int[Array, "trajectories times"]  # the index of the latest state within one step
+    deviation: Float[Array, " n"]  # root mean square change by a step, in the units of `compared`
 
     def draw(self, count: int, key: PRNGKeyArray) -> Pairs:
-        """Random pairs: a state, and one of those that a single step leads to."""
+        """Random pairs of a state and a later one within a single step."""
         first_key, second_key = jr.split(key)
         starts = (self.last > jnp.arange(self.ts.shape[1])).reshape(-1).astype(self.ts.dtype)
         place = jr.choice(first_key, starts.size, (count,), p=starts / jnp.sum(starts))
@@ -49,7 +49,7 @@ class Data(eqx.Module):
 
 
 def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
-    """The trajectories `(ts, ys)`; raises unless they are ones."""
+    """The trajectories `(ts, ys)`; raises unless they are valid."""
     if not (isinstance(data, tuple) and len(data) == 2):
         raise TypeError(f"`data` is {type(data).__name__}, but it must be a pair `(ts, ys)`.")
     ts = np.asarray(data[0], float)
@@ -96,6 +96,7 @@ def draw_points(
 def mismatch(
     model: AbstractFlowMap, pairs: Pairs, deviation: Array, schedule: LayerSchedule | None
 ) -> Float[Array, "points n"]:
-    """What the flow map makes of the states of the pairs less what they became."""
+    """The difference of the flow map's states from the later states of the pairs, relative to
+    `deviation`."""
     found = jax.vmap(lambda y0, h: model(y0, h, schedule=schedule))(pairs.y0s, pairs.hs)
     return model.compared(found, pairs.y1s) / deviation

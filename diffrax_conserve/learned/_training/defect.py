@@ -26,7 +26,7 @@ def defects(
     """`du/dt - f(t, u)` at every point, as vectors in the units of the model.
 
     The time derivative is one forward-mode pass over the whole batch. A `vmap` of forward passes
-    takes twice as long, and reverse mode six times.
+    takes twice as long, and reverse mode six times as long.
     """
 
     def states(ts: Array) -> Y:
@@ -51,7 +51,7 @@ def _field(vector_field: VectorField, args: Args, ts: Array, ys: Y) -> Y:
 
 
 def squared_norms(vectors: Float[Array, "points n"]) -> Float[Array, " points"]:
-    """The squared norms of vectors that are stacked along a leading axis."""
+    """The squared norms of vectors stacked along a leading axis."""
     return jnp.sum(jnp.square(vectors), axis=1)
 
 
@@ -61,7 +61,8 @@ def trainable(model: AbstractTrainable) -> Any:
 
 
 def linear_weights(model: AbstractTrainable) -> Any:
-    """`model` with `True` in the place of every weight that its output is linear in."""
+    """`model` with `True` in the place of every weight in which its output is linear, and `False`
+    elsewhere."""
     weights = model.linear_weights()
     return _marked(model, model.linear_weights, jtu.tree_map(lambda _: True, weights))
 

@@ -1,4 +1,4 @@
-"""The compiled part of a training: from the state after some epochs to that after more."""
+"""The compiled part of a training, which advances its state by some epochs."""
 
 from typing import Any
 
@@ -23,9 +23,9 @@ from .second_order import LeastSquares, SecondOrder
 def advance(
     objective: Objective, carry: Carry, start: Int[Array, ""], stop: Int[Array, ""]
 ) -> tuple[Carry, Float[Array, ""]]:
-    """The epochs from `start` up to `stop`, and a comparison with the best model so far.
+    """Runs the epochs from `start` up to `stop`, and compares the model with the best one so far.
 
-    Both may be traced, so that all rounds share one compilation.
+    `start` and `stop` may be traced, so that all rounds share one compilation.
     """
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
     criterion, best = _compared(objective, carry)
@@ -43,8 +43,8 @@ def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Flo
     """The criterion of the model, and that of the best one so far."""
     if not isinstance(objective.sample, Pool):
         return objective.criterion(carry.weights, objective.first_points), carry.best
-    # The first states are not those that it goes to. With `refresh=1` neither model has been
-    # trained on those of the next epoch.
+    # The states of a pool move, so both models are compared on the points of the next epoch, on
+    # which with `refresh=1` neither has been trained.
     best = objective.criterion(carry.best_weights, carry.points)
     best = jnp.where(jnp.isfinite(carry.best), best, jnp.inf).astype(carry.best.dtype)
     return objective.criterion(carry.weights, carry.points), best
@@ -56,8 +56,8 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     update = _by_least_squares if isinstance(objective.optimiser, SecondOrder) else _by_gradient
     weights, optimiser_state, loss = update(objective, carry, schedule, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
-    # Skipping the update is not enough: the same points would give the same result in the next
-    # epoch. So continue from the best model.
+    # If the update is not finite, continue from the best model: skipping the update is not enough,
+    # because the same points would give the same result in the next epoch.
     fresh = objective.optimiser.init(carry.best_weights)
     carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),
@@ -84,7 +84,7 @@ def _by_gradient(
 def _by_least_squares(
     objective: Objective, carry: Carry, schedule: LayerSchedule, epoch: Array
 ) -> tuple[Any, Any, Float[Array, ""]]:
-    """The same by a second-order method, for which the weights are one vector."""
+    """The update by a second-order method, for which the weights are one vector."""
     assert isinstance(objective.optimiser, SecondOrder)
     vector, restore = ravel_pytree(carry.weights)
     points = carry.points
@@ -107,7 +107,7 @@ def _by_least_squares(
 
 
 def _refreshed(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    """The points for that epoch."""
+    """The points for `epoch`."""
     if objective.recipe.refresh is None:
         return carry.points
     due = epoch % objective.recipe.refresh == 0
@@ -115,7 +115,7 @@ def _refreshed(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Poi
 
 
 def _anew(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    """Other points; the states of a pool go where the network takes them."""
+    """New points; the states of a pool are moved by the network."""
     recipe, sample = objective.recipe, objective.sample
     key = jr.fold_in(objective.key, epoch)
     static, data = objective.static, objective.data
@@ -136,7 +136,7 @@ def _seen(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Any:
     """The domain, extended by the states of a pool."""
     if carry.domain is None:
         return None
-    # Before that the network may have gone where no solution does.
+    # Earlier, the network may have moved states where no solution goes.
     late = 2 * epoch >= objective.recipe.epochs
     return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
 

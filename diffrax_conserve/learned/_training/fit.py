@@ -67,60 +67,59 @@ def fit(
     r"""Trains a network from the vector field alone, or a flow map from data, or from both.
 
     Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output
-    of the network, the time derivative by forward-mode automatic differentiation. For a network
-    with a conservative layer $u$ is the output after as many iterations as the recipe's schedule
-    says.
+    of the network and its time derivative is computed by forward-mode automatic differentiation.
+    For a network with a conservative layer, the recipe's schedule determines the number of
+    iterations of the layer in $u$.
 
-    From `data` a flow map learns what becomes of states. Pairs of them, one step of any length
-    apart, are drawn along the trajectories. The loss is that of the differences, each component
-    relative to the root mean square of what steps change. Together with a vector field the squared
-    defect is added, relative to the median of $|f|^2$.
+    From `data` a flow map learns from pairs of states, one step of any length apart, which are
+    drawn along the trajectories. The loss is that of the differences, each component relative to
+    the root mean square change by a step. With a vector field the squared defect is added, relative
+    to the median of $|f|^2$.
 
-    An update that is not finite is not made. The model that is returned is the best that was seen,
-    not the last. `log.error` estimates the error of its solution.
+    Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
+    estimates the error of its solution.
 
-    A `PINN` of several windows is trained window by window; each starts where the one before ended,
-    moved onto the manifold if one is given. Each is judged by its estimated error. One that failed
-    is trained again from other weights, and then in halves, as often as the recipe's `retries` say.
-    If the solution is still wrong, a warning names the window and the error.
+    A `PINN` of several windows is trained window by window; each starts at the end of the previous
+    one, projected to the manifold if one is given. Each is judged by its estimated error. A window
+    that failed is trained again from other weights, and then in halves, up to `retries` times of
+    the recipe. If the solution is still wrong, a warning names the window and the error.
 
-    A training can stop and go on. It stops after the recipe's epochs, at a `target`, after
-    `seconds`, or by an interrupt from the keyboard, and returns the best model so far. With
-    `state=log.state` and the same other arguments the next call goes on where it stopped, and with
-    a `checkpoint` another process does, with the same result, bit for bit, as without the stop. A
-    finished training goes on with a recipe of more epochs; its result is that of all epochs at once
-    if the optimiser does not depend on their number, as that of SPRING does.
+    A training can be interrupted and continued. It stops after the recipe's epochs, at a `target`,
+    after `seconds`, or at a keyboard interrupt, and returns the best model so far. With
+    `state=log.state` and otherwise the same arguments the next call continues it, and with a
+    `checkpoint` another process does; the result is the same, bit for bit, as without the stop. A
+    finished training can be continued with a recipe of more epochs. The result is that of all
+    epochs at once unless the optimiser depends on their number, as SPRING does.
 
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.DeepONet`][], any other
         [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module `(y0, h) -> y` with an attribute
-        `max_step`, all of whose arrays are then trained.
-    - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time, and with `data` it
-        may be left out.
+        `max_step`, of which all arrays are trained.
+    - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time; with `data` it is
+        optional.
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, a function from a random key to an initial state, or a
-        [`diffrax_conserve.learned.Pool`][], which follows the solutions from there.
+        [`diffrax_conserve.learned.Pool`][], which follows the solutions from such states.
     - `data`: for a flow map, trajectories `(ts, ys)`: times of shape `(n, k)`, increasing along
-        each trajectory and perhaps unequal, and states with leading axes `(n, k)`.
-        [`diffrax_conserve.learned.trajectories`][] makes some. With a vector field and without
-        `sample` its states are those of the collocation points too.
-    - `args`: passed to `vector_field`. Left out for a flow map that takes `args` itself: they are
-        drawn from its `args_domain`, and the states of `data` are then pairs `(y, args)`.
+        each trajectory and not necessarily equidistant, and states with leading axes `(n, k)`.
+        [`diffrax_conserve.learned.trajectories`][] computes some. With a vector field and without
+        `sample`, the collocation points use these states too.
+    - `args`: passed to `vector_field`. Omit them for a flow map that takes `args` itself: they are
+        drawn from its `args_domain`, and the states of `data` are pairs `(y, args)`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
         [`diffrax_conserve.learned.second_order`][]`(model)`.
-    - `manifold`: for a `PINN` of several windows, where the ends of the windows are moved to: the
-        values of its integrals are those at the initial state. Default: that of its layer.
-    - `state`: the `state` of the log of a training that is to go on.
-    - `target`: ends the training of a flow map whose loss is at most this. For a `PINN` it is the
-        estimated error that its solution shall have, relative to its largest component. Default:
-        all epochs are made, and a solution with an error above 1e-4 is wrong.
+    - `manifold`: for a `PINN` of several windows, the manifold to which the ends of the windows are
+        projected, with the conserved values at the initial state. Default: that of its layer.
+    - `state`: the `state` in the log of a training that is to be continued.
+    - `target`: for a flow map, the loss at which the training ends. For a `PINN`, the accepted
+        estimated error of its solution, relative to its largest component. Default: all epochs are
+        run, and a solution with an error above 1e-4 counts as wrong.
     - `seconds`: ends the training after this wall time.
-    - `checkpoint`: a file that holds the state of the training. It is replaced now and then; if it
-        exists, the training goes on from it.
-    - `progress`: whether to print a line on standard error, or a function that is called now and
-        then with the number of epochs done, that of all epochs, the last loss and the best
-        criterion.
+    - `checkpoint`: a file for the state of the training, which is updated regularly; if it exists,
+        the training continues from it.
+    - `progress`: whether to print a line on standard error, or a function that is called regularly
+        with the number of epochs done, the total number, the last loss and the best criterion.
 
     **Returns:**
 
@@ -128,8 +127,8 @@ def fit(
 
     **Raises:**
 
-    `ValueError` or `TypeError` before the training if the arguments do not fit, among them a vector
-    field that is not finite at an initial state, or that depends on time though a flow map cannot;
+    `ValueError` or `TypeError` before the training if the arguments do not fit, for example if the
+    vector field is not finite at an initial state, or for a flow map depends on time;
     `FloatingPointError` if no update was finite.
 
     !!! example
@@ -232,7 +231,7 @@ def _fit_flow_map(trainer: Trainer, flow_map: Any, given: FitState | None) -> tu
 
 
 def _first(trainer: Trainer, model: Any, given: FitState | None) -> FitState:
-    """The state that a training begins with: a given one, that of a checkpoint, or a new one."""
+    """The first state of the training: the given one, that of a checkpoint, or a new one."""
     network = model.window(0) if isinstance(model, PINN) else model
     recipe, (points_key, _) = trainer.recipe, jr.split(trainer.key)
     if trainer.vector_field is not None:

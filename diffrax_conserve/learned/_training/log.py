@@ -1,4 +1,4 @@
-"""What a training tells about itself."""
+"""The log of a training."""
 
 from typing import Any, final
 
@@ -8,29 +8,30 @@ import numpy as np
 
 @final
 class FitLog(eqx.Module):
-    """How a training went.
+    """The record of a training.
 
     **Attributes:**
 
-    - `error`: the estimated error of the solution. Each leaf of the state counts relative to its
+    - `error`: the estimated error of the solution, for each leaf of the state relative to its
         largest component. For a `PINN` it is the largest error in the whole interval; for a flow
-        map the root mean square of that of its longest step, over states from `sample`. The
-        estimate solves the differential equation of the error, which the defect drives. Infinity
-        where no estimate could be made, or a window was not trained.
-    - `errors`: for each window of a `PINN` the error that it adds by itself.
+        map the root mean square error of its longest step, over states from `sample`. The estimate
+        solves the differential equation of the error, driven by the defect. Infinity if no estimate
+        is possible or a window was not trained.
+    - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        what was compared: the loss on the first collocation points with all iterations of the
-        conservative layer, so that epochs with different iterations are comparable. With a
-        [`diffrax_conserve.learned.Pool`][] it is the loss on its states for the next epoch, the
+        the compared values: the loss on the first collocation points with all iterations of the
+        conservative layer, so that epochs with different numbers of iterations are comparable. With
+        a [`diffrax_conserve.learned.Pool`][] it is the loss on its states for the next epoch, the
         same states for both models.
-    - `best_epoch`, `best`: the epoch of the model that was returned, and its criterion; of several
-        windows those of the worst.
-    - `skipped`: how many updates were not finite. Each of them was replaced by a return to the best
-        model so far, with a new state of the optimiser.
-    - `ended`: what ended the training: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
-    - `seconds`, `compile_seconds`: wall times, of the training and of the one compilation.
-    - `state`: where the training stopped, for `fit(..., state=log.state)`.
+    - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
+        those of the worst.
+    - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
+        best model so far, with a new state of the optimiser.
+    - `ended`: the reason why the training ended: `"epochs"`, `"target"`, `"seconds"` or
+        `"interrupt"`.
+    - `seconds`, `compile_seconds`: the wall times of the training and of the compilation.
+    - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
     """
 
     error: float

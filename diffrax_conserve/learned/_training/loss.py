@@ -7,12 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# The squared norm of the defect at each point, and a typical squared norm of `f`, to a loss.
+# A function from the squared norm of the defect at each point, and a typical squared norm of `f`,
+# to a loss.
 Loss = Callable[[Float[Array, " points"], Float[Array, ""]], Float[Array, ""]]
 
 
 def mean_square(squares: Float[Array, " points"], typical: Float[Array, ""]) -> Float[Array, ""]:
-    """The mean of the squared norms, as the paper has it."""
+    """The mean of the squared norms, as in the paper."""
     del typical
     return jnp.mean(squares)
 
@@ -22,8 +23,8 @@ class Bounded(eqx.Module):
     r"""The mean of $q / (1 + q / (c \bar q))$, with $q$ the squared norm of the defect.
 
     A point cannot contribute more than $c \bar q$, where $\bar q$ is the median of $|f|^2$ over the
-    initial states. So no few states that change too fast for the network (a close pair of vortices)
-    carry all of the loss.
+    initial states. So a few states that change too fast for the network (a close pair of vortices)
+    do not dominate the loss.
     """
 
     factor: float = 1.0

@@ -1,4 +1,5 @@
-"""The compiled part of a training: what is constant, and what changes from epoch to epoch."""
+"""The constants of the compiled part of a training, and the values that change from epoch to
+epoch."""
 
 from typing import Any, NamedTuple, final
 
@@ -34,14 +35,14 @@ class Carry(NamedTuple):
     best: Float[Array, ""]
     best_epoch: Int[Array, ""]
     skipped: Int[Array, ""]
-    domain: Any  # around what a pool has held, and what that was when the best model was found
+    domain: Any  # around all states of a pool; `best_domain` belongs to the best model
     best_domain: Any
     losses: Float[Array, " epochs"]
 
 
 @final
 class Objective(eqx.Module):
-    """All that is constant in a training: the loss of some weights, and how it is minimised."""
+    """The constants of a training: the loss as a function of the weights, and its minimisation."""
 
     static: Any  # the model without its weights
     vector_field: VectorField | None
@@ -52,7 +53,7 @@ class Objective(eqx.Module):
     optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
     typical: Float[Array, ""]
-    linear: Bool[Array, " weights"]  # of all weights in one vector, those of the last layer
+    linear: Bool[Array, " weights"]  # marks those of the last layer
     key: PRNGKeyArray
 
     def defects(
@@ -63,7 +64,7 @@ class Objective(eqx.Module):
         if self.vector_field is not None:
             rows.append(defects(model, self.vector_field, self.args, points, schedule))
         if self.data is not None:
-            # Both relative, so that neither outweighs the other by its units.
+            # Both are relative, so that neither dominates because of its units.
             rows = [row / jnp.sqrt(self.typical) for row in rows]
             rows.append(mismatch(model, points.pairs, self.data.deviation, schedule))
         return rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=1)
@@ -73,7 +74,7 @@ class Objective(eqx.Module):
         return self.recipe.loss(squared_norms(vectors), self.typical)
 
     def criterion(self, weights: Any, points: Points) -> Float[Array, ""]:
-        """The loss of what the trained model will compute."""
+        """The loss with all iterations of the layer, as the trained model is used."""
         loss = self.loss(weights, points, self.complete())
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 

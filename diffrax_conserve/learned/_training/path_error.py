@@ -1,13 +1,13 @@
-r"""The error of a network's solution, from its defect: what a training has still to learn.
+r"""The error of a network's solution, computed from its defect.
 
 The exact solution is $u + e$ with the network $u$, its defect in the right-hand side, and
 
 $$e' = f(t, u + e) - u', \qquad e(t_0) = e_0.$$
 
-It is exact, so the truncation error of an RK4 solve for $e$ is relative to $e$: a solution that is
-right to ten digits has an estimate of two digits by the same steps as one that is wrong. Between
-them the steps see four times as many times as the training did, so a defect that is large between
-the collocation points is seen.
+This equation is exact, so the truncation error of an RK4 solve for $e$ is relative to $e$: with the
+same steps, the estimate has two correct digits both for a solution with ten correct digits and for
+a wrong one. The steps evaluate the defect at four times as many points as the training, so a large
+defect between the collocation points is detected.
 """
 
 from typing import Any, NamedTuple
@@ -29,7 +29,8 @@ from .defect import VectorField
 
 
 class PathErrors(NamedTuple):
-    """Of each path and component: errors and states by their largest modulus, and at the end."""
+    """For each path and component: the largest modulus of the error, the error at the end, and the
+    largest modulus of the state."""
 
     largest: Float[Array, "paths n"]
     end: Float[Array, "paths n"]
@@ -46,7 +47,8 @@ def path_errors(
     initial: Float[Array, "paths n"],
     substeps: int,
 ) -> PathErrors:
-    """The errors of the paths that start at the times and states of `paths`, with these errors."""
+    """The errors of the paths that start at the times and states of `paths`, with the errors
+    `initial`."""
     grid = jnp.linspace(0, 1, 2 * substeps + 1, dtype=lengths.dtype)
     ts = paths.ts[:, None] + lengths[:, None] * grid
     repeated = jtu.tree_map(lambda x: jnp.repeat(x, grid.size, axis=0), paths.y0s)
@@ -91,7 +93,7 @@ def window_errors(
     initial: Float[Array, " n"],
     substeps: int,
 ) -> PathErrors:
-    """The errors of a window by itself, and of one that starts with the error `initial`."""
+    """The errors of a window that starts without an error, and with the error `initial`."""
 
     def twice(x: Array) -> Array:
         return jnp.stack([x, x])
@@ -137,14 +139,14 @@ def data_error(flow_map: AbstractFlowMap, data: Data, key: PRNGKeyArray) -> floa
     return relative(np.sqrt(squares), np.max(np.abs(stacked_vectors(pairs.y1s)), axis=0), example)
 
 
-# Of a flow map: initial states, and steps of RK4 for the error of each.
+# For a flow map: the number of initial states, and of RK4 steps for the error of each.
 _STATES, _SUBSTEPS = 64, 32
 
 
 def relative(errors: Any, sizes: Any, example: Y) -> float:
     """The largest of `errors`, each relative to the largest component of its leaf.
 
-    Infinity if one is not finite.
+    Infinity if any error is not finite.
     """
     errors, sizes = (unflatten(jnp.asarray(x), example) for x in (errors, sizes))
 

@@ -18,31 +18,33 @@ from ..._projection import project
 from ..._tree import tree_all_finite
 from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
 
-# From steps, an initial state and a length each, to the squared norms of the defects at their ends.
+# A function from steps, each given by an initial state and a length, to the squared norms of the
+# defects at their ends.
 Squares = Callable[[Points], Float[Array, " points"]]
 
 
 @final
 class Pool(eqx.Module):
-    r"""Initial states that start at those of `sample` and are moved by the network in training.
+    r"""Initial states that are drawn from `sample` and moved by the network in training.
 
-    Pass it as `sample` to [`diffrax_conserve.fit`][]. A flow map is stepped from the end of its
-    last step, so it must be trained on such states, and it can find them itself. The pool is the
-    states of one epoch. Whenever the recipe draws new points, the network moves each state by a
-    step of random length, and the result is projected onto the manifold through the state. Every
-    state starts again from `sample` after `mean_steps` steps in the mean. A move costs one
-    evaluation of the network; [`diffrax_conserve.learned.reachable_states`][] solves equations.
+    Pass it as `sample` to [`diffrax_conserve.fit`][]. In a solve, each step of a flow map starts at
+    the end of the last one, so it must be trained on such states, and it can generate them itself.
+    The pool consists of the states of one epoch. Whenever the recipe draws new points, the network
+    moves each state by a step of random length, and the result is projected to the manifold through
+    the state. Every state is replaced by a new one from `sample` after `mean_steps` steps on
+    average. A move costs one evaluation of the network, whereas
+    [`diffrax_conserve.learned.reachable_states`][] solves equations.
 
-    A step is taken only if its defect at the end is small. A wrong network takes few steps, so it
-    first learns the states of `sample`. It does not move states to where no solution goes, or where
-    the step is too long for the solution.
+    A step is accepted only if its defect at the end is small. An inaccurate network therefore takes
+    few steps and first learns the states of `sample`, and states are not moved where no solution
+    goes, or by steps too long for the solution.
 
-    Make the network with `states` that are spread about as far as the solutions will be: they
-    normalise its inputs.
+    Construct the network with `states` that cover about the region of the solutions: they normalise
+    its inputs.
 
-    The `domain` of the network that is trained covers the states that the pool held in the second
-    half of the epochs, besides those that the network was made with. (With a frame its largest
-    clock stays, by which the network measures time; faster states start again.)
+    The `domain` of the trained network covers the states with which it was constructed and those of
+    the pool in the second half of the epochs. (With a frame, the largest clock is unchanged,
+    because the network scales time by it; faster states are replaced by new ones.)
 
     !!! example
 
@@ -96,18 +98,19 @@ class Pool(eqx.Module):
 
 Pool.__init__.__doc__ = r"""**Arguments:**
 
-- `sample`: a function from a random key to an initial state, where solves start.
-- `manifold`: where the states are projected; each keeps the values of its integrals from its
-    start. Default: nothing is projected.
-- `mean_steps`: after how many steps a state starts again, in the mean. They have any length up to
-    the longest, so solutions are followed for about half as many of these.
-- `max_defect`: the largest defect at the end of a step that is taken, relative to the median of
-    $|f|$ over the first states. That of a network that stands still is about one.
-- `keep`: which states to go on from: a function of one state. Others start again.
+- `sample`: a function from a random key to an initial state of a solve.
+- `manifold`: the manifold to which states are projected; each keeps its initial values of the
+    integrals. Default: no projection.
+- `mean_steps`: the mean number of steps before a state is replaced by a new one. Steps have random
+    lengths up to the longest, so solutions are followed for about half as many longest steps.
+- `max_defect`: the largest accepted defect at the end of a step, relative to the median of $|f|$
+    over the first states. For a network with constant output it is about 1.
+- `keep`: a function of one state that tells whether to continue from it. Others are replaced by new
+    ones.
 
 **Raises:**
 
-`TypeError` or `ValueError` if an argument has a wrong type or value.
+`TypeError` or `ValueError` if an argument is invalid.
 """
 
 
@@ -121,7 +124,7 @@ def moved(
     fresh: Y,
     key: PRNGKeyArray,
 ) -> Y:
-    """The states of a pool after a step each; `fresh` ones where they start again."""
+    """The states of a pool after one step each, with some replaced by `fresh` ones."""
     lengths_key, restarts_key = jr.split(key)
     count = jtu.tree_leaves(y0s)[0].shape[0]
     lengths = jr.uniform(lengths_key, (count,), maxval=float(model.max_step))
@@ -143,7 +146,8 @@ def moved(
 
 
 def _projected(manifold: Manifold | None, args: Args, y0: Y, end: Y) -> tuple[Y, Bool[Array, ""]]:
-    """The end of a step, on the manifold through its start, and whether it got there."""
+    """The end of a step, projected to the manifold through its start, and whether that
+    succeeded."""
     if manifold is None:
         return end, jnp.asarray(True)
     values = conserved_values(manifold, 0.0, y0, args)
@@ -152,7 +156,7 @@ def _projected(manifold: Manifold | None, args: Args, y0: Y, end: Y) -> tuple[Y,
 
 
 def domain_of(flow_map: Any) -> AbstractDomain | None:
-    """The domain of a flow map, if it has one that a training can extend."""
+    """The domain of a flow map, if `fit` can extend it, otherwise `None`."""
     domain = flow_map.domain
     return domain if isinstance(domain, AbstractDomain) else None
 

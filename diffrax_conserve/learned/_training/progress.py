@@ -1,11 +1,11 @@
-"""The line that tells how a training goes."""
+"""The progress line of a training."""
 
 import sys
 from collections.abc import Callable
 
 from .state import FitState
 
-# Called with the epochs that are done, all epochs, the last loss and the best criterion.
+# Called with the number of epochs done, the total number, the last loss and the best criterion.
 Progress = Callable[[int, int, float, float], None]
 
 
@@ -17,7 +17,7 @@ def report(
     elapsed: float,
     estimate: Callable[[], float],
 ) -> None:
-    """Calls the function `progress`, or prints a line now and then."""
+    """Calls the function `progress`, or prints a line."""
     if progress is False:
         return
     windows = state.windows
@@ -29,7 +29,8 @@ def report(
     if progress is not True:
         progress(done, total, loss, best)
         return
-    # On a terminal one line that is overwritten, in a file one line for every tenth.
+    # On a terminal one line is overwritten; in a file there is one line for each tenth of the
+    # epochs.
     terminal = sys.stderr.isatty()
     if terminal or done == total or done % max(total // 10, 1) == 0:
         end = "\r" if terminal and done < total else "\n"

@@ -1,4 +1,4 @@
-"""Initial states for a flow map where the solutions go."""
+"""Initial states for a flow map, taken from solutions."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, final
@@ -28,10 +28,10 @@ def reachable_states(
 ) -> PyTree[Array]:
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
-    A flow map is stepped from where its last step ended, so it must be trained there. The region
-    from which initial states are drawn is rarely one that solutions stay in: of the paper's boxes
-    and annuli, between 73 % and 98 % of the trajectories leave them. Pass the result as `states` to
-    [`diffrax_conserve.DeepONet`][], and through [`diffrax_conserve.learned.FromStates`][] as
+    In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
+    such states. Solutions rarely stay in the region from which initial states are drawn: between 73
+    % and 98 % of the trajectories leave the paper's boxes and annuli. Pass the result as `states`
+    to [`diffrax_conserve.DeepONet`][], and through [`diffrax_conserve.learned.FromStates`][] as
     `sample` to [`diffrax_conserve.fit`][].
 
     **Arguments:**
@@ -41,16 +41,16 @@ def reachable_states(
     - `duration`: the longest time.
     - `key`: a random key, for the times.
     - `args`: passed to `vector_field`.
-    - `keep`: which states to keep: a function of one state. Leave out those that change too fast
-        for the step that is to be learned.
-    - `solver`, `dt0`: how the solutions are found. Default: [`diffrax.Dopri8`][] with adaptive
-        steps at a tolerance of $10^{-6}$. With `dt0` the steps are fixed: where `vector_field` is
-        expensive, take a flow map that is half trained, projected, in its own steps.
+    - `keep`: a function of one state that tells whether to keep it. Exclude states that change too
+        fast for the step that is to be learned.
+    - `solver`, `dt0`: the diffrax solver. Default: [`diffrax.Dopri8`][] with adaptive steps at a
+        tolerance of $10^{-6}$. With `dt0` the steps are fixed: if `vector_field` is expensive, use
+        the projected solver of a partly trained flow map with its own steps.
 
     **Returns:**
 
-    The states, stacked along a leading axis: as many as `y0s`, less those whose solve failed or
-    that `keep` leaves out.
+    The states, stacked along a leading axis: as many as `y0s`, minus those whose solve failed or
+    that `keep` excludes.
 
     **Raises:**
 
@@ -93,13 +93,14 @@ def trajectories(
 
     **Arguments:**
 
-    - `vector_field`, `args`: as of [`diffrax_conserve.learned.reachable_states`][].
+    - `vector_field`, `args`: as for [`diffrax_conserve.learned.reachable_states`][].
     - `y0s`: states at time 0, stacked along a leading axis.
     - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
     - `solver`, `dt0`: any diffrax solver; for stiff equations [`diffrax.Kvaerno5`][]. Default:
         [`diffrax.Dopri8`][]. With `dt0` its steps are fixed.
     - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
-        component of all `y0s`. Where small components count, give one that is small for them.
+        component of all `y0s`. If small components matter, pass a value that is small relative to
+        them.
 
     **Returns:**
 
@@ -107,7 +108,7 @@ def trajectories(
 
     **Raises:**
 
-    `ValueError` if all failed.
+    `ValueError` if all solves failed.
 
     !!! example
 
@@ -139,7 +140,7 @@ def _solutions(
     rtol: float = 1e-6,
     atol: float = 1e-6,
 ) -> tuple[Any, Array]:
-    """The states at `ts`, and which solves did not fail."""
+    """The states at `ts`, and which solves succeeded."""
     method = dfx.Dopri8() if solver is None else solver
 
     def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
@@ -172,7 +173,7 @@ def _the_good(ys: Any, good: Array) -> Any:
     return jtu.tree_map(lambda x: x[good], ys)
 
 
-# Where a solution ends in finite time, the steps towards its end would never end.
+# A limit, because a solution with a singularity at a finite time would need infinitely many steps.
 _MAX_STEPS = 10_000
 
 

@@ -1,4 +1,4 @@
-"""How to train: the parts of a recipe, and the paper's."""
+"""Recipes: the options of a training, the default one and that of the paper."""
 
 from collections.abc import Callable
 from typing import final
@@ -19,7 +19,7 @@ Schedule = Callable[[Array, int, int], Array]
 
 @final
 class Recipe(eqx.Module):
-    """How [`diffrax_conserve.fit`][] trains: every part can be replaced.
+    """The options of a training by [`diffrax_conserve.fit`][]. Every part can be replaced.
 
     !!! example
 
@@ -72,22 +72,22 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
     [`diffrax_conserve.learned.LevenbergMarquardt`][].
 - `iterations`, `weight`: the projection schedule, for a network with a conservative layer:
     functions of the epoch (traced), the number of epochs and the number of iterations in the layer,
-    that return $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where
+    which return $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where
     $P_k u$ is its output after $k$ iterations. Defaults: `staged_iterations` and `ramped_weight`.
-- `loss`: from the squared norm of the defect at each point, and the median of $|f|^2$ over the
-    initial states, to the loss: `mean_square`, `Bounded()`, or a function of your own.
-- `times`: how times are drawn: `uniform_times`, `grid_times`, or a function of your own.
-- `refresh`: after how many epochs new points are drawn. Default: never.
-- `max_gradient_norm`: longer gradients are scaled to this norm. `None` for no limit. Second-order
-    methods have their damping instead.
-- `check_every`: after how many epochs the model is compared with the best one so far.
-- `retries`: how often a window of a `PINN` that failed is cut in halves. Before each time it is
-    trained again from other weights. With 0 it is only judged.
+- `loss`: a function from the squared norm of the defect at each point, and the median of $|f|^2$
+    over the initial states, to the loss: `mean_square`, `Bounded()`, or your own.
+- `times`: the distribution of times: `uniform_times`, `grid_times`, or your own function.
+- `refresh`: the number of epochs after which new points are drawn. Default: never.
+- `max_gradient_norm`: longer gradients are scaled to this norm; `None` for no limit. Not used by
+    second-order methods, which have a damping instead.
+- `check_every`: the number of epochs after which the model is compared with the best one so far.
+- `retries`: how often a failed window of a `PINN` is cut in halves. Before each cut it is trained
+    again from other weights. With 0 windows are judged but not retrained.
 """
 
 
 def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
-    """The default recipe: second-order training, by the size of the problem.
+    """The default recipe: second-order training, with a method chosen by the size of the network.
 
     A `PINN` with up to 2,000 weights in each window is trained by
     [`diffrax_conserve.learned.LevenbergMarquardt`][] on a grid of 120 times, in 40 epochs for each
@@ -97,8 +97,8 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
-    - `epochs`: the number of updates. The error falls with it, down to what the network can
-        represent.
+    - `epochs`: the number of updates. The error decreases with it, down to the approximation error
+        of the network.
     """
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
         return Recipe(
@@ -120,15 +120,16 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     )
 
 
-# Its QR factorisation of so many columns takes about as long as SPRING's Cholesky one.
+# With this many columns its QR factorisation takes about as long as SPRING's Cholesky
+# factorisation.
 _LEVENBERG_MARQUARDT_MAX = 2000
 
 
 def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -> Recipe:
     """The recipe of the paper, amended where it fails as written.
 
-    From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, 5,000 pairs of
-    an initial state and a time for a flow map, and for the latter its projection schedule.
+    From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
+    map 5,000 pairs of an initial state and a time and the projection schedule.
 
     Amended: a PINN is projected from the first epoch on; the weight of the last iteration rises
     within each stage; the loss of a flow map is bounded at each point; gradients are clipped. "The
@@ -137,7 +138,7 @@ def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
-    - `epochs`, `points`: as of [`diffrax_conserve.learned.Recipe`][].
+    - `epochs`, `points`: as for [`diffrax_conserve.learned.Recipe`][].
 
     ??? cite "Reference"
 

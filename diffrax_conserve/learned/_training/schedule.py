@@ -1,4 +1,4 @@
-"""How many iterations of the conservative layer an epoch makes, and the weight of the last one.
+"""Schedules for the number of iterations of the conservative layer, and the weight of the last one.
 
 A schedule is a pair of functions of the epoch `e` (traced), the number `E` of epochs and the number
 `P` of iterations in the layer: `p(e, E, P)` and `s(e, E, P)`. The network is trained through
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 
 def staged_iterations(epoch: Int[Array, "..."], epochs: int, steps: int) -> Int[Array, "..."]:
-    """`p = min(P, floor(e (P + 1) / E))`: none at first, one more after each stage."""
+    """`p = min(P, floor(e (P + 1) / E))`: no iterations at first, one more after each stage."""
     return jnp.minimum(steps, epoch * (steps + 1) // epochs)
 
 
@@ -27,12 +27,12 @@ def ramped_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Ar
 
 
 def linear_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Array, "..."]:
-    """`s = e / E`, as the paper has it: what is trained jumps wherever `p` increases."""
+    """`s = e / E`, as in the paper: the trained function is discontinuous where `p` increases."""
     del steps
     return epoch / epochs
 
 
 def constant_weight(epoch: Int[Array, "..."], epochs: int, steps: int) -> Float[Array, "..."]:
-    """`s = 1`: the last iteration counts alone."""
+    """`s = 1`: only the last iteration counts."""
     del epochs, steps
     return jnp.ones_like(epoch, float)

@@ -4,8 +4,9 @@ With the defects of all collocation points in one vector $r(\theta)$ and its Jac
 $\delta$ minimises $|J \delta + r|^2 + \lambda |\delta - \zeta|^2$. The two methods differ in the
 points, in the damping $\lambda$, and in $\zeta$.
 
-A loss of the squared norms $q_i$ of the defects that is not their mean is made one of least squares
-by giving each point the weight $\partial \ell / \partial q_i$: the gradient is the same.
+A loss $\ell$ of the squared norms $q_i$ of the defects other than their mean is converted to least
+squares by giving each point the weight $\partial \ell / \partial q_i$, which leaves the gradient
+the same.
 """
 
 from collections.abc import Callable
@@ -26,10 +27,10 @@ from .loss import Loss
 class LeastSquares(NamedTuple):
     """The problem of one update, as a function of the weights in one vector."""
 
-    # The defects of every point, and their Jacobian.
+    # The defects at every point, and their Jacobian.
     defects: Callable[[Float[Array, " weights"]], Float[Array, "points n"]]
     jacobian: Callable[[Float[Array, " weights"]], Float[Array, "points n weights"]]
-    # The loss, from the squared norms of the defects, and the typical square it is relative to.
+    # The loss as a function of the squared norms of the defects, and the typical square.
     loss: Loss
     typical: Float[Array, ""]
 
@@ -59,18 +60,18 @@ class SpringState(NamedTuple):
 
 @final
 class SPRING(eqx.Module):
-    r"""A natural gradient in the space of samples, with momentum, for fresh points in each epoch.
+    r"""A natural gradient in sample space, with momentum, for new points in each epoch.
 
-    Of all updates that solve the linearised equations of the epoch's points, up to the damping, it
-    takes the one nearest to $\zeta = \mu \delta_{\text{last}}$:
+    Of all updates that solve the linearised equations at the points of the epoch, up to the
+    damping, this is the one nearest to $\zeta = \mu \delta_{\text{last}}$:
 
     $$\delta = \zeta - J^\top (J J^\top + \lambda I)^{-1} (r + J \zeta),$$
 
-    with a damping $\lambda$ proportional to the loss. The matrix has as many rows as there are
-    equations, not weights: a batch of 250 points of three equations needs one Cholesky
-    factorisation of size 750, whatever the size of the network. The updates are made in full during
-    the first two fifths of the epochs; after that their length falls to zero, linearly, so that the
-    noise of the batches averages out.
+    with a damping $\lambda$ proportional to the loss. The size of the matrix is the number of
+    equations, not of weights: a batch of 250 points of three equations needs one Cholesky
+    factorisation of size 750 for any size of the network. During the first two fifths of the epochs
+    updates are made in full; then their length decreases linearly to zero, so that the noise of the
+    batches averages out.
 
     ??? cite "Reference"
 
@@ -118,16 +119,16 @@ SPRING.__init__.__doc__ = r"""**Arguments:**
 
 @final
 class LevenbergMarquardt(eqx.Module):
-    r"""Gauss-Newton steps with an adaptive damping, for small networks and the same points always.
+    r"""Gauss-Newton steps with an adaptive damping, for small networks and fixed points.
 
-    An update that does not lessen the loss is not made, and the damping $\lambda$ is raised; after
-    one that did what the linear model promised it is lowered.
+    An update that does not reduce the loss is rejected, and the damping $\lambda$ is increased;
+    after an update that reduces the loss as the linear model predicts, it is decreased.
 
     The output of a network is linear in the weights of its last layer. Those are damped far less,
     by $10^{-12} \lambda$, so that every update solves for them almost exactly, as in variable
-    projection. It decides between a residual of $10^{-5}$ and one of $10^{-10}$: damped alike, the
-    iteration creeps along a curved valley. The problem is then ill-conditioned, and solved by a QR
-    factorisation of $J$ rather than by its normal equations.
+    projection. With equal damping, the iteration moves slowly along a curved valley and reaches a
+    residual of $10^{-5}$ instead of $10^{-10}$. The problem is ill-conditioned, and therefore
+    solved by a QR factorisation of $J$ instead of its normal equations.
 
     ??? cite "Reference"
 
@@ -173,7 +174,7 @@ LevenbergMarquardt.__init__.__doc__ = r"""**Arguments:**
 - `damping`: $\lambda$ of the first update.
 """
 
-# In these units the weights of the last layer are damped like all others.
+# The unit of the weights of the last layer. In these units they are damped like all others.
 _FREEDOM = 1e6
 
 SecondOrder = SPRING | LevenbergMarquardt
@@ -187,6 +188,6 @@ def _damped_least_squares(
     identity = jnp.sqrt(damping) * jnp.eye(columns, dtype=matrix.dtype)
     zeros = jnp.zeros(columns, rhs.dtype)
     extended = jnp.block([[matrix, rhs[:, None]], [identity, zeros[:, None]]])
-    # The triangular factor of the matrix with its right-hand side holds Qᵀ b in its last column.
+    # The last column of the triangular factor of `[A, b]` is Qᵀ b.
     r = jnp.linalg.qr(extended, mode="r")
     return jsl.solve_triangular(r[:columns, :columns], r[:columns, columns])

@@ -1,4 +1,4 @@
-"""Where a training stands: what another call of `fit`, or another process, needs to go on."""
+"""The state of a training, from which another call of `fit` or another process can continue it."""
 
 import dataclasses
 import hashlib
@@ -20,44 +20,45 @@ from .objective import Carry
 
 @final
 class FitState(eqx.Module):
-    """Where a training stands, `log.state` of [`diffrax_conserve.learned.FitLog`][].
+    """The state of a training, `log.state` of [`diffrax_conserve.learned.FitLog`][].
 
-    Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are no part of the interface.
+    Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are not part of the interface.
     """
 
     model: Any  # as it was given
-    carry: Carry  # of the network that is trained now
+    carry: Carry  # of the present network
     checked: np.ndarray  # of that network
     criteria: np.ndarray
     past: "Past"
-    trained: int = 0  # how many trainings have ended
+    trained: int = 0  # number of trainings that have ended
     finished: int = 0
     windows: "Windows | None" = None  # of a PINN
 
     @property
     def done(self) -> int:
-        """The epochs that the present network has had."""
+        """The number of epochs of the present network."""
         return int(self.checked[-1]) if self.checked.size else 0
 
 
 @final
 class Windows(eqx.Module):
-    """The windows of a PINN in training, stacked in arrays of numpy: their number may change."""
+    """The windows of a PINN in training, stacked in numpy arrays, because their number may
+    change."""
 
     nets: Any
     y0s: Any
     edges: np.ndarray
-    errors: np.ndarray  # of each by itself; infinity if it is not trained
-    halvings: np.ndarray  # how often the window that it is a part of was cut
+    errors: np.ndarray  # of each window alone; infinity if it is not trained
+    halvings: np.ndarray  # how often each one's original window was cut
     slope: float  # of the first weights; 0 for none
-    present: int = 0  # the one that is trained now
-    attempt: int = 0  # how often it was trained before
+    present: int = 0  # index of the one in training
+    attempt: int = 0  # number of its earlier trainings
     given_up: int = 0  # whether a window has failed for good
 
 
 @final
 class Past(eqx.Module):
-    """The records of the networks before the present one, and the worst of them."""
+    """The records of the networks before the present one, and the values of the worst of them."""
 
     losses: np.ndarray
     checked: np.ndarray
@@ -71,7 +72,7 @@ class Past(eqx.Module):
         return cls(np.zeros(0), np.zeros(0, int), np.zeros(0))
 
     def and_then(self, carry: Carry, checked: np.ndarray, criteria: np.ndarray) -> "Past":
-        """With the record of the network after these."""
+        """These records with that of one more network."""
         before = self.losses.size
         worse = float(carry.best) > self.best
         return Past(
@@ -85,7 +86,8 @@ class Past(eqx.Module):
 
 
 def continued(state: FitState, epochs: int, first: FitState) -> FitState:
-    """A state that was given, to go on with; `first` is that of a new training."""
+    """The given `state`, if a training can be continued from it; `first` is that of a new
+    training."""
     if jtu.tree_structure(state.carry.weights) != jtu.tree_structure(first.carry.weights):
         raise ValueError("`state` is that of a training of another kind of network.")
     if state.done < epochs and (state.windows is None or state.windows.errors.size == 1):
@@ -100,7 +102,8 @@ def continued(state: FitState, epochs: int, first: FitState) -> FitState:
 
 
 def fingerprint(model: Any, key: Any, recipe: Any) -> str:
-    """A number that two trainings have in common only if they start alike."""
+    """A hash of the network, the key and some numbers of the recipe, which identifies a
+    training."""
     digest = hashlib.sha256()
     for leaf in jtu.tree_leaves(eqx.filter((model, key), eqx.is_array)):
         digest.update(_plain(leaf).tobytes())
@@ -110,7 +113,7 @@ def fingerprint(model: Any, key: Any, recipe: Any) -> str:
 
 
 def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
-    """Writes `state` such that a reader finds the old file or the new one."""
+    """Writes `state` atomically."""
     leaves = jtu.tree_leaves(state)
     header = json.dumps({"format": _FORMAT, "mark": mark, "leaves": len(leaves)})
     arrays: dict[str, Any] = {f"x{i}": _plain(leaf) for i, leaf in enumerate(leaves)}
@@ -123,7 +126,7 @@ def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
 
 
 def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
-    """The state in a file. `like` is the first one of the same training."""
+    """The state in a file; `like` is the first state of the same training."""
     try:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
@@ -151,7 +154,7 @@ def _plain(leaf: Any) -> np.ndarray:
 
 
 def _as(found: np.ndarray, like: Any) -> Any:
-    """A leaf of a file as one of the kind of `like`."""
+    """A leaf of a file, converted to the type of `like`."""
     if isinstance(like, int | float):
         return type(like)(found)
     if isinstance(like, np.ndarray):

@@ -1,4 +1,4 @@
-"""The rounds of a training: epochs, a look at the clock, a line of progress, a checkpoint."""
+"""The rounds of a training: epochs, time limit, progress line, checkpoint."""
 
 import dataclasses
 import time
@@ -26,7 +26,7 @@ from .state import FitState, write_checkpoint
 @final
 @dataclasses.dataclass
 class Trainer:
-    """Trains one network after the other, all of the same shape, with one compilation."""
+    """Trains several networks of the same shape in turn, with one compilation."""
 
     vector_field: VectorField | None
     sample: Sampler | None
@@ -42,22 +42,22 @@ class Trainer:
     begun: float = dataclasses.field(default_factory=time.perf_counter)
     compiled: Any = None
     compile_seconds: float = 0.0
-    first: int | None = None  # the epoch that this call of `fit` began with
-    saved: float = -np.inf  # when, and how long it took
+    first: int | None = None  # the first epoch of this call of `fit`
+    saved: float = -np.inf  # time of the last save; `saving` is its duration
     saving: float = 0.0
 
     def network_key(self, state: FitState) -> PRNGKeyArray:
         return self.key if state.trained == 0 else jr.fold_in(self.key, state.trained)
 
     def start(self, model: AbstractTrainable, state: FitState | None) -> tuple[Objective, Carry]:
-        """What is constant in the training of the present network, and its first carry."""
+        """The constants of the training of the present network, and its first carry."""
         key = self.key if state is None else self.network_key(state)
         field, data = self.vector_field, self.data
         return start(model, field, key, self.sample, self.args, self.recipe, data)
 
     @property
     def substeps(self) -> int:
-        """Steps in which the error of a window is followed."""
+        """The number of steps for the error of a window."""
         return 2 * self.recipe.points
 
     def rounds(
@@ -67,13 +67,13 @@ class Trainer:
         close_enough: Callable[[Objective, FitState], bool],
         estimate: Callable[[Objective, FitState], float],
     ) -> tuple[FitState, str]:
-        """Trains one network to its last epoch, or to what ends the training before."""
+        """Trains one network to its last epoch, or until the training ends earlier."""
         epochs, ended = self.recipe.epochs, ""
         state = _resized(state, epochs)
         try:
             self._compile(objective, state)
             while not ended:
-                # Without an epoch between them, the first round only judges the model as it came.
+                # The first round has no epochs: it only evaluates the given model.
                 stop = min(state.done + self.recipe.check_every, epochs)
                 stop = stop if state.checked.size else 0
                 carry, criterion = self.compiled(
@@ -126,7 +126,7 @@ class Trainer:
 
 
 def _resized(state: FitState, epochs: int) -> FitState:
-    """`state` with room for the losses of so many epochs."""
+    """`state` with an array of losses for this many epochs."""
     losses = state.carry.losses[:epochs]
     losses = jnp.concatenate([losses, jnp.full(epochs - losses.size, jnp.nan, losses.dtype)])
     return dataclasses.replace(state, carry=state.carry._replace(losses=losses))

@@ -1,4 +1,4 @@
-"""The windows of a PINN: each starts where the one before it ends, and is judged by its error."""
+"""The windows of a PINN: each starts at the end of the previous one, and is judged by its error."""
 
 import dataclasses
 import warnings
@@ -26,7 +26,7 @@ _project = eqx.filter_jit(project)
 
 
 class WindowEnds(NamedTuple):
-    """The manifold that the ends of the windows are moved to."""
+    """The manifold to which the ends of the windows are projected."""
 
     manifold: Manifold
     values: Any
@@ -47,7 +47,7 @@ class WindowEnds(NamedTuple):
 
 
 def windows_of(pinn: PINN) -> Windows:
-    """The windows of a network before the first is trained."""
+    """The windows of an untrained network."""
     nets, y0s = jtu.tree_map(np.asarray, (pinn.nets, pinn.y0s))
     count, slope = pinn.windows, initial_slope(pinn.window(0).net)
     errors, halvings = np.full(count, np.inf), np.zeros(count, int)
@@ -57,7 +57,8 @@ def windows_of(pinn: PINN) -> Windows:
 def train_windows(
     trainer: Trainer, state: FitState, ends: WindowEnds | None
 ) -> tuple[FitState, Windows, str]:
-    """Trains the windows one after the other; those that fail again, then in halves."""
+    """Trains the windows one after the other; windows that fail are trained again, then in
+    halves."""
     limit = _limit(trainer, state.model)
     objective, _ = trainer.start(_present(trainer, state), state)
 
@@ -71,13 +72,14 @@ def train_windows(
             window = eqx.combine(state.carry.best_weights, objective.static)
             judged = _judged(trainer, state, window, ends)
             if ended in ("seconds", "interrupt"):
-                # What is judged so far is not kept: a training that goes on judges it at its end.
+                # `judged` is returned but not stored in `state`: a continued training judges the
+                # window at its end.
                 return state, judged, ended
             following = _next(trainer, state, judged, limit)
             if not following.finished:
                 objective, carry = trainer.start(_present(trainer, following), following)
                 following = dataclasses.replace(following, carry=carry)
-            # At once, so that an interrupt finds one or the other.
+            # A single assignment, so that an interrupt leaves a consistent state.
             state = following
             trainer.save(state)
     except KeyboardInterrupt:
@@ -91,7 +93,7 @@ def train_windows(
 
 
 def _present(trainer: Trainer, state: FitState) -> Window:
-    """The window that is to be trained now, with other weights the second time."""
+    """The window that is trained next, with new weights at the second attempt."""
     found = state.windows
     assert found is not None
     k = found.present
@@ -102,7 +104,7 @@ def _present(trainer: Trainer, state: FitState) -> Window:
 
 
 def _judged(trainer: Trainer, state: FitState, window: Window, ends: WindowEnds | None) -> Windows:
-    """All windows with the present one, if it is the best for its interval."""
+    """All windows, with the present one replaced by `window` if that is better."""
     found = state.windows
     assert found is not None
     k, error = found.present, _own_error(trainer, state.model, window)
@@ -118,7 +120,8 @@ def _judged(trainer: Trainer, state: FitState, window: Window, ends: WindowEnds 
 
 
 def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> FitState:
-    """What is to be trained after a window: the same one again, its first half, or the next."""
+    """The state for the next training: the same window again, its first half, or the next
+    window."""
     k, retries = found.present, trainer.recipe.retries
     failed = not found.errors[k] <= limit and not found.given_up and retries
     if failed and found.attempt == 0:
@@ -126,7 +129,8 @@ def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> Fi
     elif failed and found.halvings[k] < retries:
         found = _halved(found, trainer.network_key(state))
     else:
-        # After a window that has failed for good the others start at a wrong state.
+        # After a window that has finally failed, the others start at a wrong state and are not
+        # retried.
         found = dataclasses.replace(found, given_up=int(bool(found.given_up or failed)))
         if k + 1 == found.errors.size:
             return dataclasses.replace(state, windows=found, finished=1)
@@ -169,7 +173,7 @@ def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
 
 
 def _worst(objective: Objective, state: FitState) -> float:
-    """The largest error of a window that is trained."""
+    """The largest error of the trained windows."""
     del objective
     assert state.windows is not None
     errors = state.windows.errors
@@ -177,18 +181,19 @@ def _worst(objective: Objective, state: FitState) -> float:
 
 
 def _limit(trainer: Trainer, pinn: PINN) -> float:
-    """The error by itself above which a window has failed."""
+    """The error of a single window above which it has failed."""
     return _WRONG if trainer.target is None else trainer.target / (_GROWTH * pinn.windows)
 
 
-# A solution with a larger error than this, relative to its largest component, is not one.
+# A solution with a larger error than this, relative to its largest component, counts as wrong.
 _WRONG = 1e-4
 # Errors of windows add up, and later windows may amplify them.
 _GROWTH = 4
 
 
 def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
-    """The largest error of a window, relative to the solution in it and in the beginning."""
+    """The largest error of a window alone, relative to the larger of the solution in it and the
+    initial state."""
     none = jnp.zeros_like(pinn.scale)
     assert trainer.vector_field is not None
     found = window_errors(window, trainer.vector_field, trainer.args, none, trainer.substeps)
@@ -197,7 +202,7 @@ def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
 
 
 def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray) -> float:
-    """The largest error in the whole interval; warns where it is not small."""
+    """The largest error in the whole interval, with a warning if it is not small."""
     error, largest, sizes = jnp.zeros_like(pinn.scale), [], []
     assert trainer.vector_field is not None
     for k in range(pinn.windows):
@@ -206,7 +211,7 @@ def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray
         largest.append(np.asarray(found.largest[1]))
         sizes.append(np.asarray(found.size[1]))
         if k + 1 < pinn.windows:
-            # The exact solution goes on, wherever the next window starts.
+            # The next window starts at another state, but the exact solution is continuous.
             end = flatten(window(window.start + window.length))
             error = found.end[1] + end - flatten(pinn.window(k + 1).y0)
     size = np.max(sizes, axis=0)
@@ -218,7 +223,7 @@ def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray
 
 
 def _warn(pinn: PINN, errors: np.ndarray, along: list[float], limit: float, wrong: float) -> None:
-    """Says which window is wrong, and by how much."""
+    """Warns, with the window that is wrong and its error."""
     failed = np.flatnonzero(~(errors <= limit))
     k = int(failed[0]) if failed.size else int(np.argmax(along))
     first, last = pinn.edges[k], pinn.edges[k + 1]
