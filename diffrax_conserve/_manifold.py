@@ -170,9 +170,9 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 - `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
     `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
     `jax.pure_callback`. All other derivatives are taken by autodiff of `fn` and `jacobian`; where
-    that is impossible it is an error. The Jacobian is not checked, although the scales of residuals
-    and all derivatives depend on it: compare it once with finite differences, by
-    `jax.test_util.check_grads` of `entry.fn`.
+    that is impossible it is an error. The scales of residuals and all derivatives depend on it. A
+    solve compares it with difference quotients at the initial state, and does not start if it is
+    wrong there; [`diffrax_conserve.project`][] does not check it.
 """
 
 

@@ -1,14 +1,16 @@
 """Functions with a Jacobian given by the user, for functions that autodiff cannot differentiate."""
 
+import functools as ft
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Bool
 
 from ._custom_types import Args, ConstraintFn, RealScalarLike, Values, Y
-from ._tree import tree_tangents
+from ._tree import tree_add, tree_max, tree_tangents, working_dtype
 
 
 class WithJacobian(eqx.Module):
@@ -28,6 +30,50 @@ class WithJacobian(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return _call((self.fn, self.jacobian, t, args), y)
+
+    def is_wrong(self, t: RealScalarLike, y: Y, args: Args) -> Bool[Array, ""]:
+        """Whether derivatives at `y`, along two directions, differ from central difference
+        quotients by more than these can be wrong."""
+        eps = float(jnp.finfo(working_dtype(y)).eps)
+        step, tolerance = eps ** (1 / 3), eps ** (1 / 8)
+        # A state of zeros has no size.
+        largest = jnp.where(tree_max(y) > 0, tree_max(y), 1)
+        rng = np.random.default_rng(0)
+        value, rows = self.fn(t, y, args), self.jacobian(t, y, args)
+
+        def signs(x: Array) -> Array:
+            return jnp.asarray(rng.choice([-1.0, 1.0], jnp.shape(x)), jnp.real(x).dtype)
+
+        def along(x: Array, phase: Array) -> Array:
+            return (jnp.abs(x) + 0.1 * largest.astype(jnp.real(x).dtype)) * phase
+
+        def combined(value: Array, row: Any) -> Y:
+            return jtu.tree_map(lambda r: jnp.tensordot(signs(value), r, axes=value.ndim), row)
+
+        # Along the first direction the terms of a single gradient have the same sign.
+        sums = jtu.tree_leaves(value), jtu.tree_structure(value).flatten_up_to(rows)
+        total = ft.reduce(tree_add, map(combined, *sums))
+        phases = jtu.tree_map(lambda r: jnp.where(r == 0, 1, jnp.conj(r) / jnp.abs(r)), total)
+        directions = [jtu.tree_map(along, y, x) for x in (phases, jtu.tree_map(signs, y))]
+
+        def moved(direction: Y, factor: float) -> Values:
+            there = jtu.tree_map(lambda x, v: (x + factor * v).astype(x.dtype), y, direction)
+            return self.fn(t, there, args)
+
+        def differs(value: Array, ahead: Array, behind: Array, row: Any, v: Y) -> Array:
+            quotient = (ahead - behind) / (2 * step)
+            terms = _product(value, jtu.tree_map(jnp.abs, row), jtu.tree_map(jnp.abs, v))
+            size = tolerance * jnp.maximum(terms, jnp.abs(quotient))
+            roundoff = 100 * eps / step * jnp.maximum(jnp.abs(value), jnp.abs(ahead))
+            # NaN tells nothing: `fn` need not be defined there.
+            return jnp.any(jnp.abs(quotient - _product(value, row, v)) > size + roundoff)
+
+        wrong = []
+        for v in directions:
+            ahead, behind = moved(v, step), moved(v, -step)
+            differ = ft.partial(differs, v=v)
+            wrong += jtu.tree_leaves(jtu.tree_map(differ, value, ahead, behind, rows))
+        return jnp.any(jnp.stack(wrong))
 
 
 @eqx.filter_custom_jvp

@@ -399,7 +399,8 @@ def tables(records):
 def cells(kind, rows):
     def median(label, key):
         found = [row["errors"].get(label, {}).get(key) for row in rows]
-        return None if None in found else trained.median(found)
+        known = [number for number in found if number is not None]
+        return trained.median(known) if known else None
 
     def error(label, key):
         number = median(label, key)
@@ -409,7 +410,8 @@ def cells(kind, rows):
         number = median(label, "ns_per_step")
         return "" if number is None else f"{number:,.0f}"
 
-    seconds = trained.median(row["seconds"] for row in rows)
+    # Of the processors; of the clock where only that was taken.
+    seconds = trained.median(row.get("cpu_seconds", row["seconds"]) for row in rows)
     first = [str(len(rows)), f"{rows[0]['weights']:,}", f"{seconds:.0f}"]
     if kind == "pinn":
         return [

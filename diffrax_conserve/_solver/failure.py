@@ -40,6 +40,8 @@ _CAUSES = (
     "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`.",
     _START + "the conserved `value` of {name} cannot be reached from the initial state. Check the "
     "value, or find a state that has it by `diffrax_conserve.project`.",
+    _START + "the `jacobian` of {name} is not the derivative of its `fn` at the initial state. "
+    "Compare it with difference quotients, by `jax.test_util.check_grads` for example.",
 )
 _NONFINITE, _TOO_FAR, _DIVERGED, _UNSATISFIED = range(4)
 # The index of the first cause from `initial.py` other than `FINE`.

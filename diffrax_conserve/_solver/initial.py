@@ -10,8 +10,9 @@ from .._manifold import Constraint, FirstIntegral, is_entry
 from .._projection import AbstractProjection, SimplifiedNewton, measure, relative
 from .._projection.project import apply
 from .._tree import tree_stop_gradient, working_dtype
+from .._with_jacobian import WithJacobian
 
-FINE, NOT_FINITE, VIOLATED, UNREACHABLE = range(4)
+FINE, NOT_FINITE, VIOLATED, UNREACHABLE, WRONG_JACOBIAN = range(5)
 
 
 class Initial(eqx.Module):
@@ -34,7 +35,8 @@ def judge(
 ) -> Initial:
     """A `Constraint` is violated if its residual is larger than the square root of roundoff,
     relative to the size of its terms; the first step removes smaller ones. A first integral with
-    its own `value` may start at another value if a projection from the initial state succeeds."""
+    its own `value` may start at another value if a projection from the initial state succeeds. A
+    given `jacobian` must agree with difference quotients."""
     # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
     manifold, values, t, y, args = tree_stop_gradient((manifold, values, t, y, args))
     dtype = working_dtype(y)
@@ -51,7 +53,10 @@ def judge(
         nonfinite = _any(ratio, lambda x: ~jnp.isfinite(x)) | _any(
             scale, lambda x: ~jnp.isfinite(x)
         )
-        wrong = jnp.where(nonfinite, NOT_FINITE, jnp.where(violated, VIOLATED, FINE))
+        wrong = jnp.where(violated, VIOLATED, FINE)
+        if isinstance(entry.fn, WithJacobian):
+            wrong = jnp.where(entry.fn.is_wrong(t, y, args), WRONG_JACOBIAN, wrong)
+        wrong = jnp.where(nonfinite, NOT_FINITE, wrong)
         position = jnp.where(wrong != FINE, i, position).astype(jnp.int32)
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)

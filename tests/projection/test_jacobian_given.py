@@ -6,6 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 import diffrax_conserve as dfc
 
@@ -140,3 +143,41 @@ def test_complex_states_follow_the_convention_of_jax():
     got, expected = (dfc.project(m, y, **options) for m in (given, dfc.FirstIntegral(fn)))
     assert got[1].ok
     same(got[0], expected[0], 1e-14)
+
+
+STATES = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0, width=32))
+
+
+@jax.jit
+def is_wrong(y, factor, offset):
+    def fn(t, y, args):
+        return offset + y[0] * y[1] + y[2] ** 2 + jnp.sin(y[0])
+
+    def scaled(t, y, args):
+        return factor * jax.grad(fn, 1)(t, y, args)
+
+    return dfc.FirstIntegral(fn, jacobian=scaled).fn.is_wrong(0.0, y, None)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@given(y=STATES, offset=st.floats(-1e10, 1e10))
+@example(y=np.zeros(3), offset=0.0)
+def test_a_right_jacobian_is_never_refused(dtype, y, offset):
+    """Roundoff of a large constant is no difference."""
+    assert not is_wrong(*(jnp.asarray(x, dtype) for x in (y, 1.0, offset)))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@given(y=STATES, factor=st.floats(-10.0, 0.5) | st.floats(2.0, 10.0))
+@example(y=np.zeros(3), factor=2.0)
+def test_a_jacobian_that_is_off_by_a_factor_is_refused(dtype, y, factor):
+    assert is_wrong(*(jnp.asarray(x, dtype) for x in (y, factor, 0.0)))
+
+
+def test_a_wrong_jacobian_ends_the_solve_and_names_its_entry():
+    def twice(t, y, args):
+        return 2 * slope(t, y, args)
+
+    wrong = (SEEN, dfc.FirstIntegral(called(lambda y: 3 * in_numpy(y)), jacobian=twice))
+    solution = solve(wrong, throw=False)
+    assert "`jacobian` of entry 1" in dfx.RESULTS[solution.result]
