@@ -16,11 +16,12 @@ from .._manifold import (
     check_manifold,
     conserved_values,
     evaluate,
+    is_entry,
     named_entries,
 )
 from .._options import check_solution
 from .._projection import measure, relative
-from .._tree import tree_add, tree_shapes
+from .._tree import tree_add, tree_shapes, tree_sub
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -119,6 +120,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     _, scale = measure(manifold, values, t0, y0, args)
 
     gained = _gained(sol, manifold, args)
+    if gained is not None:
+        # The rates are integrated from the start of the solve, at which a given `value` holds.
+        values = tree_sub(values, _without_value(manifold, gained(t0)))
 
     def at(t: Array, y: Y) -> Values:
         padded = ~jnp.isfinite(t)
@@ -129,6 +133,16 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         return relative(residual, scale)
 
     return jax.vmap(at)(sol.ts, sol.ys)
+
+
+def _without_value(manifold: Manifold, gained: Values) -> Values:
+    """`gained`, and zero for the entries whose `value` is given."""
+    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
+    parts = [
+        jtu.tree_map(jnp.zeros_like, part) if getattr(entry, "value", None) is not None else part
+        for entry, part in zip(entries, treedef.flatten_up_to(gained), strict=True)
+    ]
+    return treedef.unflatten(parts)
 
 
 def _check_states(sol: dfx.Solution, y0: Y) -> None:

@@ -151,7 +151,8 @@ class AbstractProjection(eqx.Module):
     """A map from a candidate to a state on the manifold.
 
     Write your own as a subclass with a field `metric` and the method `solve`; see "Your own
-    projection" in the guide.
+    projection" in the guide. Set `sees_step = False` in the class if it does not use
+    `Problem.step`: then it needs no step, as in a stage of [`diffrax_conserve.Staged`][].
     """
 
     metric: eqx.AbstractVar[PyTree[ArrayLike] | None]

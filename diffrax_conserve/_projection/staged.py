@@ -66,7 +66,8 @@ class Staged(AbstractProjection):
             if not isinstance(stage[1], AbstractProjection) or stage[1].sees_step:
                 raise TypeError(
                     f"The stage `{stage[0]}` of `Staged` has {stage[1]!r}, which is not a "
-                    "projection of a state by itself. Pass for example `SimplifiedNewton()`."
+                    "projection of a state by itself: an instance of an `AbstractProjection` with "
+                    "`sees_step = False`. Pass for example `SimplifiedNewton()`."
                 )
         self.names = tuple(name for name, _ in stages)
         self.projections = tuple(projection for _, projection in stages)

@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, PyTree
 
-from .._custom_types import Args, Manifold, RealScalarLike, Values
-from .._manifold import Constraint, FirstIntegral, is_entry
+from .._custom_types import Args, ConstraintFn, Manifold, RealScalarLike
+from .._manifold import Constraint, FirstIntegral, is_entry, rate_of
 
 
 @final
@@ -67,10 +67,12 @@ class Restructuring(eqx.Module):
         """The manifold of the packed state, with the same names and conserved values."""
 
         def repack(entry: FirstIntegral | Constraint) -> FirstIntegral | Constraint:
-            def fn(t: RealScalarLike, z: Any, args: Args) -> Values:
-                return entry.fn(t, self.unpack(z), args)
+            def packed(fn: ConstraintFn) -> ConstraintFn:
+                return lambda t, z, args: fn(t, self.unpack(z), args)
 
-            return eqx.tree_at(lambda e: e.fn, entry, fn)
+            entry = eqx.tree_at(lambda e: e.fn, entry, packed(entry.fn))
+            rate = rate_of(entry)
+            return entry if rate is None else eqx.tree_at(lambda e: e.rate, entry, packed(rate))
 
         return jtu.tree_map(repack, manifold, is_leaf=is_entry)
 

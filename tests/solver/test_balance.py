@@ -148,6 +148,13 @@ def test_the_order_survives(solver, step, order):
     )
 
 
+@pytest.mark.parametrize("balance", [BALANCE, dfc.FirstIntegral(energy, rate=power, value=0.1)])
+def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
+    late = dfx.SaveAt(ts=jnp.array([0.5, 1.0]), dense=True)
+    assert worst(solve(manifold=balance, saveat=late), balance) <= 4 * EPS
+    assert 1e-12 < worst(solve(manifold=None, saveat=late)) < 1e-10
+
+
 def test_a_continued_solve_is_one_solve():
     whole = solve(saveat=dfx.SaveAt(t1=True))
     half = solve(t1=1.0, saveat=dfx.SaveAt(t1=True, solver_state=True))

@@ -111,6 +111,8 @@ def test_restructurings_keep_the_numbers(packing):
     assert packing.manifold(KEPLER.manifold)["energy"].fn(0.0, z, None) == pytest.approx(-0.5)
     slope = packing.unpack(packing.vector_field(KEPLER.vector_field)(0.0, z, None))
     assert np.array_equal(slope[0], KEPLER.y0[1])
+    balance = dfc.FirstIntegral(KEPLER.energy, rate=lambda t, y, args: t + y[0][0])
+    assert packing.manifold(balance).rate(2.0, z, None) == 2.0 + KEPLER.y0[0][0]
     assert repr(packing).startswith("Restructuring(")
 
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import equinox as eqx
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
@@ -126,6 +127,12 @@ def test_a_checkpoint_is_the_state(make, tmp_path):
     assert time.perf_counter() - begun < 10
     with pytest.raises(ValueError, match="of another training"):
         dfc.fit(network, **(options | dict(key=jr.key(6))), checkpoint=path)
+    for other in (
+        dict(args=jnp.array(1.0)),
+        dict(recipe=dataclasses.replace(options["recipe"], loss=dfc.learned.Bounded(2.0))),
+    ):
+        with pytest.raises(ValueError, match="of another training"):
+            dfc.fit(network, **(options | other), checkpoint=path)
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(ValueError, match="holds no checkpoint"):
         dfc.fit(network, **options, checkpoint=path)

@@ -119,6 +119,8 @@ class FlowMap(AbstractFlowMap):
     def __check_init__(self):
         if not callable(self.function):
             raise TypeError(f"`function` is {self.function!r}, not a function `(y0, h) -> y`.")
+        if not isinstance(self.order, int) or self.order < 0:
+            raise ValueError(f"`order` is {self.order!r}, but it must be 0 or a positive integer.")
         if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
             raise TypeError(
                 f"The `domain` of the flow map is {self.domain!r}, which has no method "

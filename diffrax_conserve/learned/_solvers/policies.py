@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
+from ..._options import check_solution
 from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
@@ -276,6 +277,8 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         0.0
         ```
     """
+
+    check_solution(sol, "domain_statistics")
 
     def is_found(x: Any) -> bool:
         return isinstance(x, DomainStatistics)

@@ -176,7 +176,7 @@ def fit(
         math.inf if seconds is None else seconds,
         progress,
         None if checkpoint is None else Path(checkpoint),
-        fingerprint(model, key, recipe),
+        fingerprint((model, key, args, vector_field), recipe),
     )
     if isinstance(model, PINN):
         return _fit_windows(trainer, model, manifold, state)

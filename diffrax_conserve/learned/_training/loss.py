@@ -7,6 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..._options import check_number
+
 # A function from the squared norm of the defect at each point, and a typical squared norm of `f`,
 # to a loss.
 Loss = Callable[[Float[Array, " points"], Float[Array, ""]], Float[Array, ""]]
@@ -28,6 +30,9 @@ class Bounded(eqx.Module):
     """
 
     factor: float = 1.0
+
+    def __check_init__(self):
+        check_number("factor", self.factor, above=0.0, optional=False)
 
     def __call__(
         self, squares: Float[Array, " points"], typical: Float[Array, ""]

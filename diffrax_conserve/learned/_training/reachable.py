@@ -126,7 +126,8 @@ def trajectories(
     times = jnp.asarray(ts, float)
     ts = jnp.broadcast_to(times, (count, times.shape[-1]))
     size = max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
-    ys, good = _solutions(vector_field, y0s, ts, args, solver, dt0, rtol, atol or rtol * size)
+    atol = rtol * size if atol is None else atol
+    ys, good = _solutions(vector_field, y0s, ts, args, solver, dt0, rtol, atol)
     return _the_good((ts, ys), good)
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import optax
 from jaxtyping import Array
 
+from ..._options import check_number
 from ..._tree import tree_size
 from .._networks import PINN, Times
 from .loss import Bounded, Loss, mean_square
@@ -49,6 +50,7 @@ class Recipe(eqx.Module):
         for name in ("epochs", "points", "check_every"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"`{name}` must be at least 1, but is {getattr(self, name)}.")
+        check_number("max_gradient_norm", self.max_gradient_norm, above=0.0)
         if not isinstance(self.optimiser, optax.GradientTransformation | SecondOrder):
             raise TypeError(
                 f"`optimiser` is {self.optimiser!r}, but it must be an optimiser of optax, such as "
@@ -102,7 +104,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     """
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
         return Recipe(
-            epochs=epochs or 40,
+            epochs=40 if epochs is None else epochs,
             points=120,
             optimiser=LevenbergMarquardt(),
             iterations=every_iteration,
@@ -111,7 +113,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
             retries=4,
         )
     return Recipe(
-        epochs=epochs or 2000,
+        epochs=2000 if epochs is None else epochs,
         points=250,
         optimiser=SPRING(),
         iterations=every_iteration,
@@ -145,5 +147,6 @@ def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
     if isinstance(model, PINN):
-        return Recipe(epochs=epochs, points=points or 2000, iterations=every_iteration)
-    return Recipe(epochs=epochs, points=points or 5000, loss=Bounded())
+        points = 2000 if points is None else points
+        return Recipe(epochs=epochs, points=points, iterations=every_iteration)
+    return Recipe(epochs=epochs, points=5000 if points is None else points, loss=Bounded())
