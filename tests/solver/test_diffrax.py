@@ -32,7 +32,12 @@ def on_rigid_body(ys):
 
 
 @pytest.mark.parametrize(
-    "solver", [dfx.Kvaerno5(), dfx.KenCarp4(), dfx.ImplicitEuler()], ids=lambda s: type(s).__name__
+    "solver",
+    [
+        pytest.param(dfx.Kvaerno5(), id="Kvaerno5"),
+        pytest.param(dfx.KenCarp4(), id="KenCarp4", marks=pytest.mark.slow),
+        pytest.param(dfx.ImplicitEuler(), id="ImplicitEuler", marks=pytest.mark.slow),
+    ],
 )
 def test_implicit_solvers_take_the_tolerances_of_the_controller(solver):
     term = dfx.ODETerm(rigid_body)
