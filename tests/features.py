@@ -12,8 +12,14 @@ from .learned import oscillator as oscillator
 EIGHT = dfc.RandomFeatureSolver(8)
 
 
+def solve(vector_field, y0, t1, *, t0=0.0, dt0=None, tol=None, **kwargs):
+    """Compiled once for all times and tolerances."""
+    numbers = [None if x is None else jnp.asarray(x) for x in (t1, t0, dt0, tol)]
+    return compiled(vector_field, y0, *numbers, **kwargs)
+
+
 @eqx.filter_jit
-def solve(vector_field, y0, t1, *, solver=EIGHT, t0=0.0, dt0=None, tol=None, args=None, **kwargs):
+def compiled(vector_field, y0, t1, t0, dt0, tol, *, solver=EIGHT, args=None, **kwargs):
     if tol is not None:
         kwargs["stepsize_controller"] = dfx.PIDController(rtol=tol, atol=tol)
     kwargs.setdefault("max_steps", 512)

@@ -21,7 +21,7 @@ SWEEPS = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
 
 
 def states(count=50, system=LORENZ, seed=7):
-    return jax.vmap(system.sample)(jr.split(jr.key(seed), count))
+    return jax.jit(jax.vmap(system.sample))(jr.split(jr.key(seed), count))
 
 
 def flow_map(max_step=0.25, layer=None, seed=0, **options):

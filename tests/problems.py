@@ -1,6 +1,7 @@
 """Small problems that several test files share, written out here independently of the catalogue."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,9 +89,22 @@ def exponential_solution(t):
 
 
 def solve(vector_field, solver, y0, *, t0=0.0, t1=1.0, dt0=0.1, args=None, **kwargs):
+    times = [None if t is None else jnp.asarray(t, jnp.result_type(float)) for t in (t0, t1, dt0)]
+    return _solve(vector_field, solver, *times, y0, args, kwargs)
+
+
+@eqx.filter_jit
+def _solve(vector_field, solver, t0, t1, dt0, y0, args, kwargs):
+    """All in one program: outside of one, diffrax compiles each of some forty operations."""
     return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs)
+
+
+@eqx.filter_jit
+def drift_of(sol, manifold, args=None):
+    """`dfc.drift` in one program."""
+    return dfc.drift(sol, manifold, args)
 
 
 def largest(tree):
     """The largest absolute value in a PyTree."""
-    return max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(tree))
+    return max(float(np.max(np.abs(x))) for x in jax.tree.leaves(tree))

@@ -1,6 +1,8 @@
 """The command line: what it prints and writes, and how it refuses what it cannot do."""
 
+import contextlib
 import errno
+import io
 import json
 import os
 import subprocess
@@ -20,6 +22,20 @@ from diffrax_conserve.reproduce import _trained as _learned
 FIGURES = ("trajectory", "drift", "state_error")
 PAPER = dfc.systems.names()[:5]
 LEARNED = ("standard", "conservative", "standard projected")
+
+
+@pytest.fixture(autouse=True)
+def no_figures(request, monkeypatch):
+    """Drawing takes as long as solving: only the tests of it draw."""
+    if "draws" not in request.keywords:
+        monkeypatch.setattr(_job, "import_plot", lambda: None)
+
+
+@pytest.fixture
+def only_rk4(monkeypatch):
+    """For what does not depend on the solvers."""
+    monkeypatch.setattr(_job, "is_learned", lambda system: False)
+    monkeypatch.setattr(_job, "solvers", lambda system, networks: {"rk4": dfc.RK4()})
 
 
 def reproduce(tmp_path, *arguments, out="out"):
@@ -57,9 +73,20 @@ def rotation(t):
     return np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
 
 
-def test_it_says_what_it_is_doing_before_it_is_done(tmp_path, capsys):
-    reproduce(tmp_path, "kepler", "--t1", "1")
-    said = capsys.readouterr().err.splitlines()
+KEPLER = ("kepler", "--t1", "3", "--dt", "0.2")
+
+
+@pytest.fixture(scope="module")
+def of_kepler(tmp_path_factory):
+    """The metrics, and what was said meanwhile."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as said:
+        patch.setattr(_job, "import_plot", lambda: None)
+        _, metrics = reproduce(tmp_path_factory.mktemp("kepler"), *KEPLER)
+    return metrics, said.getvalue()
+
+
+def test_it_says_what_it_is_doing_before_it_is_done(of_kepler):
+    said = of_kepler[1].splitlines()
     assert said[0] == "[1/2] rk4: compiles and solves"
     assert said[1] == "[2/2] projected rk4: compiles and solves"
 
@@ -95,9 +122,9 @@ def test_metrics_of_the_harmonic_oscillator(tmp_path, monkeypatch):
         assert row["seconds"] > 0
 
 
-def test_metrics_of_keplers_problem(tmp_path):
+def test_metrics_of_keplers_problem(of_kepler):
     t1, h, steps = 3.0, 0.2, 15
-    _, metrics = reproduce(tmp_path, "kepler", "--t1", str(t1), "--dt", str(h))
+    metrics, _ = of_kepler
     system = dfc.systems.Kepler()
     y0 = np.concatenate(system.y0)
 
@@ -117,11 +144,12 @@ def test_metrics_of_keplers_problem(tmp_path):
     assert projected["state_error"] < row["state_error"]
 
 
-def test_the_largest_drift_is_over_every_step_however_few_are_plotted(tmp_path, monkeypatch):
-    arguments = ("kepler", "--t1", "7", "--dt", "0.1")
-    _, all_plotted = reproduce(tmp_path, *arguments, out="a")
+def test_the_largest_drift_is_over_every_step_however_few_are_plotted(
+    of_kepler, tmp_path, monkeypatch
+):
+    all_plotted, _ = of_kepler
     monkeypatch.setattr(_compare, "PLOTTED_MAX", 3)
-    _, few_plotted = reproduce(tmp_path, *arguments, out="b")
+    _, few_plotted = reproduce(tmp_path, *KEPLER)
     for name, row in few_plotted["solvers"].items():
         assert row["drift"] == all_plotted["solvers"][name]["drift"]
         assert row["state_error"] == pytest.approx(
@@ -165,6 +193,7 @@ def test_a_figure_is_the_median_over_the_initial_states(tmp_path, monkeypatch):
 # ---- What it writes and prints ----
 
 
+@pytest.mark.draws
 def test_files_and_nothing_else(tmp_path, capsys):
     _, metrics = reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
     assert set(metrics["solvers"]) == {"rk4", "projected rk4", *LEARNED}
@@ -194,12 +223,12 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk(tmp_path, monkeypatch, capsys):
+def test_a_full_disk(tmp_path, monkeypatch, capsys, only_rk4):
     def full(*arguments, **options):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "metrics.json")
 
     monkeypatch.setattr("diffrax_conserve.reproduce._job.replace_file", full)
-    argv = ["reproduce", "lotka-volterra", "--t1", "0.5", "--out", str(tmp_path / "out")]
+    argv = ["reproduce", "harmonic-oscillator", "--t1", "0.5", "--out", str(tmp_path / "out")]
     assert main(argv) == 1
     found = capsys.readouterr().err
     assert found.endswith("\nerror: cannot write metrics.json: No space left on device\n")
@@ -216,10 +245,10 @@ def test_an_output_that_ends_early(redirection):
         assert done.returncode == 1
 
 
-def test_the_folder_of_the_system_is_the_default(tmp_path, monkeypatch):
+def test_the_folder_of_the_system_is_the_default(tmp_path, monkeypatch, only_rk4):
     monkeypatch.chdir(tmp_path)
-    assert main(["reproduce", "lotka-volterra", "--t1", "0.5"]) == 0
-    assert (tmp_path / "out" / "lotka-volterra" / "metrics.json").exists()
+    assert main(["reproduce", "harmonic-oscillator", "--t1", "0.5"]) == 0
+    assert (tmp_path / "out" / "harmonic-oscillator" / "metrics.json").exists()
 
 
 def test_list_names_every_system(capsys):
@@ -232,6 +261,7 @@ def test_list_names_every_system(capsys):
 QUICK = ("kepler",)
 
 
+@pytest.mark.draws
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in dfc.systems.names()],
@@ -299,18 +329,16 @@ def test_without_matplotlib(tmp_path):
     (tmp_path / "matplotlib.py").write_text("raise ImportError('No module named matplotlib')")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
 
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, "-m", "diffrax_conserve", *arguments],
-            env=environment,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-        )
-
-    assert run("list").returncode == 0
-    done = run("reproduce", "kepler", "--t1", "1")
+    code = (
+        "from diffrax_conserve.__main__ import main\n"
+        "assert main(['list']) == 0\n"
+        "raise SystemExit(main(['reproduce', 'kepler', '--t1', '1']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
+    assert all(name in done.stdout for name in dfc.systems.names())
     assert "projected rk4" in done.stdout
     assert "pip install 'diffrax-conserve[plots]'" in done.stdout
     assert [file.name for file in (tmp_path / "out" / "kepler").iterdir()] == ["metrics.json"]
@@ -319,6 +347,7 @@ def test_without_matplotlib(tmp_path):
 # ---- What it says about a solver that fails ----
 
 
+@pytest.mark.draws
 def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys):
     """Steps this long have no point on the manifold near their candidates."""
     status, metrics = reproduce(tmp_path, "kepler", "--t1", "60", "--dt", "6")

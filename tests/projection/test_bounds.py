@@ -11,6 +11,7 @@ import scipy.optimize
 import diffrax_conserve as dfc
 
 from ..problems import largest
+from ..problems import solve as one_solve
 
 EPS = np.finfo(np.float64).eps
 BOTH = pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_a_candidate_within_the_bounds_is_projected_as_without():
             BALANCES, candidate, args=atoms, value=value, projection=dfc.SimplifiedNewton()
         )[0]
 
-    expected = jax.vmap(free)(atoms, moved, inside + 1)
+    expected = jax.jit(jax.vmap(free))(atoms, moved, inside + 1)
     untouched = jnp.all(expected > 0, axis=1)
     assert jnp.sum(untouched) > 10
     assert largest((y - expected)[untouched]) < 1e-13
@@ -139,9 +140,13 @@ def test_a_bound_that_is_nan_is_never_ignored():
     with pytest.raises(ValueError, match="`lower` is"):
         dfc.Newton(lower=jnp.array([0.0, jnp.nan]))
     lanes = jnp.array([0.0, jnp.nan])
-    ok = jax.vmap(lambda a: dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=a))[1].ok)(
-        lanes
-    )
+
+    @jax.jit
+    @jax.vmap
+    def found(lower):
+        return dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=lower))[1].ok
+
+    ok = found(lanes)
     assert ok.tolist() == [True, False]
 
 
@@ -215,15 +220,10 @@ def test_a_solve_stays_within_the_bounds_between_its_steps_too():
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
 
     def solve(**bounds):
-        return dfx.diffeqsolve(
-            dfx.ODETerm(decay),
-            dfc.ManifoldProjection(dfx.Euler(), total, projection=dfc.SimplifiedNewton(**bounds)),
-            0.0,
-            1.0,
-            0.05,
-            jnp.array([1.0, 0.0, 0.0]),
-            saveat=dfx.SaveAt(ts=jnp.linspace(0, 1, 101)),
-        ).ys
+        projection = dfc.SimplifiedNewton(**bounds)
+        solver = dfc.ManifoldProjection(dfx.Euler(), total, projection=projection)
+        saveat = dfx.SaveAt(ts=jnp.linspace(0, 1, 101))
+        return one_solve(decay, solver, jnp.array([1.0, 0.0, 0.0]), dt0=0.05, saveat=saveat).ys
 
     kept = solve(lower=0.0)
     assert jnp.min(solve()) < -0.1

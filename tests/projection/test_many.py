@@ -79,7 +79,7 @@ def test_derivatives_agree_with_finite_differences():
 
 def test_a_lane_of_a_batch_is_that_lane_alone():
     qs = jnp.stack([chain(noise=1e-4), chain(noise=1e-3)])
-    batch, info = jax.vmap(projected)(qs)
+    batch, info = jax.jit(jax.vmap(projected))(qs)
     assert bool(jnp.all(info.residual_after <= 1e-15))
     for q, y in zip(qs, batch, strict=True):
         np.testing.assert_allclose(y, projected(q)[0], rtol=0, atol=1e-12)

@@ -8,7 +8,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import OMEGA0, RIGID_BODY, rigid_body, solve
+from ..problems import OMEGA0, RIGID_BODY, drift_of, rigid_body, solve
 
 STEPS = dfx.SaveAt(t0=True, steps=True, solver_state=True, dense=True)
 
@@ -20,7 +20,7 @@ def run(t1=2.0, dt0=0.1, **options):
 
 def drifts(sol):
     """The largest residual at each saved time."""
-    leaves = jax.tree.leaves(dfc.drift(sol, RIGID_BODY))
+    leaves = jax.tree.leaves(drift_of(sol, RIGID_BODY))
     return np.max(np.abs(np.stack(leaves)), axis=0)[: int(sol.stats["num_steps"]) + 1]
 
 

@@ -29,8 +29,13 @@ def step(solver, y0, h=0.25, *, term=TERM, t0=0.0, args=None):
     return y1, error
 
 
+def solve(solver, y0=LORENZ.y0, *, t0=0.0, t1=1.0, dt0=0.25, **kwargs):
+    """Compiled once for all times."""
+    return compiled(solver, y0, *map(jnp.asarray, (t0, t1, dt0)), **kwargs)
+
+
 @eqx.filter_jit
-def solve(solver, y0=LORENZ.y0, *, term=TERM, t0=0.0, t1=1.0, dt0=0.25, args=None, **kwargs):
+def compiled(solver, y0, t0, t1, dt0, *, term=TERM, args=None, **kwargs):
     return dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, args, **kwargs)
 
 

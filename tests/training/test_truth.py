@@ -66,7 +66,7 @@ def test_each_leaf_counts_in_its_own_units():
     chosen = recipe(network, 8, retries=0, loss=lambda q, typical: jnp.mean(q) / typical)
     trained, log = dfc.fit(network, pair_oscillator, key=KEY, recipe=chosen)
     ts = jnp.linspace(0, 2, 300)
-    found = jax.vmap(trained)(ts)
+    found = jax.jit(jax.vmap(trained))(ts)
     errors = [
         jnp.max(jnp.abs(found["q"] - 1e-3 * jnp.cos(ts))) / jnp.max(jnp.abs(found["q"])),
         jnp.max(jnp.abs(found["p"] + jnp.sin(ts))) / jnp.max(jnp.abs(found["p"])),
@@ -81,8 +81,8 @@ def test_the_estimate_of_a_flow_map_is_its_error():
         network, LORENZ.vector_field, key=KEY, sample=LORENZ.sample, recipe=chosen
     )
     y0s = jax.vmap(LORENZ.sample)(jr.split(KEY, 64))  # those of the estimate
-    exact = jax.vmap(lambda y0: LORENZ.reference(jnp.array([0.25]), y0)[0])(y0s)
-    errors = jax.vmap(trained, (0, None))(y0s, 0.25) - exact
+    exact = jax.jit(jax.vmap(lambda y0: LORENZ.reference(jnp.array([0.25]), y0)[0]))(y0s)
+    errors = jax.jit(jax.vmap(trained, (0, None)))(y0s, 0.25) - exact
     expected = jnp.max(jnp.sqrt(jnp.mean(errors**2, axis=0))) / jnp.max(jnp.abs(exact))
     np.testing.assert_allclose(log.error, expected, rtol=0.3)
 
