@@ -68,36 +68,32 @@ def with_smaller(states, distance, key):
     return jnp.concatenate([states, jax.vmap(shrink)(states, powers)])
 
 
-def ellipse(y):
-    """The semi-major axis and the eccentricity of an orbit."""
-    system = dfc.systems.Kepler()
-    a = -system.mu / (2 * system.energy(0.0, y, None))
-    return a, jnp.linalg.norm(system.laplace_runge_lenz(0.0, y, None)) / system.mu
-
-
 def ordinary(y):
     """Whether an orbit is about as large as the default one, and not more eccentric."""
-    a, e = ellipse(y)
+    system = dfc.systems.Kepler()
+    a = -system.mu / (2 * system.energy(0.0, y, None))
+    e = jnp.linalg.norm(system.laplace_runge_lenz(0.0, y, None)) / system.mu
     return (a >= 0.8) & (a <= 1.2) & (e <= 0.6)
 
 
 def orbits(count, key):
     """States of Kepler's problem up to symmetries: uniform on the disc of (e cos E, e sin E).
 
-    All are as far from the centre as the fastest states. For them the steps are the longest in
-    their own time, so the others are known too.
+    All are at the distance from the centre where a step is the longest in their own time, so that
+    what happens farther out is known too.
     """
     e_key, anomaly_key = jr.split(key)
-    e, anomaly = 0.6 * jnp.sqrt(jr.uniform(e_key, (count,))), jr.uniform(anomaly_key, (count,))
-    c, s = e * jnp.cos(2 * jnp.pi * anomaly), e * jnp.sin(2 * jnp.pi * anomaly)
+    e = LARGEST * jnp.sqrt(jr.uniform(e_key, (count,)))
+    anomaly = 2 * jnp.pi * jr.uniform(anomaly_key, (count,))
+    c, s = e * jnp.cos(anomaly), e * jnp.sin(anomaly)
     # The rates towards the centre and around it, in units of that of a circular orbit.
     radial = s / jnp.sqrt(1 - c)
     p = jnp.stack([radial, jnp.sqrt(1 + c - radial**2)], axis=1)
     return jnp.tile(jnp.array([CLOSEST, 0.0]), (count, 1)), p / CLOSEST**0.5
 
 
-# A little less than at the pericentre of the smallest `ordinary` orbit, which is at 0.32.
-CLOSEST = 0.31
+# A little beyond the `ordinary` orbits, of which the smallest has its perihelion at 0.32.
+LARGEST, CLOSEST = 0.61, 0.31
 
 
 @dataclasses.dataclass(frozen=True)

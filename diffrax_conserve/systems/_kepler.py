@@ -119,11 +119,12 @@ class Kepler(AbstractSystem):
         $E$. The third input is $e^2$, so that a domain that is a box ends with the eccentricity.
         The basis stretches position and velocity along each other, as Lagrange's coefficients do.
         The clock is $\nu = \sqrt{\mu / r^3}$, the rate of a circular orbit through the same place:
-        in its time passing the pericentre is no faster than the rest, and the solution has no
-        singularity, of complex time, much closer than one unit.
+        in its time a passage of the perihelion is no faster than the rest. The singularities of the
+        solution, which are in complex time, are nowhere closer than one unit up to $e = 0.6$, and
+        0.77 up to 0.8.
 
-        Orbits that are not bound have it too. It degenerates where the orbit becomes a line
-        ($e \to 1$), since the basis does.
+        Orbits that are not bound have it too. Where the orbit becomes a line ($e \to 1$) position
+        and velocity are parallel, and the basis degenerates.
         """
         q, p = y
         mu, r = self.like(y).mu, jnp.sqrt(jnp.sum(q**2))

@@ -35,8 +35,8 @@ class Frame(eqx.Module):
     are the same to it, seen for a longer time; $\tau_{\max}$ is the longest among the states that
     it was made with.
 
-    [`diffrax_conserve.systems.PointVortices`][] has one, its method `frame`, which returns the
-    three in a tuple.
+    [`diffrax_conserve.systems.PointVortices`][] and [`diffrax_conserve.systems.Kepler`][] have
+    one, their method `frame`, which returns the three in a tuple.
 
     !!! example
 
