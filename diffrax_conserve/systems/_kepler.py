@@ -113,8 +113,8 @@ class Kepler(AbstractSystem):
         r"""The frame of an orbit, for a [`diffrax_conserve.DeepONet`][].
 
         The flow commutes with rotations, reflections, and changes of scale by $c$ together with
-        those of time by $c^{3/2}$. What is left of four numbers are two, which tell the shape of the
-        orbit and the place on it: $e \cos E = r |p|^2 / \mu - 1$ and
+        those of time by $c^{3/2}$. What is left of four numbers are two, which tell the shape of
+        the orbit and the place on it: $r |p|^2 / \mu - 1 = e \cos E$ and
         $q \cdot p / \sqrt{\mu r}$, with $r = |q|$, the eccentricity $e$ and the eccentric anomaly
         $E$. The third input is $e^2$, so that a domain that is a box ends with the eccentricity.
         The basis stretches position and velocity along each other, as Lagrange's coefficients do.
