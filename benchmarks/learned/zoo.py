@@ -92,6 +92,13 @@ def orbits(count, key):
     return jnp.tile(jnp.array([CLOSEST, 0.0]), (count, 1)), p / CLOSEST**0.5
 
 
+def extreme_orbits():
+    """A circle, and the most eccentric orbit at its perihelion: no drawn orbit is one of these."""
+    e = jnp.array([0.0, LARGEST])
+    p = jnp.stack([jnp.zeros(2), jnp.sqrt((1 + e) / CLOSEST)], axis=1)
+    return jnp.tile(jnp.array([CLOSEST, 0.0]), (2, 1)), p
+
+
 # A little beyond the `ordinary` orbits, of which the smallest has its perihelion at 0.32.
 LARGEST, CLOSEST = 0.61, 0.31
 
@@ -112,6 +119,7 @@ class Spec:
     keep: Callable | None = None  # which initial states and states to train for
     draws: int = 1  # for each initial state, where most are not kept
     states: Callable | None = None  # draws those to train for; by default they are along solutions
+    extremes: Callable | None = None  # states that the domain reaches to
     damping: float = 1e-2
     frame: bool = False
     smaller: float | None = None  # how close the vortices of shrunk states may be
@@ -156,6 +164,7 @@ SPECS = {
         keep=ordinary,
         draws=5,
         states=orbits,
+        extremes=extreme_orbits,
         frame=True,
         repeats=4,
     ),
@@ -239,7 +248,14 @@ def train_flow_map(system, spec, seed, key):
             optimiser=dfc.learned.LevenbergMarquardt(damping=5e-5),
         )  # fmt: skip
     network = scaled(network, own) if spec.natural else network
+    if spec.extremes is not None:
+        network = reaching(network, spec.extremes())
     return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
+
+
+def reaching(network, states):
+    """The same network, with these states in its domain."""
+    return eqx.tree_at(lambda m: m.domain, network, network.domain.extended(states))
 
 
 def scaled(network, system):

@@ -132,6 +132,8 @@ def test_its_domain_ends_with_the_eccentricity_and_with_the_distance():
     network = dfc.load_pretrained("kepler")
     contains = jax.jit(jax.vmap(lambda y: network.domain.contains(y)))
     np.testing.assert_array_equal(contains(inside), True)
+    circles = ellipses(np.linspace(0.35, 2, 50), np.zeros(50), np.linspace(0, 6, 50))
+    np.testing.assert_array_equal(contains(arrays(circles)), True)
     eccentric = ellipses(np.ones(50), np.full(50, 0.65), np.linspace(0, 6, 50))
     np.testing.assert_array_equal(contains(arrays(eccentric)), False)
     small = ellipses(np.full(50, 0.29), np.zeros(50), np.linspace(0, 6, 50))
