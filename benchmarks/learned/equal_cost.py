@@ -25,10 +25,9 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 import trained
-from zoo import apart
+import zoo
 
 import diffrax_conserve as dfc
 
@@ -36,7 +35,6 @@ sys.path.append(str(Path(__file__).parent.parent / "cost"))
 import measuring
 
 RESULTS = Path(__file__).parent.parent / "results" / "equal-cost"
-SEPARATION = 0.2  # of the vortices, as in their training
 CLASSICAL = {
     "RK4": dfc.RK4(),
     "Tsit5": dfc.Unrolled(dfx.Tsit5()),
@@ -69,6 +67,7 @@ PIECES = {
         "Dopri8": (1, 2, 4),
     },
     "point-vortices": {"RK4": (1, 2, 4, 8, 16), "Tsit5": (1, 2, 4, 8), "Dopri8": (1, 2, 4)},
+    "kepler": {"RK4": (1, 2, 4, 8, 16), "Tsit5": (1, 2, 4, 8), "Dopri8": (1, 2, 4)},
 }
 SMOKE = Size(steps=2, states=3, batch=4, batch_steps=2, alone_steps=2, rounds=1)
 
@@ -89,10 +88,7 @@ def contestants(system, networks, pieces):
     found = {}
     for (method, m), solver in plain.items():
         found[method, m, False] = Contestant(solver, m)
-        projected = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
-        if method in CLASSICAL:
-            projected = dfc.ManifoldProjection(solver, system.manifold)
-        found[method, m, True] = Contestant(projected, m)
+        found[method, m, True] = Contestant(dfc.ManifoldProjection(solver, system.manifold), m)
     return found
 
 
@@ -114,10 +110,9 @@ def rollout(system, solver, y0s, ts, dt, max_steps):
 
 
 def initial_states(system, count):
-    y0s = jax.vmap(system.sample)(jr.split(jr.key(2000), 4 * count))
-    if system.name == "point-vortices":
-        y0s = y0s[jax.vmap(apart(SEPARATION))(y0s)]
-    return y0s[:count]
+    """As in the training of the zoo."""
+    y0s = zoo.initial_states(system, zoo.SPECS[system.name], 4 * count, 2000)
+    return jax.tree.map(lambda x: x[:count], y0s)
 
 
 def errors(system, contestant, y0s, ts, reference, most):
@@ -127,10 +122,10 @@ def errors(system, contestant, y0s, ts, reference, most):
     compilation.
     """
     max_steps = len(ts) * most + 2
-    dt = jnp.asarray(system.dt / contestant.pieces)
+    dt = ts[1] / contestant.pieces
     ys, drift, ok = rollout(system, contestant.solver, y0s, ts, dt, max_steps)
-    distance = np.asarray(jnp.linalg.norm((ys - reference).reshape(*ys.shape[:2], -1), axis=-1))
-    largest = np.where(np.asarray(ok), np.max(distance, axis=1), np.inf)
+    largest = np.max(zoo.distances(ys, reference, 2), axis=1)
+    largest = np.where(np.asarray(ok), largest, np.inf)
     largest = np.where(np.isfinite(largest), largest, np.inf)
     return {
         "median": trained.number(np.median(largest)),
@@ -160,6 +155,7 @@ def compiled_solve(system, solver, y0s, max_steps):
 
 def costs(system, found, y0s, steps, rounds):
     """Nanoseconds for a step of one trajectory, of every contestant: they take turns."""
+    (dt, _), lanes = zoo.times_of(system), len(jax.tree.leaves(y0s)[0])
     compiled = {}
     calls = {}
     most = {key[::2]: 0 for key in found}
@@ -169,27 +165,29 @@ def costs(system, found, y0s, steps, rounds):
         if (method, projected) not in compiled:
             max_steps = steps * most[method, projected] + 1
             compiled[method, projected] = compiled_solve(system, contestant.solver, y0s, max_steps)
-        span, dt = jnp.asarray(steps * system.dt), jnp.asarray(system.dt / m)
+        span, dt = jnp.asarray(steps * dt), jnp.asarray(dt / m)
         run = compiled[method, projected]
         calls[method, m, projected] = lambda run=run, s=contestant.solver, a=span, b=dt: run(
             s, y0s, a, b
         )
     best = measuring.take_turns(calls, rounds)
-    return {key: 1e9 * t.seconds / steps / len(y0s) for key, t in best.items()}
+    return {key: 1e9 * t.seconds / steps / lanes for key, t in best.items()}
 
 
 def measure(name, networks, size=None, pieces=None):
     system = dfc.systems.get(name)
     size = Size() if size is None else size
-    steps = round(system.t1 / system.dt) if size.steps is None else size.steps
-    ts = jnp.arange(steps + 1) * system.dt
+    dt, t1 = zoo.times_of(system)
+    steps = round(t1 / dt) if size.steps is None else size.steps
+    ts = jnp.arange(steps + 1) * dt
     y0s = initial_states(system, size.states)
     reference = jax.vmap(lambda y0: system.reference(ts, y0))(y0s)
     found = contestants(system, networks, PIECES[name] if pieces is None else pieces)
     many = initial_states(system, size.batch)
+    first = jax.tree.map(lambda x: x[:1], y0s)
     ns = {
         "batch": costs(system, found, many, size.batch_steps, size.rounds),
-        "alone": costs(system, found, y0s[:1], size.alone_steps, size.rounds),
+        "alone": costs(system, found, first, size.alone_steps, size.rounds),
     }
     rows = []
     for key, contestant in found.items():
@@ -197,7 +195,7 @@ def measure(name, networks, size=None, pieces=None):
         most = max(k[1] for k in found if k[::2] == key[::2])
         row |= errors(system, contestant, y0s, ts, reference, most)
         rows.append(row | {f"ns_{place}": round(ns[place][key], 1) for place in COSTS})
-    return {"system": name, "steps": steps, "dt": system.dt, "states": size.states, "rows": rows}
+    return {"system": name, "steps": steps, "dt": dt, "states": size.states, "rows": rows}
 
 
 # ---- The comparison ----

@@ -1,6 +1,6 @@
 """The best small networks: trains them by second-order methods, judges them, and ships them.
 
-    python benchmarks/learned/zoo.py  # five systems, three seeds: an hour
+    python benchmarks/learned/zoo.py  # six systems, three seeds: an hour
     python benchmarks/learned/zoo.py --system rigid-body --seed 0 --ship  # and ship this network
     python benchmarks/learned/zoo.py --table  # only print the table of the results
     python benchmarks/learned/zoo.py --smoke  # toy sizes, to see that it runs
@@ -36,6 +36,13 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "results" / "zoo"
 SHIPPED = ROOT.parent / "diffrax_conserve" / "pretrained"
 INITIAL_STATES = 100
+# The step and the horizon where they are not the system's own.
+TIMES = {"kepler": (0.5, 50.0)}
+
+
+def times_of(system):
+    """The step and the horizon."""
+    return TIMES.get(system.name, (system.dt, system.t1))
 
 
 def separation(y):
@@ -61,6 +68,41 @@ def with_smaller(states, distance, key):
     return jnp.concatenate([states, jax.vmap(shrink)(states, powers)])
 
 
+def ordinary(y):
+    """Whether an orbit is about as large as the default one, and not more eccentric."""
+    system = dfc.systems.Kepler()
+    a = -system.mu / (2 * system.energy(0.0, y, None))
+    e = jnp.linalg.norm(system.laplace_runge_lenz(0.0, y, None)) / system.mu
+    return (a >= 0.8) & (a <= 1.2) & (e <= 0.6)
+
+
+def orbits(count, key):
+    """States of Kepler's problem up to symmetries: uniform on the disc of (e cos E, e sin E).
+
+    All are at the distance from the centre where a step is the longest in their own time, so that
+    what happens farther out is known too.
+    """
+    e_key, anomaly_key = jr.split(key)
+    e = LARGEST * jnp.sqrt(jr.uniform(e_key, (count,)))
+    anomaly = 2 * jnp.pi * jr.uniform(anomaly_key, (count,))
+    c, s = e * jnp.cos(anomaly), e * jnp.sin(anomaly)
+    # The rates towards the centre and around it, in units of that of a circular orbit.
+    radial = s / jnp.sqrt(1 - c)
+    p = jnp.stack([radial, jnp.sqrt(1 + c - radial**2)], axis=1)
+    return jnp.tile(jnp.array([CLOSEST, 0.0]), (count, 1)), p / CLOSEST**0.5
+
+
+def extreme_orbits():
+    """A circle, and the most eccentric orbit at its perihelion: no drawn orbit is one of these."""
+    e = jnp.array([0.0, LARGEST])
+    p = jnp.stack([jnp.zeros(2), jnp.sqrt((1 + e) / CLOSEST)], axis=1)
+    return jnp.tile(jnp.array([CLOSEST, 0.0]), (2, 1)), p
+
+
+# A little beyond the `ordinary` orbits, of which the smallest has its perihelion at 0.32.
+LARGEST, CLOSEST = 0.61, 0.31
+
+
 @dataclasses.dataclass(frozen=True)
 class Spec:
     """How the network of a system is made."""
@@ -75,6 +117,9 @@ class Spec:
     duration: float = 20.0  # of the solutions along which its states are drawn
     pool: int = 20_000
     keep: Callable | None = None  # which initial states and states to train for
+    draws: int = 1  # for each initial state, where most are not kept
+    states: Callable | None = None  # draws those to train for; by default they are along solutions
+    extremes: Callable | None = None  # states that the domain reaches to
     damping: float = 1e-2
     frame: bool = False
     smaller: float | None = None  # how close the vortices of shrunk states may be
@@ -110,6 +155,19 @@ SPECS = {
         repeats=4,
         polish=8,
     ),
+    "kepler": Spec(
+        width=24,
+        depth=2,
+        epochs=1400,
+        order=2,
+        points=200,
+        keep=ordinary,
+        draws=5,
+        states=orbits,
+        extremes=extreme_orbits,
+        frame=True,
+        repeats=4,
+    ),
 }
 SMOKE = {
     name: dataclasses.replace(
@@ -127,8 +185,11 @@ SMOKE = {
 
 
 def initial_states(system, spec, count, seed):
-    y0s = jax.jit(jax.vmap(system.sample))(jr.split(jr.key(seed), count))
-    return y0s if spec.keep is None else y0s[jax.vmap(spec.keep)(y0s)]
+    y0s = jax.jit(jax.vmap(system.sample))(jr.split(jr.key(seed), spec.draws * count))
+    if spec.keep is None:
+        return y0s
+    kept = jax.vmap(spec.keep)(y0s)
+    return jax.tree.map(lambda x: x[kept][:count], y0s)
 
 
 def train(system, spec, seed):
@@ -152,10 +213,14 @@ def train(system, spec, seed):
 
 
 def train_flow_map(system, spec, seed, key):
-    """SPRING on fresh points, then Levenberg-Marquardt on many that stay the same."""
+    """SPRING on fresh points, then perhaps Levenberg-Marquardt on many that stay the same."""
     own, system = system, dfc.systems.DoublePendulum(gravity=1.0) if spec.natural else system
-    longest = system.dt if spec.natural else system.dt / spec.repeats
-    pool = reachable(system, spec, spec.pool, seed)
+    dt, _ = times_of(system)
+    longest = dt if spec.natural else dt / spec.repeats
+    if spec.states is None:
+        pool = reachable(system, spec, spec.pool, seed)
+    else:
+        pool = spec.states(spec.pool, jr.key(seed + 100))
     if spec.smaller is not None:
         pool = with_smaller(pool, spec.smaller, jr.key(seed + 300))
     network = dfc.DeepONet(
@@ -183,7 +248,14 @@ def train_flow_map(system, spec, seed, key):
             optimiser=dfc.learned.LevenbergMarquardt(damping=5e-5),
         )  # fmt: skip
     network = scaled(network, own) if spec.natural else network
+    if spec.extremes is not None:
+        network = reaching(network, spec.extremes())
     return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
+
+
+def reaching(network, states):
+    """The same network, with these states in its domain."""
+    return eqx.tree_at(lambda m: m.domain, network, network.domain.extended(states))
 
 
 def scaled(network, system):
@@ -238,10 +310,11 @@ def judge_pinn(system, network):
 
 def exact_step(system, y0):
     controller = dfx.PIDController(rtol=1e-13, atol=1e-13)
-    return dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field), dfx.Dopri8(), 0.0, system.dt, None, y0,
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field), dfx.Dopri8(), 0.0, times_of(system)[0], None, y0,
         stepsize_controller=controller, max_steps=None, adjoint=dfx.ForwardMode(),
-    ).ys[-1]  # fmt: skip
+    )  # fmt: skip
+    return jax.tree.map(lambda x: x[-1], solution.ys)
 
 
 @functools.cache
@@ -250,8 +323,9 @@ def judged_on(name, spec, steps, states):
     system = dfc.systems.get(name)
     fresh = reachable(system, spec, states, seed=1000)
     exact = jax.jit(jax.vmap(lambda y: exact_step(system, y)))(fresh)
-    y0s = initial_states(system, spec, 4 * INITIAL_STATES, seed=2000)[:INITIAL_STATES]
-    ts = jnp.arange(steps + 1) * system.dt
+    y0s = initial_states(system, spec, 4 * INITIAL_STATES, seed=2000)
+    y0s = jax.tree.map(lambda x: x[:INITIAL_STATES], y0s)
+    ts = jnp.arange(steps + 1) * times_of(system)[0]
     reference = jax.vmap(lambda y0: system.reference(ts, y0))(y0s)
     return fresh, exact, y0s, ts, reference
 
@@ -274,13 +348,21 @@ def judge_flow_map(system, spec, network, steps, states):
 
 
 def step(system, solver, y0):
-    term = dfx.ODETerm(system.vector_field)
-    return dfx.diffeqsolve(term, solver, 0.0, system.dt, system.dt, y0, throw=False).ys[-1]
+    term, (dt, _) = dfx.ODETerm(system.vector_field), times_of(system)
+    ys = dfx.diffeqsolve(term, solver, 0.0, dt, dt, y0, throw=False).ys
+    return jax.tree.map(lambda x: x[-1], ys)
+
+
+def distances(ys, others, leading=1):
+    """The Euclidean distances of states with so many leading axes."""
+    differences = jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), ys, others))
+    flat = [x.reshape(*x.shape[:leading], -1) for x in differences]
+    return np.linalg.norm(np.concatenate(flat, axis=-1), axis=-1)
 
 
 def one_step(system, solver, states, exact):
     ys = jax.jit(jax.vmap(lambda y: step(system, solver, y)))(states)
-    error = np.linalg.norm(np.asarray(ys - exact).reshape(len(ys), -1), axis=1)
+    error = distances(ys, exact)
     return float(np.sqrt(np.mean(error**2))), float(np.median(error))
 
 
@@ -289,7 +371,7 @@ def rollout(system, solver, y0s, ts, reference):
     @jax.vmap
     def solve(y0):
         solution = dfx.diffeqsolve(
-            dfx.ODETerm(system.vector_field), solver, 0.0, ts[-1], system.dt, y0,
+            dfx.ODETerm(system.vector_field), solver, 0.0, ts[-1], times_of(system)[0], y0,
             saveat=dfx.SaveAt(ts=ts), max_steps=len(ts) + 2, throw=False,
         )  # fmt: skip
         drift = jax.tree.leaves(dfc.drift(solution, system.manifold))
@@ -297,7 +379,7 @@ def rollout(system, solver, y0s, ts, reference):
         return solution.ys, largest, solution.result == dfx.RESULTS.successful
 
     ys, drift, ok = solve(y0s)
-    error = np.linalg.norm(np.asarray(ys - reference).reshape(*ys.shape[:2], -1), axis=-1)
+    error = distances(ys, reference, 2)
     error = np.where(np.asarray(ok)[:, None], error, np.inf)
     largest = np.max(error, axis=1)
     return {
@@ -312,12 +394,13 @@ def rollout(system, solver, y0s, ts, reference):
 
 def cost(system, solver, states, steps=20, repeats=5):
     """Nanoseconds for a step of one trajectory in a batch."""
+    dt, _ = times_of(system)
 
     @jax.jit
     @jax.vmap
     def solve(y0):
         return dfx.diffeqsolve(
-            dfx.ODETerm(system.vector_field), solver, 0.0, steps * system.dt, system.dt, y0,
+            dfx.ODETerm(system.vector_field), solver, 0.0, steps * dt, dt, y0,
             throw=False, max_steps=None, adjoint=dfx.ForwardMode(),
         ).ys  # fmt: skip
 
@@ -327,7 +410,8 @@ def cost(system, solver, states, steps=20, repeats=5):
         started = time.perf_counter()
         jax.block_until_ready(solve(states))
         times.append(time.perf_counter() - started)
-    return round(min(times) / steps / len(states) * 1e9, 1)
+    count = len(jax.tree.leaves(states)[0])
+    return round(min(times) / steps / count * 1e9, 1)
 
 
 # ---- Records ----
@@ -350,7 +434,8 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
     if spec.windows:
         record["errors"] = judge_pinn(system, network)
     else:
-        steps = round(system.t1 / system.dt) if steps is None else steps
+        dt, t1 = times_of(system)
+        steps = round(t1 / dt) if steps is None else steps
         record["errors"] = judge_flow_map(system, spec, network, steps, states)
     return network, record
 
@@ -364,6 +449,7 @@ def weights_of(network):
 def ship(network, record):
     spec = SPECS[record["system"]]
     domain = "the initial state" if spec.windows else "states along solutions"
+    domain = domain if spec.states is None else " ".join(spec.states.__doc__.split())
     info = {
         **record,
         "command": f"python benchmarks/learned/zoo.py --system {record['system']} "

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractSystem, real
+from ._reduced import Reduced
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]
@@ -107,6 +108,34 @@ class Kepler(AbstractSystem):
         f_rate = -s * n * a**2 / (r * r0)
         g_rate = 1 - (1 - c) * a / r
         return jnp.outer(f, q) + jnp.outer(g, p), jnp.outer(f_rate, q) + jnp.outer(g_rate, p)
+
+    def frame(self, y: State) -> Reduced:
+        r"""The frame of an orbit, for a [`diffrax_conserve.DeepONet`][].
+
+        The flow commutes with rotations, reflections, and changes of scale by $c$ together with
+        those of time by $c^{3/2}$. What is left of four numbers are two, which tell the shape of
+        the orbit and the place on it: $r |p|^2 / \mu - 1 = e \cos E$ and
+        $q \cdot p / \sqrt{\mu r}$, with $r = |q|$, the eccentricity $e$ and the eccentric anomaly
+        $E$. The third input is $e^2$, so that a domain that is a box ends with the eccentricity.
+        The basis stretches position and velocity along each other, as Lagrange's coefficients do.
+        The clock is $\nu = \sqrt{\mu / r^3}$, the rate of a circular orbit through the same place:
+        in its time a passage of the perihelion is no faster than the rest. The singularities of the
+        solution, which are in complex time, are nowhere closer than one unit up to $e = 0.6$, and
+        0.77 up to 0.8.
+
+        Orbits that are not bound have it too. Where the orbit becomes a line ($e \to 1$) position
+        and velocity are parallel, and the basis degenerates.
+        """
+        q, p = y
+        mu, r = self.like(y).mu, jnp.sqrt(jnp.sum(q**2))
+        nu = jnp.sqrt(mu / r**3)
+        e_cos, radial = r * jnp.sum(p**2) / mu - 1, jnp.sum(q * p) / (nu * r**2)
+        # $1 - r / a = e \cos E$, and the second input is $e \sin E / \sqrt{1 - e \cos E}$.
+        e2 = e_cos**2 + (1 - e_cos) * radial**2
+        still = jnp.zeros_like(q)
+        columns = [(q, still), (p / nu, still), (still, nu * q), (still, p)]
+        basis = jnp.stack([jnp.concatenate(column) for column in columns], axis=1)
+        return Reduced(jnp.stack([e_cos, radial, e2]), basis, nu)
 
     def period(self, y0: State | None = None) -> Float[Array, ""]:
         a = self._semi_major_axis(self.y0 if y0 is None else y0)

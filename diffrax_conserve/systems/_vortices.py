@@ -1,6 +1,6 @@
 """Point vortices in the plane."""
 
-from typing import ClassVar, NamedTuple, final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax
@@ -13,18 +13,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
 from ._base import real
+from ._reduced import Reduced
 from ._reference import AbstractIntegratedSystem
 from ._sampling import annulus
 
 State = Float[Array, "vortices 2"]
-
-
-class Reduced(NamedTuple):
-    """A state up to symmetries: the three parts of a `diffrax_conserve.learned.Frame`."""
-
-    inputs: Float[Array, " k"]  # invariants of the symmetries
-    basis: Float[Array, "n m"]  # directions that turn with the state
-    clock: Float[Array, ""]  # units of its own time in one unit of time
 
 
 @final

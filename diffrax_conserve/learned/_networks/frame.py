@@ -35,8 +35,8 @@ class Frame(eqx.Module):
     inputs and different own times; $\tau_{\max}$ is the largest own time of `max_step` among the
     states with which it was built.
 
-    An example is the method `frame` of [`diffrax_conserve.systems.PointVortices`][], which returns
-    the three as a tuple.
+    Examples are the methods `frame` of [`diffrax_conserve.systems.PointVortices`][] and of
+    [`diffrax_conserve.systems.Kepler`][], which return the three as a tuple.
 
     !!! example
 

@@ -1,0 +1,175 @@
+"""The frame of Kepler's problem, and the flow map of the zoo that has it."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import CORES, SMALL, states
+
+KEPLER = dfc.systems.Kepler(mu=1.7)
+FRAMES = jax.jit(jax.vmap(KEPLER.frame))
+Y0S = states(system=KEPLER)
+
+
+def transformed(y, angle=0.7, scale=1.3, mirror=-1.0):
+    """The same orbit turned, seen in a mirror, and larger."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    matrix = jnp.array([[c, -s], [s, c]]) @ jnp.diag(jnp.array([mirror, 1.0]))
+    q, p = y
+    return scale * q @ matrix.T, p @ matrix.T / jnp.sqrt(scale)
+
+
+MOVED = transformed(Y0S)
+
+
+def ellipses(a, e, anomaly, angle=0.0, sense=1.0):
+    """States from the elements of their orbits, by textbook formulas and nothing of the package."""
+    c, s = np.cos(anomaly), np.sin(anomaly)
+    b = a * np.sqrt(1 - e**2) * sense
+    q = np.stack([a * (c - e), b * s], axis=-1)
+    p = np.stack([-a * s, b * c], axis=-1) / (a**1.5 * (1 - e * c))[..., None]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return tuple(np.einsum("ij...,...j->...i", turn, x) for x in (q, p))
+
+
+def arrays(y):
+    return jax.tree.map(jnp.asarray, y)
+
+
+def anomaly_after(t, a, e, anomaly):
+    """Kepler's equation, by bisection: slow, but it cannot fail."""
+    mean = anomaly - e * np.sin(anomaly) + t / a**1.5
+    lower, upper = mean - 1, mean + 1
+    for _ in range(60):
+        middle = (lower + upper) / 2
+        early = middle - e * np.sin(middle) < mean
+        lower, upper = np.where(early, middle, lower), np.where(early, upper, middle)
+    return (lower + upper) / 2
+
+
+def random_orbits(count, seed=0):
+    """Those that the network of the zoo is for."""
+    rng = np.random.default_rng(seed)
+    elements = {
+        "a": rng.uniform(0.8, 1.2, count),
+        "e": rng.uniform(0.0, 0.6, count),
+        "anomaly": rng.uniform(0, 2 * np.pi, count),
+    }
+    place = {"angle": rng.uniform(0, 2 * np.pi, count), "sense": rng.choice([-1, 1], count)}
+    return elements, place
+
+
+def distances(ys, others):
+    differences = [np.asarray(a) - b for a, b in zip(ys, others, strict=True)]
+    return np.linalg.norm(np.concatenate(differences, axis=-1), axis=-1)
+
+
+# ---- The frame ----
+
+
+def test_its_inputs_are_the_shape_and_the_anomaly():
+    rng = np.random.default_rng(1)
+    e, anomaly = rng.uniform(0, 0.9, 30), rng.uniform(0, 2 * np.pi, 30)
+    y = ellipses(rng.uniform(0.5, 2, 30), e, anomaly)
+    inputs = jax.vmap(dfc.systems.Kepler().frame)(arrays(y)).inputs
+    c = e * np.cos(anomaly)
+    expected = [c, e * np.sin(anomaly) / np.sqrt(1 - c), e**2]
+    np.testing.assert_allclose(inputs, np.stack(expected, axis=1), atol=1e-13)
+
+
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_symmetries_leave_the_inputs_and_turn_the_basis(mirror):
+    frames, others = FRAMES(Y0S), FRAMES(transformed(Y0S, mirror=mirror))
+    np.testing.assert_allclose(others.inputs, frames.inputs, atol=1e-13)
+    np.testing.assert_allclose(others.clock, frames.clock / 1.3**1.5, rtol=1e-13)
+    coefficients = jnp.array([0.3, -1.0, 0.5, 2.0])
+    change, found = ((f.basis @ coefficients).reshape(-1, 2, 2) for f in (frames, others))
+    expected = transformed((change[:, 0], change[:, 1]), mirror=mirror)
+    np.testing.assert_allclose(found[:, 0], expected[0], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1], expected[1], atol=1e-12)
+
+
+def test_its_basis_spans_what_the_vector_field_can_do():
+    frames = FRAMES(Y0S)
+    rates = jnp.concatenate(jax.vmap(lambda y: KEPLER.vector_field(0.0, y, None))(Y0S), axis=1)
+    coefficients = jax.vmap(dfc.learned.Frame.measure)(frames, rates)
+    # In its own units and its own time all orbits have the same field.
+    expected = jnp.broadcast_to(jnp.array([0.0, 1.0, -1.0, 0.0]), coefficients.shape)
+    np.testing.assert_allclose(coefficients, expected, atol=1e-11)
+
+
+def test_an_orbit_that_is_not_bound_has_a_frame():
+    frame = dfc.systems.Kepler().frame((jnp.array([1.0, 0.0]), jnp.array([0.0, 2.0])))
+    np.testing.assert_allclose(frame.inputs, [3.0, 0.0, 9.0], rtol=1e-14)
+    np.testing.assert_allclose(frame.clock, 1.0, rtol=1e-14)
+
+
+# ---- Flow maps with it ----
+
+
+@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+def test_untrained_it_commutes_with_the_symmetries(core, order):
+    taylor = dfc.learned.Taylor(KEPLER.vector_field, order) if order else None
+    network = dfc.DeepONet(
+        Y0S, 0.1, taylor=taylor, core=CORES[core], frame=KEPLER.frame, key=jr.key(0), **SMALL
+    )
+    step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
+    found, expected = step(MOVED, 0.1 * 1.3**1.5), transformed(step(Y0S, 0.1))
+    scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in expected)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * scale)
+
+
+def test_its_domain_ends_with_the_eccentricity_and_with_the_distance():
+    elements, _ = random_orbits(200)
+    inside = arrays(ellipses(**elements))
+    network = dfc.load_pretrained("kepler")
+    contains = jax.jit(jax.vmap(lambda y: network.domain.contains(y)))
+    np.testing.assert_array_equal(contains(inside), True)
+    circles = ellipses(np.linspace(0.35, 2, 50), np.zeros(50), np.linspace(0, 6, 50))
+    np.testing.assert_array_equal(contains(arrays(circles)), True)
+    eccentric = ellipses(np.ones(50), np.full(50, 0.65), np.linspace(0, 6, 50))
+    np.testing.assert_array_equal(contains(arrays(eccentric)), False)
+    small = ellipses(np.full(50, 0.29), np.zeros(50), np.linspace(0, 6, 50))
+    np.testing.assert_array_equal(contains(arrays(small)), False)
+    large = ellipses(np.full(50, 30.0), np.full(50, 0.5), np.linspace(0, 6, 50))
+    np.testing.assert_array_equal(contains(arrays(large)), True)
+
+
+# ---- The network of the zoo ----
+
+
+def test_its_step_against_keplers_equation():
+    elements, place = random_orbits(500, seed=1)
+    y0s = arrays(ellipses(**elements, **place))
+    after = elements | {"anomaly": anomaly_after(0.5, **elements)}
+    network = dfc.load_pretrained("kepler")
+    y1s = eqx.filter_jit(jax.vmap(lambda y: network(y, 0.5)))(y0s)
+    error = distances(y1s, ellipses(**after, **place))
+    assert 0 < np.sqrt(np.mean(error**2)) < 1e-6
+    assert np.max(error) < 2e-5
+
+
+def test_a_hundred_projected_steps_against_keplers_equation():
+    elements, place = random_orbits(40, seed=2)
+    y0s = arrays(ellipses(**elements, **place))
+    system = dfc.systems.Kepler()
+    solver = dfc.ManifoldProjection(
+        dfc.DeepONetSolver(dfc.load_pretrained("kepler")), system.manifold
+    )
+
+    @jax.jit
+    @jax.vmap
+    def solve(y0):
+        return dfx.diffeqsolve(dfx.ODETerm(system.vector_field), solver, 0.0, 50.0, 0.5, y0).ys
+
+    after = elements | {"anomaly": anomaly_after(50.0, **elements)}
+    error = distances([x[:, -1] for x in solve(y0s)], ellipses(**after, **place))
+    assert np.median(error) < 1e-4
+    assert np.max(error) < 1e-3
