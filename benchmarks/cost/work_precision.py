@@ -97,9 +97,9 @@ def batch(settings: Settings) -> dict[str, Any]:
         "projected Tsit5": projected(dfx.Tsit5(), tolerances),
         "projected Dopri8, unrolled": projected(dfc.Unrolled(dfx.Dopri8()), finer),
         "projected Tsit5, unrolled": projected(dfc.Unrolled(dfx.Tsit5()), finer),
-        "projected Dopri8, fixed steps": projected(dfx.Dopri8(), (250, 350, 500, 700), False),
-        "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (1_000, 2_000, 4_000), False),
-        "projected RK4, fixed steps": projected(dfc.RK4(), (8_000, 16_000, 32_000), False),
+        "projected Dopri8, fixed steps": projected(dfx.Dopri8(), (1_500, 2_000, 3_000), False),
+        "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (5_000, 10_000, 20_000), False),
+        "projected RK4, fixed steps": projected(dfc.RK4(), (40_000, 80_000, 160_000), False),
     }
     for width in (8, 16):
         contestants |= heyoka("rigid-body", (*tolerances, 1e-12, 1e-13, 1e-14), width)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
@@ -188,6 +189,12 @@ def check_options(projection: Any) -> None:
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):
         check_count("max_steps", projection.max_steps)
+    solver = getattr(projection, "linear_solver", None)
+    if solver is not None and not isinstance(solver, lx.AbstractLinearSolver):
+        raise TypeError(
+            f"`linear_solver` is {solver!r}, but it must be a solver of lineax, such as "
+            "`lineax.Cholesky()`, or `None`."
+        )
     for name in ("lower", "upper"):
         check_numbers(name, getattr(projection, name, None), least=-np.inf)
 
@@ -220,12 +227,16 @@ NEWTON_OPTIONS = r"""**Arguments:**
     linear constraints is the nearest such point of the manifold. If there is no such point, the
     projection fails. In derivatives, components at a bound are constant. For a complex component
     the bounds apply to both parts. Default: none.
+- `linear_solver`: a solver of lineax for the linear systems of the iterations, with the matrix
+    $G M^{-1} G^\top$: `lineax.Cholesky()`, `lineax.CG(...)`, or `lineax.SVD()`, which is positive
+    semi-definite, and singular if constraints depend on each other. Default: elimination that
+    leaves out dependent constraints, and with more than 128 constraints conjugate gradients.
 
 **Raises:**
 
-`TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
-less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
-projection is used, the bounds are not shaped like the state.
+`TypeError` if an option is not a number, or `linear_solver` is not a solver of lineax; `ValueError`
+if a tolerance is negative, `max_steps` is less than 1, a weight is not positive, a lower bound is
+above its upper bound, or, when the projection is used, the bounds are not shaped like the state.
 """
 
 

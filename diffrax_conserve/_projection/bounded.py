@@ -7,6 +7,7 @@ Sun, "A nonsmooth version of Newton's method", 1993). For nonlinear constraints 
 programs is solved, each with the constraints linearised about the last state.
 """
 
+import dataclasses
 import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -172,7 +173,7 @@ def _polished(
     candidate."""
     z = tree_add(equations.candidate, equations.correction(base, multiplier))
     y, active = box.clip(z), tree_mul(equations.weights, box.inside(z))
-    gram_solver = base.gram_solver(active)
+    gram_solver = equations.gram_solver(base, weights=active)
     for _ in range(2):
         change = gram_solver.solve(equations.residual(y))
         y = box.clip(tree_sub(y, tree_mul(base.pullback(change), active)))
@@ -208,7 +209,8 @@ def _quadratic_program(
         active = jtu.tree_map(
             lambda w, i: w * (i + share.astype(w.dtype) * (1 - i)), weights, box.inside(z)
         )
-        change = jtu.tree_map(jnp.negative, base.gram_solver(active).solve(gradient))
+        gram_solver = equations.gram_solver(base, weights=active)
+        change = jtu.tree_map(jnp.negative, gram_solver.solve(gradient))
         pull = base.pullback(change)
         step = tree_mul(pull, weights)
         slope = tree_dot(gradient, change, dtype)
@@ -273,7 +275,8 @@ def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
 
         _, at_candidate = linearise(equations.residual, equations.candidate)
         t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, (given,), (t_given,)))
-        t_multiplier = at_y.gram_solver(active, at_candidate).solve(jtu.tree_map(jnp.negative, t_g))
+        gram_solver = equations.gram_solver(at_y, at_candidate, weights=active)
+        t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
         t_y = tree_add(t_y, tree_mul(at_candidate.pullback(t_multiplier), active))
     else:
 
@@ -290,9 +293,7 @@ def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
         t_y, t_multiplier = solve_linearised(
             lambda x: optimality(x, given), unknowns, right, units(at_y, equations.weights)
         )
-    inside = Equations(
-        equations.residual, equations.candidate, active, equations.magnitude, equations.tolerance
-    )
+    inside = dataclasses.replace(equations, weights=active)
     factor = jnp.where(info.ok, certain(inside, y, at_y), 1)
     t_y = tree_scale(lax.stop_gradient(factor), t_y)
     return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

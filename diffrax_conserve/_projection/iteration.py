@@ -7,13 +7,14 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import tree_cancel, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
 from .base import Problem
-from .elimination import Vector
-from .jacobian import AbstractJacobian
+from .elimination import GramSolver, Vector
+from .jacobian import AbstractJacobian, lineax_solver
 from .linearise import Elements, Joined, linearise
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, relative, within
 
@@ -33,6 +34,7 @@ class Equations(eqx.Module):
     weights: Y
     magnitude: Vector
     tolerance: Tolerance
+    linear_solver: lx.AbstractLinearSolver | None = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -41,9 +43,29 @@ class Equations(eqx.Module):
         candidate: Y,
         rtol: float | Array | None,
         atol: float | Array | None,
+        linear_solver: lx.AbstractLinearSolver | None,
     ) -> "Equations":
-        tolerance = Tolerance(rtol, atol)
-        return cls(problem.residual, candidate, problem.weights, problem.magnitude, tolerance)
+        return cls(
+            problem.residual,
+            candidate,
+            problem.weights,
+            problem.magnitude,
+            Tolerance(rtol, atol),
+            linear_solver,
+        )
+
+    def gram_solver(
+        self,
+        jacobian: AbstractJacobian,
+        other: AbstractJacobian | None = None,
+        damping: Array | float = 0.0,
+        weights: Y | None = None,
+    ) -> GramSolver:
+        """Solves with `G M⁻¹ Hᵀ`; see `AbstractJacobian.gram_solver`."""
+        weights = self.weights if weights is None else weights
+        if self.linear_solver is None:
+            return jacobian.gram_solver(weights, other, damping)
+        return lineax_solver(self.linear_solver, jacobian, weights, other, damping)
 
     def correction(self, jacobian: AbstractJacobian, multiplier: Vector) -> Y:
         """`M⁻¹ Gᵀ λ`."""
@@ -142,7 +164,7 @@ def iterate(
         # Near a state where all terms vanish, the residual never becomes small relative to their
         # size there, so the scale of the candidate bounds it from below.
         vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
-        change = jacobian.gram_solver(equations.weights, base, damping * vanishing).solve(g)
+        change = equations.gram_solver(jacobian, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
 
         def choose(a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:

@@ -15,7 +15,7 @@ import lineax as lx
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import Y
-from .._tree import tree_dot, tree_mul, tree_scale, tree_sub, working_dtype
+from .._tree import tree_dot, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
 from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
 # Up to this many constraints are unrolled, enough for the ten integrals of the N-body problem.
@@ -235,7 +235,7 @@ _SMALL = 4096
 _SOLVE_RTOL = 1e-4
 # With two different Jacobians, the number of corrections of the solve with one of them, which reach
 # roundoff.
-_CORRECTIONS = 4
+_CORRECTIONS = 7
 
 
 @final
@@ -293,6 +293,49 @@ class MatrixFree(AbstractJacobian):
             return x
 
         return GramSolver(solve if other is None else corrected, jnp.asarray(diagonal.size))
+
+
+def lineax_solver(
+    linear_solver: lx.AbstractLinearSolver,
+    jacobian: AbstractJacobian,
+    weights: Y,
+    other: AbstractJacobian | None = None,
+    damping: Real[Array, ""] | float = 0.0,
+) -> GramSolver:
+    """As `jacobian.gram_solver`, by a solver of lineax for positive semi-definite operators."""
+    rows, row_sizes = jacobian.unit_rows()
+    same = other is None or other is jacobian
+    columns, column_sizes = (rows, row_sizes) if other is None else other.unit_rows()
+    diagonal = jtu.tree_map(jnp.square, rows.scale(jtu.tree_map(jnp.sqrt, weights)))
+
+    def product(x: Vector, columns: AbstractJacobian = rows) -> Vector:
+        g = rows.pushforward(tree_mul(columns.pullback(x), weights))
+        return jtu.tree_map(lambda g, d, x: g + damping * d * x, g, diagonal, x)
+
+    struct = jax.eval_shape(lambda: diagonal)
+    operator = lx.FunctionLinearOperator(product, struct, lx.positive_semidefinite_tag)
+
+    def solve_scaled(_: Any, b: Vector) -> Vector:
+        # An absolute tolerance is relative to `b`, and zero is solved by zero.
+        size = tree_max(b)
+        found = jnp.where((size > 0) & (size < jnp.inf), size, 1)
+        unit = jtu.tree_map(lambda b: jnp.where(size == 0, 1, b / found), b)
+        x = lx.linear_solve(operator, unit, linear_solver, throw=False).value
+        return jtu.tree_map(lambda x: jnp.where(size == 0, 0, x * found), x)
+
+    def solve(b: Vector) -> Vector:
+        return lax.custom_linear_solve(product, b, solve_scaled, symmetric=True)
+
+    def corrected(b: Vector) -> Vector:
+        x = solve(b)
+        for _ in range(_CORRECTIONS):
+            left = jtu.tree_map(jnp.subtract, b, product(x, columns))
+            x = jtu.tree_map(jnp.add, x, solve(left))
+        return x
+
+    rank = jacobian.gram_solver(weights).rank
+    solver = GramSolver(solve if same else corrected, rank)
+    return solver.scaled(row_sizes, column_sizes)
 
 
 def estimated_norms(linear: Callable[[Y], Vector], weights: Y) -> Vector:

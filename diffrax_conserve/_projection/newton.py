@@ -85,6 +85,7 @@ class Newton(AbstractProjection):
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
+    linear_solver: lx.AbstractLinearSolver | None = option(None, static=True)
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -103,7 +104,7 @@ class Newton(AbstractProjection):
                 "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
                 "pass `projection=SimplifiedNewton()`."
             )
-        equations = Equations.of(problem, candidate, self.rtol, self.atol)
+        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         unbounded = ft.partial(_project, max_steps=steps)
@@ -167,7 +168,7 @@ def _nearest(
     offset = jacobian.pushforward(tree_sub(start, candidate))
     # Scaled, so that a linear solver finds the right rank of the system.
     roots, norms = units(jacobian, weights)
-    multiplier = jacobian.gram_solver(weights).solve(offset) * norms
+    multiplier = equations.gram_solver(jacobian).solve(offset) * norms
 
     def scaled(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
         (y, multiplier), (residual, candidate, weights, roots, norms) = unknowns, parameters

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
@@ -89,6 +90,7 @@ class SimplifiedNewton(AbstractProjection):
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
+    linear_solver: lx.AbstractLinearSolver | None = option(None, static=True)
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -96,7 +98,7 @@ class SimplifiedNewton(AbstractProjection):
         check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        equations = Equations.of(problem, candidate, self.rtol, self.atol)
+        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         if box is None:
@@ -132,7 +134,7 @@ def _project(
 ) -> tuple[Y, Vector, ProjectionInfo]:
     inline, _, join = _in_scalars(equations)
     before, jacobian = linearise(inline.residual, inline.candidate)
-    gram_solver = jacobian.gram_solver(inline.weights)
+    gram_solver = inline.gram_solver(jacobian)
     y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
     last, at_y, count = before, jacobian, min(jacobian.inline_steps, max_steps)
     for step in range(count):
@@ -292,7 +294,7 @@ def _project_jvp(primals, tangents, *, max_steps):
     t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, moving(equations), moving(t_equations)))
     _, at_candidate = linearise(equations.residual, equations.candidate)
     _, at_y = linearise(equations.residual, y)
-    gram_solver = at_y.gram_solver(equations.weights, at_candidate)
+    gram_solver = equations.gram_solver(at_y, at_candidate)
     t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
     t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
     # The derivative of a failed projection is not used: its step is rejected, or ends the solve.

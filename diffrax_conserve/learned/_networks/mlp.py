@@ -95,11 +95,12 @@ def initial_slope(net: MLP) -> float | None:
 
 
 @eqx.filter_jit
-def fresh(net: MLP, slope: float | None, key: PRNGKeyArray) -> MLP:
-    """A network of the shape of `net`, with other random weights."""
+def fresh(net: MLP, slope: float | None, size: float, key: PRNGKeyArray) -> MLP:
+    """A network of the shape of `net`, with other random weights and outputs of about `size`."""
     first, last = net.weights[0], net.weights[-1]
     (in_size, width), out_size, depth = first.shape, last.shape[1], len(net.weights) - 1
-    return MLP(in_size, out_size, width, depth, net.activation, first.dtype, key=key, slope=slope)
+    new = MLP(in_size, out_size, width, depth, net.activation, first.dtype, key=key, slope=slope)
+    return eqx.tree_at(lambda net: net.weights[-1], new, size * new.weights[-1])
 
 
 def _spread(

@@ -82,7 +82,9 @@ def fit(
     A `PINN` of several windows is trained window by window; each starts at the end of the previous
     one, projected to the manifold if one is given. Each is judged by its estimated error. A window
     that failed is trained again from other weights, and then in halves, as often as the recipe's
-    `retries` allow. If the solution is still wrong, a warning names the window and the error.
+    `retries` allow. Errors add up along the solution and may grow: if it misses the `target`, the
+    windows are trained again, to smaller errors. If the solution is still wrong, a warning names
+    the window and the error.
 
     A training can be interrupted and continued. It stops after the recipe's epochs, at a `target`,
     after `seconds`, or at a keyboard interrupt, and returns the best model so far. With
@@ -196,7 +198,7 @@ def _fit_windows(
     state, found, ended = train_windows(trainer, state, ends)
     trainer.save(state, always=True)
     trained = pinn.cut(found.edges.tolist(), found.nets, found.y0s)
-    error = solution_error(trainer, pinn, trained, found.errors)
+    error = solution_error(trainer, pinn, trained, found)
     if ended == "epochs" and trainer.target is not None and error <= trainer.target:
         ended = "target"
     return trained, _log(trainer, state, ended, error, found.errors)

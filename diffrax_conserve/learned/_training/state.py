@@ -55,6 +55,8 @@ class Windows(eqx.Module):
     present: int = 0  # index of the one in training
     attempt: int = 0  # number of its earlier trainings
     given_up: int = 0  # whether a window has finally failed
+    passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
+    tightening: float = 1.0  # by which the limit of a window's error is divided
 
 
 @final

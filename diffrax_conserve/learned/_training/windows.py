@@ -17,6 +17,7 @@ from ..._manifold import conserved_values
 from ..._projection import project
 from .._networks import PINN, Window, fresh, initial_slope
 from .._networks.flat import flatten
+from .._networks.mlp import MLP
 from .objective import Objective
 from .path_error import relative, window_errors
 from .state import FitState, Windows
@@ -58,13 +59,14 @@ def train_windows(
     trainer: Trainer, state: FitState, ends: WindowEnds | None
 ) -> tuple[FitState, Windows, str]:
     """Trains the windows one after the other; windows that fail are trained again, then in
-    halves."""
-    limit = _limit(trainer, state.model)
+    halves. If errors grow too much from window to window, they are all trained to a smaller one."""
     objective, _ = trainer.start(_present(trainer, state), state)
 
     def close(objective: Objective, state: FitState) -> bool:
         window = eqx.combine(state.carry.best_weights, objective.static)
-        return trainer.target is not None and _own_error(trainer, state.model, window) <= limit
+        return trainer.target is not None and _own_error(trainer, state.model, window) <= _limit(
+            trainer, state.model, state.windows
+        )
 
     try:
         while not state.finished:
@@ -75,7 +77,7 @@ def train_windows(
                 # `judged` is returned but not stored in `state`: a continued training judges the
                 # window at its end.
                 return state, judged, ended
-            following = _next(trainer, state, judged, limit)
+            following = _next(trainer, state, judged)
             if not following.finished:
                 objective, carry = trainer.start(_present(trainer, following), following)
                 following = dataclasses.replace(following, carry=carry)
@@ -99,7 +101,8 @@ def _present(trainer: Trainer, state: FitState) -> Window:
     k = found.present
     net, y0 = jtu.tree_map(lambda x: jnp.asarray(x[k]), (found.nets, found.y0s))
     if found.attempt:
-        net = fresh(net, found.slope or None, jr.fold_in(trainer.network_key(state), 1))
+        key = jr.fold_in(trainer.network_key(state), 1)
+        net = _fresh(net, found, int(found.halvings[k]), key)
     return state.model.window_of(net, y0, found.edges[k], found.edges[k + 1])
 
 
@@ -119,10 +122,11 @@ def _judged(trainer: Trainer, state: FitState, window: Window, ends: WindowEnds 
     return dataclasses.replace(found, nets=nets, y0s=y0s, errors=_put(found.errors, k, error))
 
 
-def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> FitState:
-    """The state for the next training: the same window again, its first half, or the next
-    window."""
+def _next(trainer: Trainer, state: FitState, found: Windows) -> FitState:
+    """The state for the next training: the same window again, its first half, the next window, or
+    the first that is not accurate enough for the whole solution."""
     k, retries = found.present, trainer.recipe.retries
+    limit = _limit(trainer, state.model, found)
     failed = not found.errors[k] <= limit and not found.given_up and retries
     if failed and found.attempt == 0:
         found = dataclasses.replace(found, attempt=1)
@@ -132,9 +136,14 @@ def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> Fi
         # After a window that has finally failed, the others start at a wrong state and are not
         # retried.
         found = dataclasses.replace(found, given_up=int(bool(found.given_up or failed)))
-        if k + 1 == found.errors.size:
+        again = None
+        if k + 1 < found.errors.size:
+            again = dataclasses.replace(found, present=k + 1, attempt=0)
+        elif not found.given_up and found.passes < retries:
+            again = _tightened(trainer, state.model, found)
+        if again is None:
             return dataclasses.replace(state, windows=found, finished=1)
-        found = dataclasses.replace(found, present=k + 1, attempt=0)
+        found = again
     return dataclasses.replace(
         state,
         windows=found,
@@ -145,16 +154,38 @@ def _next(trainer: Trainer, state: FitState, found: Windows, limit: float) -> Fi
     )
 
 
+def _tightened(trainer: Trainer, given: PINN, found: Windows) -> Windows | None:
+    """The windows with a smaller limit, if the solution is right but not within the target."""
+    along = _errors_along(trainer, given.cut(found.edges.tolist(), found.nets, found.y0s))
+    error, target = max(along), trainer.target
+    if target is None or not target < error < _WRONG:
+        return None
+    tightening = found.tightening * 2 * error / target
+    # At least one window is trained again.
+    tightening = max(tightening, 2 * _limit(trainer, given) / np.max(found.errors))
+    k = int(np.flatnonzero(found.errors > _limit(trainer, given) / tightening)[0])
+    errors = found.errors.copy()
+    errors[k + 1 :] = np.inf  # these will start elsewhere
+    return dataclasses.replace(
+        found,
+        errors=errors,
+        present=k,
+        attempt=0,
+        passes=found.passes + 1,
+        tightening=float(tightening),
+    )
+
+
 def _halved(found: Windows, key: PRNGKeyArray) -> Windows:
     """The windows with the present one cut in halves."""
     k, edges = found.present, found.edges
     net = jtu.tree_map(lambda x: jnp.asarray(x[k]), found.nets)
-    halves = [fresh(net, found.slope or None, key) for key in jr.split(jr.fold_in(key, 2))]
+    depth = int(found.halvings[k]) + 1
+    halves = [_fresh(net, found, depth, key) for key in jr.split(jr.fold_in(key, 2))]
 
     def cut(x: np.ndarray, first: Any, second: Any) -> np.ndarray:
         return np.concatenate([x[:k], np.stack([first, second]), x[k + 1 :]])
 
-    depth = found.halvings[k] + 1
     return dataclasses.replace(
         found,
         nets=jtu.tree_map(cut, found.nets, *halves),
@@ -164,6 +195,11 @@ def _halved(found: Windows, key: PRNGKeyArray) -> Windows:
         halvings=cut(found.halvings, depth, depth),
         attempt=0,
     )
+
+
+def _fresh(net: MLP, found: Windows, halvings: int, key: PRNGKeyArray) -> MLP:
+    """New weights. In a shorter window the state changes less, and so do the outputs."""
+    return fresh(net, found.slope or None, 0.5**halvings, key)
 
 
 def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
@@ -180,9 +216,12 @@ def _worst(objective: Objective, state: FitState) -> float:
     return float(np.max(errors, where=np.isfinite(errors), initial=0))
 
 
-def _limit(trainer: Trainer, pinn: PINN) -> float:
+def _limit(trainer: Trainer, given: PINN, found: Windows | None = None) -> float:
     """The error of a single window above which it has failed."""
-    return _WRONG if trainer.target is None else trainer.target / (_GROWTH * pinn.windows)
+    if trainer.target is None:
+        return _WRONG
+    tightening = 1.0 if found is None else found.tightening
+    return trainer.target / (_GROWTH * given.windows * tightening)
 
 
 # A solution with a larger error than this, relative to its largest component, counts as wrong.
@@ -201,8 +240,8 @@ def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
     return relative(found.largest[0], size, pinn.y0)
 
 
-def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray) -> float:
-    """The largest error in the whole interval, with a warning if it is not small."""
+def _errors_along(trainer: Trainer, pinn: PINN) -> list[float]:
+    """The largest error of the solution in each window, with what earlier windows add to it."""
     error, largest, sizes = jnp.zeros_like(pinn.scale), [], []
     assert trainer.vector_field is not None
     for k in range(pinn.windows):
@@ -215,10 +254,15 @@ def solution_error(trainer: Trainer, given: PINN, pinn: PINN, errors: np.ndarray
             end = flatten(window(window.start + window.length))
             error = found.end[1] + end - flatten(pinn.window(k + 1).y0)
     size = np.max(sizes, axis=0)
-    along = [relative(e, size, pinn.y0) for e in largest]
+    return [relative(e, size, pinn.y0) for e in largest]
+
+
+def solution_error(trainer: Trainer, given: PINN, pinn: PINN, found: Windows) -> float:
+    """The largest error in the whole interval, with a warning if it is not small."""
+    along = _errors_along(trainer, pinn)
     wrong = trainer.target if trainer.target is not None else _WRONG
     if not max(along) <= wrong:
-        _warn(pinn, errors, along, _limit(trainer, given), wrong)
+        _warn(pinn, found.errors, along, _limit(trainer, given, found), wrong)
     return max(along)
 
 

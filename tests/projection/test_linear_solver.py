@@ -1,0 +1,103 @@
+"""`linear_solver=`: solves by lineax lead to the projection that elimination leads to."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import lineax as lx
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+EPS = np.finfo(np.float64).eps
+KEPLER = dfc.systems.get("kepler")
+PROJECTIONS = [dfc.SimplifiedNewton, dfc.Newton]
+# An absolute tolerance, too: it is relative to the right-hand side.
+SOLVERS = [lx.Cholesky(), lx.SVD(), lx.CG(1e-10, 1e-10), lx.AutoLinearSolver(well_posed=None)]
+
+
+def name(x):
+    return type(x).__name__ if isinstance(x, lx.AbstractLinearSolver) else x.__name__
+
+
+def chained(count):
+    """Constraints of which each shares a component with the next one."""
+    return dfc.FirstIntegral(lambda t, y, args: y[:count] ** 2 + y[1 : count + 1])
+
+
+def candidate(count):
+    return 1 + 0.1 * jnp.sin(jnp.arange(count + 1.0)), 1e-3 * jnp.cos(3 * jnp.arange(count + 1.0))
+
+
+def projected(manifold, value, projection):
+    def final(y):
+        found, info = dfc.project(manifold, y, value=value, projection=projection)
+        total = sum(jnp.sum(jnp.sin(3 * x)) for x in jax.tree.leaves(found))
+        return total, (found, info)
+
+    return jax.jit(jax.value_and_grad(final, has_aux=True))
+
+
+def agree(manifold, y0, y, projection, linear_solver, **options):
+    value = jax.tree.map(
+        lambda entry: entry.fn(0.0, y0, None),
+        manifold,
+        is_leaf=lambda x: isinstance(x, dfc.FirstIntegral),
+    )
+    (_, (expected, _)), derivative = projected(manifold, value, projection(**options))(y)
+    chosen = projection(**options, linear_solver=linear_solver)
+    (_, (found, info)), gradient = projected(manifold, value, chosen)(y)
+    assert info.ok
+    for a, b in ((found, expected), (gradient, derivative)):
+        for x, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+            np.testing.assert_allclose(x, other, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("linear_solver", SOLVERS, ids=name)
+@pytest.mark.parametrize("projection", PROJECTIONS, ids=name)
+def test_few_constraints(projection, linear_solver):
+    y = jax.tree.map(lambda x: x + 1e-3 * jnp.arange(1, x.size + 1), KEPLER.y0)
+    agree(KEPLER.manifold, KEPLER.y0, y, projection, linear_solver)
+
+
+@pytest.mark.parametrize("count", [20, 150])
+def test_many_constraints(count):
+    y0, offset = candidate(count)
+    for solver in (lx.Cholesky(), lx.CG(1e-12, 0.0)):
+        agree(chained(count), y0, y0 + offset, dfc.SimplifiedNewton, solver)
+
+
+def test_with_bounds_and_a_metric():
+    y0, offset = candidate(3)
+    agree(chained(3), y0, y0 + offset, dfc.SimplifiedNewton, lx.Cholesky(), lower=0.95, metric=2.0)
+
+
+def test_it_is_an_option_of_a_solve():
+    def final(linear_solver):
+        solver = dfc.ManifoldProjection(
+            dfx.Tsit5(),
+            KEPLER.manifold,
+            projection=dfc.SimplifiedNewton(linear_solver=linear_solver),
+        )
+        return dfx.diffeqsolve(
+            dfx.ODETerm(KEPLER.vector_field), solver, 0.0, 5.0, 0.1, KEPLER.y0,
+            saveat=dfx.SaveAt(t0=True, steps=True), max_steps=64,
+        )  # fmt: skip
+
+    found, expected = final(lx.SVD()), final(None)
+    for a, b in zip(found.ys, expected.ys, strict=True):
+        used = np.isfinite(expected.ts)
+        np.testing.assert_allclose(a[used], b[used], atol=1e-12)
+    drift = dfc.drift(found, KEPLER.manifold)
+    assert max(float(jnp.nanmax(jnp.abs(x[used]))) for x in drift.values()) < 16 * EPS
+
+
+def test_a_solver_of_another_library_is_refused():
+    jaxtyping.config.update("jaxtyping_disable", True)  # which finds it first
+    try:
+        for projection in PROJECTIONS:
+            with pytest.raises(TypeError, match="`linear_solver` is 'cholesky'"):
+                projection(linear_solver="cholesky")
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
