@@ -96,7 +96,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 COSTS := overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
   random_features
-TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures pollu worth \
+TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures chemistry worth \
   parameters
 STUDIES := first_same_as_last max_correction project_error claims
 
@@ -107,6 +107,7 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 
 bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and judge them: many hours
 	set -e; for name in $(TRAININGS); do $(BIN)/python benchmarks/learned/$$name.py; done
+	$(BIN)/python benchmarks/learned/chemistry.py --system robertson
 
 bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
@@ -115,7 +116,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/pollu learned/equal_cost \
+	  learned/chemistry learned/equal_cost \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 

@@ -421,6 +421,6 @@ def test_a_smoke_run_of_a_family_of_equations():
 
 @pytest.mark.slow
 def test_a_smoke_run_of_stiff_chemistry_from_data():
-    found = benchmark("pollu").main(["--smoke"])
+    found = benchmark("chemistry").main(["--smoke"])
     assert found["balances"] < 1e-13
     assert found["smallest"] >= 0

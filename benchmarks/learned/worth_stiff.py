@@ -1,9 +1,9 @@
 """A learned step of POLLU against stiff solvers: time for a step of two minutes at equal error.
 
-    python benchmarks/learned/worth_stiff.py FILE       # a network of `pollu.py --out FILE`
+    python benchmarks/learned/worth_stiff.py FILE       # a network of `chemistry.py --out FILE`
     python benchmarks/learned/worth_stiff.py --smoke    # toy sizes, to see that it runs
 
-A batch of states from solves as in `pollu.py`. Kvaerno3 and Kvaerno5 are those of diffrax,
+A batch of states from solves as in `chemistry.py`. Kvaerno3 and Kvaerno5 are those of diffrax,
 adaptive, from a first step of one minute. The Rosenbrock method is written out here for a batch:
 Rodas3 in equal pieces, with the Jacobian by forward mode and an elimination without pivots, whose
 loops run over the batch. The learned step is projected on the balances. Errors are relative, of
@@ -125,12 +125,12 @@ def untrained(states):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("network", type=Path, nargs="?", help="what `pollu.py --out` wrote")
+    parser.add_argument("network", type=Path, nargs="?", help="what `chemistry.py --out` wrote")
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     options = parser.parse_args(argv)
     smoke = options.smoke
     if not smoke and options.network is None:
-        parser.error("name the file of a network, from `pollu.py --out FILE`")
+        parser.error("name the file of a network, from `chemistry.py --out FILE`")
     count, steps, tolerance = (2, 2, 1e-4) if smoke else (50, 20, 1e-8)
     y0s = jax.vmap(SYSTEM.sample)(jr.split(jr.key(77), count))
     ts = FIRST + STEP * jnp.arange(steps + 1)
