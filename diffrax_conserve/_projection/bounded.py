@@ -275,7 +275,7 @@ def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
 
         _, at_candidate = linearise(equations.residual, equations.candidate)
         t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, (given,), (t_given,)))
-        gram_solver = equations.gram_solver(at_y, at_candidate, weights=active)
+        gram_solver = at_y.derivative_solver(active, at_candidate)
         t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
         t_y = tree_add(t_y, tree_mul(at_candidate.pullback(t_multiplier), active))
     else:

@@ -61,7 +61,8 @@ class Equations(eqx.Module):
         damping: Array | float = 0.0,
         weights: Y | None = None,
     ) -> GramSolver:
-        """Solves with `G M⁻¹ Hᵀ`; see `AbstractJacobian.gram_solver`."""
+        """Solves with `G M⁻¹ Hᵀ`; see `AbstractJacobian.gram_solver`. With a `linear_solver` these
+        are approximate, which the next iteration corrects."""
         weights = self.weights if weights is None else weights
         if self.linear_solver is None:
             return jacobian.gram_solver(weights, other, damping)

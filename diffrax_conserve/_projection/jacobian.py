@@ -54,6 +54,10 @@ class AbstractJacobian(eqx.Module):
         added.
         """
 
+    def derivative_solver(self, weights: Y, other: Any) -> GramSolver:
+        """`gram_solver(weights, other)`, for derivatives: with NaN where it is not accurate."""
+        return self.gram_solver(weights, other)
+
     @abc.abstractmethod
     def unit_rows(self) -> tuple["AbstractJacobian", Vector]:
         """The Jacobian with each row divided by its largest element, and these divisors; unchanged
@@ -266,6 +270,25 @@ class MatrixFree(AbstractJacobian):
     def sines(self, weights: Y) -> None:
         del weights
 
+    def _product(self, x: Vector, weights: Y, other: "MatrixFree") -> Vector:
+        return self.forward(tree_mul(other.backward(x), weights))
+
+    def derivative_solver(self, weights: Y, other: Any) -> GramSolver:
+        approximate = self.gram_solver(weights)
+
+        def checked(product: Callable[[Vector], Vector], b: Vector) -> Vector:
+            x = _corrected(approximate.solve, product, b)
+            tolerance = jnp.sqrt(jnp.finfo(b.dtype).eps) * tree_max(b)
+            return jnp.where(tree_max(b - product(x)) <= tolerance, x, jnp.nan)
+
+        def product(x: Vector) -> Vector:
+            return self._product(x, weights, other)
+
+        def solve(b: Vector) -> Vector:
+            return lax.custom_linear_solve(product, b, checked, checked)
+
+        return GramSolver(solve, approximate.rank)
+
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
     ) -> GramSolver:
@@ -286,11 +309,7 @@ class MatrixFree(AbstractJacobian):
             return lx.linear_solve(operator, b, solver, options=options, throw=False).value
 
         def corrected(b: Vector) -> Vector:
-            x = solve(b)
-            for _ in range(_CORRECTIONS):
-                product = self.forward(tree_mul(other.backward(x), weights))
-                x = x + solve(b - product)
-            return x
+            return _corrected(solve, lambda x: self._product(x, weights, other), b)
 
         return GramSolver(solve if other is None else corrected, jnp.asarray(diagonal.size))
 
@@ -303,8 +322,11 @@ def lineax_solver(
     damping: Real[Array, ""] | float = 0.0,
 ) -> GramSolver:
     """As `jacobian.gram_solver`, by a solver of lineax for positive semi-definite operators."""
+    if other is jacobian:
+        other = None
+    if other is not None and not isinstance(jacobian, MatrixFree):
+        return jacobian.gram_solver(weights, other, damping)  # not symmetric
     rows, row_sizes = jacobian.unit_rows()
-    same = other is None or other is jacobian
     columns, column_sizes = (rows, row_sizes) if other is None else other.unit_rows()
     diagonal = jtu.tree_map(jnp.square, rows.scale(jtu.tree_map(jnp.sqrt, weights)))
 
@@ -315,7 +337,7 @@ def lineax_solver(
     struct = jax.eval_shape(lambda: diagonal)
     operator = lx.FunctionLinearOperator(product, struct, lx.positive_semidefinite_tag)
 
-    def solve_scaled(_: Any, b: Vector) -> Vector:
+    def solve(b: Vector) -> Vector:
         # An absolute tolerance is relative to `b`, and zero is solved by zero.
         size = tree_max(b)
         found = jnp.where((size > 0) & (size < jnp.inf), size, 1)
@@ -323,19 +345,22 @@ def lineax_solver(
         x = lx.linear_solve(operator, unit, linear_solver, throw=False).value
         return jtu.tree_map(lambda x: jnp.where(size == 0, 0, x * found), x)
 
-    def solve(b: Vector) -> Vector:
-        return lax.custom_linear_solve(product, b, solve_scaled, symmetric=True)
-
     def corrected(b: Vector) -> Vector:
-        x = solve(b)
-        for _ in range(_CORRECTIONS):
-            left = jtu.tree_map(jnp.subtract, b, product(x, columns))
-            x = jtu.tree_map(jnp.add, x, solve(left))
-        return x
+        return _corrected(solve, lambda x: product(x, columns), b)
 
     rank = jacobian.gram_solver(weights).rank
-    solver = GramSolver(solve if same else corrected, rank)
-    return solver.scaled(row_sizes, column_sizes)
+    return GramSolver(solve if other is None else corrected, rank).scaled(row_sizes, column_sizes)
+
+
+def _corrected(
+    solve: Callable[[Vector], Vector], product: Callable[[Vector], Vector], b: Vector
+) -> Vector:
+    """The solution of `product(x) = b`, if `solve` solves with a similar matrix."""
+    x = solve(b)
+    for _ in range(_CORRECTIONS):
+        left = jtu.tree_map(jnp.subtract, b, product(x))
+        x = jtu.tree_map(jnp.add, x, solve(left))
+    return x
 
 
 def estimated_norms(linear: Callable[[Y], Vector], weights: Y) -> Vector:

@@ -43,7 +43,8 @@ def continue_if_any(
 
     @jax.custom_batching.custom_vmap
     def alone(flag, state, arrays):
-        return lax.cond(flag, lambda: lane(flag, state, arrays), lambda: state)
+        # Not `flag`: XLA may compute it twice with different rounding, for the branch and for `fn`.
+        return lax.cond(flag, lambda: lane(jnp.asarray(True), state, arrays), lambda: state)
 
     @alone.def_vmap
     def batched(size, axes, flag, state, arrays):

@@ -294,7 +294,7 @@ def _project_jvp(primals, tangents, *, max_steps):
     t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, moving(equations), moving(t_equations)))
     _, at_candidate = linearise(equations.residual, equations.candidate)
     _, at_y = linearise(equations.residual, y)
-    gram_solver = equations.gram_solver(at_y, at_candidate)
+    gram_solver = at_y.derivative_solver(equations.weights, at_candidate)
     t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
     t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
     # The derivative of a failed projection is not used: its step is rejected, or ends the solve.

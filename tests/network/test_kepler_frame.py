@@ -173,3 +173,38 @@ def test_a_hundred_projected_steps_against_keplers_equation():
     error = distances([x[:, -1] for x in solve(y0s)], ellipses(**after, **place))
     assert np.median(error) < 1e-4
     assert np.max(error) < 1e-3
+
+
+def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
+    """Small orbits can start inside and be too fast a quarter later."""
+    rng = np.random.default_rng(3)
+    elements = {
+        "a": np.exp(rng.uniform(np.log(0.05), np.log(20), 4000)),
+        "e": rng.uniform(0, 0.65, 4000),
+        "anomaly": rng.uniform(0, 2 * np.pi, 4000),
+    }
+    y0s = arrays(ellipses(**elements))
+    after = elements | {"anomaly": anomaly_after(0.5, **elements)}
+    network = dfc.load_pretrained("kepler")
+
+    @jax.jit
+    @jax.vmap
+    def step(y):
+        return network(y, 0.5), network.domain.contains(y), network.inside(y, 0.5)
+
+    y1s, starts, stays = step(y0s)
+    error = distances(y1s, ellipses(**after)) / np.maximum(elements["a"], 1)
+    left = np.asarray(starts & ~stays)
+    assert left.sum() > 100
+    assert np.max(error[left]) > 1  # and without that it would be wrong
+    assert np.max(error[np.asarray(stays)]) < 1e-4
+
+    y0 = jax.tree.map(lambda x: x[np.argmax(np.where(left, error, 0))], y0s)
+    system = dfc.systems.Kepler()
+    solver = dfc.DeepONetSolver(network, outside=dfc.learned.Refuse())
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field), solver, 0.0, 0.5, 0.5, y0,
+        saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False,
+    )  # fmt: skip
+    assert sol.result != dfx.RESULTS.successful
+    assert dfc.learned.domain_statistics(sol).num_outside == 1

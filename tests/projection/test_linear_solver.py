@@ -68,6 +68,44 @@ def test_many_constraints(count):
         agree(chained(count), y0, y0 + offset, dfc.SimplifiedNewton, solver)
 
 
+@pytest.mark.parametrize("linear_solver", [None, lx.Cholesky(), lx.CG(0.5, 0.5)])
+def test_the_derivative_far_from_the_manifold(linear_solver):
+    """Where the two Jacobians of the implicit function theorem are not alike."""
+
+    def g(t, y, args):
+        return jnp.stack([y[0] ** 4 + 2 * y[1] ** 2 + y[2] ** 2 * y[1] - 1, y[2] - y[0] * y[1]])
+
+    projection = dfc.SimplifiedNewton(linear_solver=linear_solver)
+    project = jax.jit(lambda x: dfc.project(dfc.Constraint(g), x, projection=projection))
+    x, v, h = jnp.array([1.27614744, 0.97407117, 0.56399029]), jnp.array([1.0, 0.3, 0.0]), 1e-4
+    assert project(x)[1].ok
+    near, far = (project(x + s * v)[0] - project(x - s * v)[0] for s in (h, 2 * h))
+    _, slope = jax.jvp(lambda x: project(x)[0], (x,), (v,))
+    np.testing.assert_allclose(slope, (8 * near - far) / (12 * h), atol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1e-4, 1e-2, 0.1, 0.3])
+def test_the_derivative_with_many_constraints_is_right_or_nan(distance):
+    y0, offset = candidate(150)
+    manifold, x = chained(150), y0 + distance * 1e3 * offset
+    value = manifold.fn(0.0, y0, None)
+    v = jnp.cos(jnp.arange(151.0))
+
+    @jax.jit
+    def project(x):
+        return dfc.project(manifold, x, value=value)
+
+    _, info = project(x)
+    near, far = (project(x + s * v)[0] - project(x - s * v)[0] for s in (1e-5, 2e-5))
+    _, slope = jax.jvp(lambda x: project(x)[0], (x,), (v,))
+    (pulled,) = jax.vjp(lambda x: project(x)[0], x)[1](v)
+    if info.ok and jnp.all(jnp.isfinite(slope)):
+        np.testing.assert_allclose(slope, (8 * near - far) / 12e-5, atol=1e-7)
+        np.testing.assert_allclose(v @ pulled, v @ slope, rtol=1e-7)
+    if distance < 1e-3:
+        assert jnp.all(jnp.isfinite(slope))
+
+
 def test_with_bounds_and_a_metric():
     y0, offset = candidate(3)
     agree(chained(3), y0, y0 + offset, dfc.SimplifiedNewton, lx.Cholesky(), lower=0.95, metric=2.0)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_shapes
@@ -55,6 +55,12 @@ class AbstractFlowMap(AbstractTrainable):
     @abc.abstractmethod
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         """A rate of change of the solution through `y0`, in the units of the loss."""
+
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        """Whether the step from `y0` is within the domain. For a single network: whether `y0`
+        is."""
+        del step
+        return jnp.asarray(True if self.domain is None else self.domain.contains(y0))
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
         """The differences of states, in the units in which states are compared with data."""

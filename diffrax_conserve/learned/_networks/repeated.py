@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike, Y
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
@@ -60,6 +60,19 @@ class Repeated(AbstractFlowMap):
 
         return lax.scan(once, y0, length=self.count)[0]
 
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        """Whether every inner step is within the domain."""
+        *args, h = step
+        each = jnp.asarray(h) / self.count
+
+        def once(carry: tuple[Y, Array], _: None) -> tuple[tuple[Y, Array], None]:
+            y, inside = carry
+            inside = inside & self.flow_map.inside(y, *args, each)
+            return (self.flow_map(y, *args, each), inside), None
+
+        start = jtu.tree_map(jnp.asarray, y0), jnp.asarray(True)
+        return lax.scan(once, start, length=self.count)[0][1]
+
     @property
     def max_step(self) -> RealScalarLike:
         """The longest step."""
@@ -72,8 +85,7 @@ class Repeated(AbstractFlowMap):
 
     @property
     def domain(self) -> Any:
-        """The domain of the inner flow map, or `None`. Only the start of the whole step is
-        tested."""
+        """The domain of the inner flow map, or `None`."""
         return self.flow_map.domain
 
     @property

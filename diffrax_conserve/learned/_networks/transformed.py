@@ -171,6 +171,9 @@ class Transformed(AbstractFlowMap):
     def layer(self) -> None:
         """`None`, because the manifold of an inner layer is in other coordinates."""
 
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        return self.flow_map.inside(self.transformation(y0), *step)
+
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
         return flatten(jax.jvp(self.transformation, (y0,), (unflatten(rate, y0),))[1])
 

@@ -66,6 +66,11 @@ class AtArgs(_AbstractOfFamily):
         """The state a time `h` after the state `y0`, with `step` = `h`."""
         return self.flow_map(y0, self.args, *step, schedule=schedule)
 
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        known = args_domain_of(self.flow_map)
+        assert known is not None
+        return known.contains(self.args) & self.flow_map.inside(y0, self.args, *step)
+
     @property
     def domain(self) -> "ArgsDomain":
         """The domain of the family, which contains no state if `args` are outside their domain."""

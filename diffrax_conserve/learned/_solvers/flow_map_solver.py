@@ -198,7 +198,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         h = refuse_backwards(jnp.asarray(t1 - t0), terms, flow_map.max_step)
         step = self._learned(flow_map, h, y0, increment(terms, t0, t1, y0, args))
         if self.outside is not None and solver_state is not None:
-            inside = _inside(flow_map.domain, y0)
+            inside = flow_map.inside(y0, h)
             accurate = self._accurate(step.error)
             solver_state = solver_state.add(t0, inside & accurate)
             inputs = StepInputs(terms, t0, t1, y0, args)
@@ -238,10 +238,6 @@ def _path(flow_map: AbstractFlowMap, nodes: int, h: Array, y0: Y) -> Path:
 
     rows = jax.vmap(state)(fractions(nodes, h.dtype)[1:])
     return jnp.concatenate([start[None], rows])
-
-
-def _inside(domain: Any, y0: Y) -> Array:
-    return jnp.asarray(True if domain is None else domain.contains(y0))
 
 
 FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
