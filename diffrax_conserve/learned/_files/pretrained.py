@@ -35,8 +35,8 @@ def load_pretrained(name: str) -> PINN | DeepONet | Transformed | Repeated:
     For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
     trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
     trained by [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of
-    eccentricities up to 0.6, for steps of up to 0.5; `pollu` and `robertson` are flow maps of stiff
-    chemistry.
+    eccentricities up to 0.6 and semi-major axes from 0.8, for steps of up to 0.5; `pollu` and
+    `robertson` are flow maps of stiff chemistry.
     [`diffrax_conserve.learned.read_info`][] returns the command that made the network and its
     measured errors.
 
