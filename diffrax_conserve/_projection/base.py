@@ -29,7 +29,7 @@ class ProjectionInfo(eqx.Module):
 
     - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
         residual is within its tolerance at the state that is returned.
-    - `num_steps`: the number of iterations.
+    - `num_steps`: the number of iterations (of `Newton`: of both phases).
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint at the projected state,
         $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
