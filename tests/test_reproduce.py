@@ -16,7 +16,7 @@ import pytest
 import diffrax_conserve as dfc
 from diffrax_conserve.__main__ import main
 from diffrax_conserve._replace_file import replace_file
-from diffrax_conserve.reproduce import _compare, _job
+from diffrax_conserve.reproduce import _compare, _job, _tables
 from diffrax_conserve.reproduce import _trained as _learned
 
 FIGURES = ("trajectory", "drift", "state_error")
@@ -405,3 +405,12 @@ def test_a_state_that_blows_up(tmp_path):
     status, metrics = reproduce(tmp_path, "henon-heiles", "--t1", "400", "--dt", "4")
     assert status == 1
     assert "not finite" in metrics["solvers"]["rk4"]["failure"]
+
+
+def test_the_lines_between_the_steps_are_those_of_the_solution():
+    system = dfc.systems.get("rigid-body")
+    ts = np.linspace(0, system.t1, 36)
+    (path,) = _tables._line(system, ts, system.reference(ts)).values()
+    fine = np.linspace(0, system.t1, len(path))
+    np.testing.assert_allclose(path, system.reference(fine), atol=1e-4)
+    np.testing.assert_allclose(path[:: _tables._POINTS], system.reference(ts), atol=1e-13)

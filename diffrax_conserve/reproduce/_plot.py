@@ -137,15 +137,28 @@ def error_of_training(
         return figure
 
 
+def _in_space(paths: dict[str, _Curves], axis_labels: tuple[str, ...]) -> bool:
+    """Whether the trajectory is drawn in three dimensions: a single curve in space. Several are
+    drawn by their first two coordinates."""
+    return len(axis_labels) == 3 and len(next(iter(paths.values()))) == 1
+
+
+def shows_lines(paths: dict[str, _Curves], axis_labels: tuple[str, ...]) -> bool:
+    """Whether the lines of the solvers can be told apart: in space, and not too long."""
+    return _in_space(paths, axis_labels) and not any(_is_long(c) for c in paths.values())
+
+
 def trajectory(
-    paths: dict[str, _Curves], reference: _Curves | None, axis_labels: tuple[str, ...]
+    paths: dict[str, _Curves],
+    lines: dict[str, _Curves],
+    reference: _Curves | None,
+    axis_labels: tuple[str, ...],
 ) -> Figure:
-    """One panel for each part of the system: the reference, and the last steps of each solver."""
+    """One panel for each part of the system: the reference, and the last steps of each solver, with
+    `lines` between them if there are any."""
     with mpl.rc_context(_STYLE):
         parts = list(next(iter(paths.values())))
-        # A single curve in space is drawn in three dimensions, several by their first two
-        # coordinates.
-        solid = len(axis_labels) == 3 and len(parts) == 1
+        solid = _in_space(paths, axis_labels)
         labels = axis_labels if solid else axis_labels[:2]
         columns = min(len(parts), 3)
         rows = -(-len(parts) // columns)
@@ -157,6 +170,8 @@ def trajectory(
         for ax, part in zip(panels.flat, parts, strict=False):
             path = None if reference is None else reference[part]
             _draw_paths(ax, {name: curves[part] for name, curves in paths.items()}, path, labels)
+            for name, curves in lines.items():
+                ax.plot(*curves[part].T, color=_colour(name, paths), linewidth=0.6)
             if len(parts) > 1:
                 ax.set_title(part)
         for ax in panels.flat[len(parts) :]:

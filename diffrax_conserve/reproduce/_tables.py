@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from .. import __version__
 from ..systems import AbstractSystem
@@ -150,7 +151,10 @@ def figures(
         }
         for integral in system.manifold
     }
-    out["trajectory"] = plot.trajectory(paths, reference, system.axes)
+    lines = {}
+    if plot.shows_lines(paths, system.axes):
+        lines = {name: _line(system, run.ts, take(run.ys, 0)) for name, run in succeeded.items()}
+    out["trajectory"] = plot.trajectory(paths, lines, reference, system.axes)
     out["drift"] = plot.drift(times, drifts, time_unit)
     if comparison.errors:
         errors = {name: np.median(values, axis=0)[1:] for name, values in comparison.errors.items()}
@@ -161,3 +165,15 @@ def figures(
 def _paths(system: AbstractSystem, ys: Any) -> dict[str, np.ndarray]:
     paths = system.trajectories(jtu.tree_map(jnp.asarray, ys))
     return {name: np.asarray(path) for name, path in paths.items()}
+
+
+# The number of points that are drawn for each step.
+_POINTS = 8
+
+
+def _line(system: AbstractSystem, ts: np.ndarray, ys: Any) -> dict[str, np.ndarray]:
+    """The path between the steps too, by cubic Hermite interpolation."""
+    slopes = jax.vmap(lambda t, y: system.vector_field(t, y, system.args))(jnp.asarray(ts), ys)
+    fine = np.linspace(ts[0], ts[-1], _POINTS * (len(ts) - 1) + 1)
+    states = jtu.tree_map(lambda y, f: CubicHermiteSpline(ts, y, f)(fine), ys, slopes)
+    return _paths(system, states)
