@@ -1,7 +1,7 @@
 """Other programs that solve the same equations, for work_precision.py: scipy, homproj, heyoka and
 CVODE. None of them takes functions of jax, so the equations stand here once more, in Python.
 
-homproj and heyoka are optional: `pip install '.[peers]'`. CVODE needs a C compiler and the headers
+homproj and heyoka are optional: `pip install '.[bench]'`. CVODE needs a C compiler and the headers
 of SUNDIALS (Debian: libsundials-dev). What is not there is left out, and named by `missing`.
 """
 
