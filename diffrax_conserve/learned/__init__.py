@@ -23,6 +23,7 @@ from ._networks import Repeated as Repeated
 from ._networks import Scale as Scale
 from ._networks import Taylor as Taylor
 from ._networks import Transformed as Transformed
+from ._networks import single_precision as single_precision
 from ._solvers import AbstractPolicy as AbstractPolicy
 from ._solvers import AbstractSweep as AbstractSweep
 from ._solvers import DeepONetSolver as DeepONetSolver

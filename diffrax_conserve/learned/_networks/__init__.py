@@ -20,6 +20,7 @@ from .mlp import fresh as fresh
 from .mlp import initial_slope as initial_slope
 from .pinn import PINN as PINN
 from .pinn import Window as Window
+from .precision import single_precision as single_precision
 from .repeated import Repeated as Repeated
 from .taylor import Taylor as Taylor
 from .trainable import AbstractTrainable as AbstractTrainable

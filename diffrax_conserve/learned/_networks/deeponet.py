@@ -182,7 +182,9 @@ class DeepONet(AbstractFlowMap):
         fraction: Float[Array, ""],
     ) -> Float[Array, " m"]:
         inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
-        return self.core(inputs, 2 * fraction - 1 if self.normalise else step)
+        own = self.core.output_layer().biases[-1].dtype
+        time = 2 * fraction - 1 if self.normalise else step
+        return self.core(inputs.astype(own), time.astype(own)).astype(inputs.dtype)
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

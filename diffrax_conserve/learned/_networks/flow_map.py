@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import tree_shapes
+from ..._tree import tree_shapes, working_dtype
 from .domain import Box
 from .flat import stacked_vectors
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
@@ -61,6 +61,11 @@ class AbstractFlowMap(AbstractTrainable):
         is."""
         del step
         return jnp.asarray(True if self.domain is None else self.domain.contains(y0))
+
+    def slope(self, y0: Y, *args: Args) -> Y:
+        """The time derivative for `h = 0`."""
+        zero = jnp.zeros((), working_dtype(y0))
+        return jax.jvp(lambda h: self(y0, *args, h), (zero,), (jnp.ones_like(zero),))[1]
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
         """The differences of states, in the units in which states are compared with data."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 Activation = Callable[[Array], Array]
 
+
 # Names, by which a file refers to an activation function.
 ACTIVATIONS: dict[str, Activation] = {
     "tanh": jnp.tanh,
@@ -82,9 +83,14 @@ class MLP(eqx.Module):
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
-            x = self.activation(x @ weight + bias)
+            x = self.activation(_product(x, weight) + bias)
         weight, bias = last
-        return x @ weight + bias
+        return _product(x, weight) + bias
+
+
+def _product(x: Float[Array, "*batch in"], weight: Float[Array, "in out"]) -> Array:
+    # By default GPUs round the factors of products in float32 to three digits.
+    return jnp.matmul(x, weight, precision=jax.lax.Precision.HIGHEST)
 
 
 def initial_slope(net: MLP) -> float | None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
-from ..._custom_types import RealScalarLike, Y
+from ..._custom_types import Args, RealScalarLike, Y
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .mlp import check_sizes
 from .trainable import LayerSchedule
@@ -72,6 +72,9 @@ class Repeated(AbstractFlowMap):
 
         start = jtu.tree_map(jnp.asarray, y0), jnp.asarray(True)
         return lax.scan(once, start, length=self.count)[0][1]
+
+    def slope(self, y0: Y, *args: Args) -> Y:
+        return self.flow_map.slope(y0, *args)
 
     @property
     def max_step(self) -> RealScalarLike:

@@ -66,6 +66,9 @@ class AtArgs(_AbstractOfFamily):
         """The state a time `h` after the state `y0`, with `step` = `h`."""
         return self.flow_map(y0, self.args, *step, schedule=schedule)
 
+    def slope(self, y0: Y, *args: Args) -> Y:
+        return self.flow_map.slope(y0, self.args, *args)
+
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
         known = args_domain_of(self.flow_map)
         assert known is not None

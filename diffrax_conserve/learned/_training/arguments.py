@@ -83,10 +83,24 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
         )
+    _check_precision(as_flow_map(model))
     if sample is None and data is None:
         raise ValueError(
             "A flow map is trained on many initial states: pass `sample`, a function from a random "
             "key to one of them, for example `sample=system.sample`."
+        )
+
+
+def _check_precision(flow_map: AbstractFlowMap) -> None:
+    """Raises for weights in float32 beside arrays in float64."""
+    weights, arrays = (
+        {x.dtype.name for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)}
+        for tree in (flow_map.weights(), flow_map)
+    )
+    if "float32" in weights and "float64" in arrays:
+        raise TypeError(
+            "The weights of the model are float32, but its states are float64. Train it in double "
+            "precision, and pass the result to `diffrax_conserve.learned.single_precision`."
         )
 
 
