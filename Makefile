@@ -98,7 +98,7 @@ COSTS := overhead gradients work_precision scaling unlike_lanes devices balance 
   random_features
 TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures chemistry worth \
   parameters
-STUDIES := first_same_as_last max_correction project_error claims
+STUDIES := first_same_as_last max_correction project_error claims long_run
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done

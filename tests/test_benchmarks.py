@@ -375,6 +375,23 @@ def test_a_smoke_run_of_the_balances():
     assert all(row["kept"] <= 1.2 * row["plain"] for row in found["entropy"])
 
 
+# ---- A hundred million steps ----
+
+
+def test_the_drift_is_flat():
+    """Of a short run, and of the recorded one, whose table is in the documentation."""
+    run = benchmark("long_run")
+    recorded = json.loads(run.RESULTS.read_text())
+    for row in run.measure(10**3) + recorded:
+        eps = float(np.finfo(row["dtype"]).eps)
+        if row["solver"] == "projected":
+            assert max(row["drift"].values()) < 4 * eps
+        else:
+            assert row["drift"]["1e+03"] > 20 * eps
+    page = (FOLDER.parent / "docs" / "appendix" / "performance.md").read_text(encoding="utf-8")
+    assert run.table(recorded) in page
+
+
 # ---- What a learned step is worth ----
 
 

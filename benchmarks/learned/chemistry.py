@@ -12,6 +12,11 @@ concentration is negative. The times of the solves are such that steps of many l
 them. The training is in float32, and what it finds is made float64.
 """
 
+import os
+
+# The factorisations of the optimiser are many times slower with threads of OpenBLAS beside XLA's.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import argparse
 import dataclasses
 import json
