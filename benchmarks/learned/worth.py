@@ -5,8 +5,9 @@
     python benchmarks/learned/worth.py --smoke    # toy sizes, to see that it runs
 
 A pendulum, q'' = -sin q + g(q, q') with g of growing cost: nothing, a neural network of width 32 or
-128 with two hidden layers, a quadrature of 64 points, or an inner solve, ten iterations for a
-fixed point. For each of these a flow map is trained from the vector field, all by the same recipe.
+128 with two hidden layers, also in float32, a quadrature of 64 points, or an inner solve, ten
+iterations for a fixed point. For each of these a flow map is trained from the vector field, all by
+the same recipe, and evaluated in float32.
 
 A classical method takes the step in so many equal pieces that the root mean square of its error is
 that of the flow map. That number is not rounded: it is interpolated between whole ones, in
@@ -46,15 +47,17 @@ PIECES = {"RK4": (1, 2, 3, 4, 6, 8), "Tsit5": (1, 2, 3, 4), "Dopri8": (1, 2)}
 # ---- The vector fields ----
 
 
-def neural(width):
+def neural(width, dtype=jnp.float64):
     keys = jr.split(jr.key(width), 3)
     shapes = [(2, width), (width, width), (width, 1)]
     weights = [jr.normal(k, s) / s[0] ** 0.5 for k, s in zip(keys, shapes, strict=True)]
+    weights = [w.astype(dtype) for w in weights]
 
     def force(y):
+        x = y.astype(dtype)
         for w in weights[:-1]:
-            y = jnp.tanh(y @ w)
-        return 0.2 * (y @ weights[-1])[0]
+            x = jnp.tanh(x @ w)
+        return 0.2 * (x @ weights[-1])[0].astype(y.dtype)
 
     return force
 
@@ -76,6 +79,7 @@ FORCES = {
     "inner solve": inner_solve,
     "neural 32": neural(32),
     "quadrature": quadrature,
+    "neural 128, float32": neural(128, jnp.float32),
     "neural 128": neural(128),
 }
 
@@ -169,6 +173,7 @@ def around(errors, error):
 def measure(name, epochs, batches, count, seconds):
     field = field_of(FORCES[name])
     network, log = train(field, epochs)
+    network = dfc.learned.single_precision(network)
     y0s = jax.vmap(sample)(jr.split(jr.key(9), count))
     exact = jax.jit(jax.vmap(in_pieces(piece_of(dfx.Dopri8(), field), 20)))(y0s)
     steps = {("learned", 1): lambda y: network(y, jnp.asarray(STEP))}

@@ -126,6 +126,7 @@ class Spec:
     repeats: int = 1  # learned steps in one
     natural: bool = False  # of the double pendulum: trained in a gravity of 1, and scaled
     polish: int = 0  # updates by Levenberg-Marquardt in the end
+    single: bool = False  # evaluated in float32
 
 
 SPECS = {
@@ -141,6 +142,7 @@ SPECS = {
         duration=10.0,
         repeats=4,
         natural=True,
+        single=True,
     ),
     "point-vortices": Spec(
         width=32,
@@ -167,6 +169,7 @@ SPECS = {
         extremes=extreme_orbits,
         frame=True,
         repeats=4,
+        single=True,
     ),
 }
 SMOKE = {
@@ -250,6 +253,8 @@ def train_flow_map(system, spec, seed, key):
     network = scaled(network, own) if spec.natural else network
     if spec.extremes is not None:
         network = reaching(network, spec.extremes())
+    if spec.single:
+        network = dfc.learned.single_precision(network)
     return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
 
 

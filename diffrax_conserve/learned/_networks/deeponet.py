@@ -182,14 +182,19 @@ class DeepONet(AbstractFlowMap):
         fraction: Float[Array, ""],
     ) -> Float[Array, " m"]:
         inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
-        own = self.core.output_layer().biases[-1].dtype
         time = 2 * fraction - 1 if self.normalise else step
-        return self.core(inputs.astype(own), time.astype(own)).astype(inputs.dtype)
+        output = self.core(inputs.astype(self.precision), time.astype(self.precision))
+        return output.astype(inputs.dtype)
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The order for all values of the weights, which is that of the Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
+
+    @property
+    def precision(self) -> jnp.dtype:
+        """The dtype of the weights, in which the network is evaluated."""
+        return self.core.output_layer().biases[-1].dtype
 
     @property
     def state(self) -> Y:

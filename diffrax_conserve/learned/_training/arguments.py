@@ -16,7 +16,15 @@ from ..._manifold import check_manifold, check_outputs
 from ..._options import check_number
 from ..._projection import check_state
 from ..._tree import tree_shapes
-from .._networks import PINN, AbstractFlowMap, AbstractTrainable, Points, as_flow_map, has_arrays
+from .._networks import (
+    PINN,
+    AbstractFlowMap,
+    AbstractTrainable,
+    DeepONet,
+    Points,
+    as_flow_map,
+    has_arrays,
+)
 from .._networks.flat import stacked_vectors
 from .._solvers import check_output
 from .defect import VectorField
@@ -83,7 +91,7 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
         )
-    _check_precision(as_flow_map(model))
+    _check_precision(model)
     if sample is None and data is None:
         raise ValueError(
             "A flow map is trained on many initial states: pass `sample`, a function from a random "
@@ -91,13 +99,11 @@ def check_arguments(model: Any, sample: Any, data: Any, manifold: Manifold | Non
         )
 
 
-def _check_precision(flow_map: AbstractFlowMap) -> None:
-    """Raises for weights in float32 beside arrays in float64."""
-    weights, arrays = (
-        {x.dtype.name for x in jtu.tree_leaves(tree) if eqx.is_inexact_array(x)}
-        for tree in (flow_map.weights(), flow_map)
-    )
-    if "float32" in weights and "float64" in arrays:
+def _check_precision(model: Any) -> None:
+    """Raises for a network that is evaluated in a lower precision than its states have."""
+    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
+    networks = filter(is_network, jtu.tree_leaves(model, is_leaf=is_network))
+    if any(network.precision != network.scale.dtype for network in networks):
         raise TypeError(
             "The weights of the model are float32, but its states are float64. Train it in double "
             "precision, and pass the result to `diffrax_conserve.learned.single_precision`."
