@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 # Most of the time goes into compilation, which takes a fifth as long with XLA's older emitters and
-# without LLVM's optimisations. Of what then remains, a third goes into what XLA does to the loops of
-# a solve, and into pieces for several threads, of which a worker has one.
-# `make examples` has those, and `make slow` compiles as users do.
+# without LLVM's optimisations. A third of the rest goes into what XLA does to the loops of a solve,
+# and into pieces for several threads. `make examples` has all that but the newer emitters, and
+# `make slow` compiles as users do.
 QUICKLY_COMPILED = (
     "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters "
     "--xla_backend_optimization_level=0 "
