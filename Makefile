@@ -55,14 +55,17 @@ demo: $(PLOTS) ## reproduce two of the paper's examples into out/
 	$(BIN)/python -m diffrax_conserve reproduce rigid-body --out out/rigid-body
 	$(BIN)/python -m diffrax_conserve reproduce kepler --out out/kepler
 
+# Neighbours, which share fixtures and compiled functions, mostly run in one worker.
+SHARED := -n $(WORKERS) --dist worksteal
+
 test: $(TEST) ## run the tests, without the slow ones
-	$(BIN)/python -m pytest -n $(WORKERS) -m "not slow and not examples"
+	$(BIN)/python -m pytest $(SHARED) -m "not slow and not examples"
 
 # ---- What a developer runs ----
 
 slow: export XLA_FLAGS ?=
 slow: $(TEST) ## run the slow tests
-	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+	$(BIN)/python -m pytest $(SHARED) -m slow
 
 COUNT ?= 10000
 SEED ?= 0
@@ -91,7 +94,7 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
 examples: export XLA_FLAGS ?= --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters
 examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
-	$(BIN)/python -m pytest -n $(WORKERS) -qq -m examples tests/test_docs.py
+	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
 COSTS := overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
@@ -112,10 +115,12 @@ bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and j
 bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
-# At toy sizes nearly all of it is compilation, which takes half as long with XLA's older emitters.
-bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters
+# At toy sizes nearly all of it is compilation, so it is compiled as in the tests. `make test` runs and
+# judges the smoke runs of TESTED.
+TESTED := balance learned_solvers sweeps
+bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the tests run those of learned/
-	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
+	printf '%s\n' $(patsubst %,cost/%,$(filter-out $(TESTED),$(COSTS))) cost/many_constraints $(STUDIES:%=studies/%) \
 	  learned/chemistry learned/equal_cost \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py

@@ -7,6 +7,7 @@ import itertools
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 from beartype.door import is_bearable
@@ -14,10 +15,14 @@ from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 # Most of the time goes into compilation, which takes a fifth as long with XLA's older emitters and
-# without LLVM's optimisations. `make examples` has those, and `make slow` compiles as users do.
+# without LLVM's optimisations. A third of the rest goes into what XLA does to the loops of a solve,
+# and into pieces for several threads. `make examples` has all that but the newer emitters, and
+# `make slow` compiles as users do.
 QUICKLY_COMPILED = (
     "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters "
-    "--xla_backend_optimization_level=0"
+    "--xla_backend_optimization_level=0 "
+    "--xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
 )
 os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)
 jax.config.update("jax_enable_x64", True)
@@ -26,10 +31,11 @@ jax.config.update("jax_enable_x64", True)
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
 CACHE_BYTES_MAX = 2**30
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+# To compile even one operation takes twice as long as to read it.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # The interpreters that tests start share it.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 # Before the first import of the package: its annotations are then checked at every call.
 install_import_hook("diffrax_conserve", "beartype.beartype")
@@ -50,6 +56,26 @@ def _checked_by_beartype(accepts):
 # time of tracing. `test_typeguards.py` holds that leaves are checked as before.
 with contextlib.suppress(ImportError):
     importlib.import_module("jaxtyping._typeguard").typechecked = _checked_by_beartype
+
+
+def _only_what_is_returned(make):
+    """In place of jaxtyping's `_make_fn_with_signature`, for what checks a call after its return.
+
+    It checks the arguments once more, though their shapes are still known from the check before.
+    """
+
+    def made(name, qualname, module, signature, output):
+        if output:
+            unchecked = [p.replace(annotation=Any) for p in signature.parameters.values()]
+            signature = signature.replace(parameters=unchecked)
+        return make(name, qualname, module, signature, output)
+
+    return made
+
+
+with contextlib.suppress(ImportError, AttributeError):
+    decorator = importlib.import_module("jaxtyping._decorator")
+    decorator._make_fn_with_signature = _only_what_is_returned(decorator._make_fn_with_signature)
 
 # Tracing makes many small objects, of which few are garbage: a tenth of its time.
 gc.set_threshold(50_000, 20, 100)

@@ -131,7 +131,7 @@ def tangents(projection, e, direction):
     return orbit(solver, e, direction), exact
 
 
-@pytest.mark.parametrize("name", ["simplified", "newton"])
+@pytest.mark.parametrize("name", ["newton", pytest.param("simplified", marks=pytest.mark.slow)])
 def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
     """Of the projected solve it must be close to that of the flow: the orbit differs by 1e-7."""
     rng = np.random.default_rng(0)

@@ -200,7 +200,7 @@ def saved(system, y0, step, fractions, solver):
 
 @pytest.mark.parametrize(
     "name",
-    [n if i % 7 == 0 else pytest.param(n, marks=pytest.mark.slow) for i, n in enumerate(SYSTEMS)],
+    [n if i % 14 == 0 else pytest.param(n, marks=pytest.mark.slow) for i, n in enumerate(SYSTEMS)],
 )
 @settings(max_examples=6)
 @given(data=st.data())
@@ -219,7 +219,10 @@ def test_success_implies_that_the_solution_is_conserved(name, data):
 
 @pytest.mark.parametrize(
     ("dimension", "integrals"),
-    [(3, 2), (5, 1), *(pytest.param(*p, marks=pytest.mark.slow) for p in [(2, 1), (4, 2), (6, 2)])],
+    [
+        (3, 2),
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in [(2, 1), (5, 1), (4, 2), (6, 2)]),
+    ],
 )
 @settings(max_examples=15)
 @given(data=st.data())

@@ -11,6 +11,8 @@ from hypothesis import given, settings
 
 import diffrax_conserve as dfc
 
+from ..problems import drift_of, largest
+
 pytestmark = pytest.mark.filterwarnings("ignore:Complex dtype support")
 
 # ---- A soliton of the nonlinear Schrödinger equation ----
@@ -57,13 +59,11 @@ def soliton(solver, steps):
 @pytest.mark.parametrize("steps", [200, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_a_soliton_keeps_norm_and_energy(steps):
     sol = soliton(dfc.ManifoldProjection(dfc.RK4(), MANIFOLD), steps)
-    for drift in jax.tree.leaves(dfc.drift(sol, MANIFOLD)):
-        assert jnp.max(jnp.abs(drift)) < 4e-15
+    assert largest(drift_of(sol, MANIFOLD)) < 4e-15
     if steps == 200:
         exact = SOLITON * np.exp(0.5j * 4.0)
         assert np.max(np.abs(sol.ys[-1] - exact)) < 1e-5
-        plain = dfc.drift(soliton(dfc.RK4(), steps), MANIFOLD)
-        assert max(jnp.max(jnp.abs(x)) for x in jax.tree.leaves(plain)) > 1e-12
+        assert largest(drift_of(soliton(dfc.RK4(), steps), MANIFOLD)) > 1e-12
 
 
 def test_the_invariance_is_proved():
@@ -139,7 +139,36 @@ def solve(projection, y0=Z0, args=ARGS, vf=field, manifold=QUANTA, inner=None, *
     return dfx.diffeqsolve(dfx.ODETerm(vf), solver, 0.0, t1, dt0, y0, args, **options)
 
 
-@pytest.mark.parametrize("name", PROJECTIONS)
+@eqx.filter_jit
+def evaluated(sol, t):
+    return sol.evaluate(t)
+
+
+@eqx.filter_jit
+def in_parts_and_whole(complex_one, real_one):
+    """One projection of the same candidate, in complex and in real numbers."""
+    value = {"q": quanta(0.0, Z0, ARGS)}
+    candidate = jax.tree.map(lambda x: (1.01 + 0.02j) * x, Z0)
+    got = dfc.project({"q": QUANTA}, candidate, value=value, args=ARGS, projection=complex_one)
+    expected = dfc.project(
+        {"q": REAL_QUANTA}, split(candidate), value=value, args=ARGS, projection=real_one
+    )
+    return got, (join(expected[0]), expected[1])
+
+
+@pytest.mark.parametrize("name", [name for name in PROJECTIONS if name != "simplified"])
+def test_it_is_the_projection_in_real_and_imaginary_parts(name):
+    (got, info), (expected, real_info) = in_parts_and_whole(*PROJECTIONS[name])
+    assert info.ok
+    assert real_info.ok
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n if n == "simplified" else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS],
+)
 def test_it_is_the_solve_in_real_and_imaginary_parts(name):
     complex_one, real_one = PROJECTIONS[name]
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9), dense=True)
@@ -148,7 +177,7 @@ def test_it_is_the_solve_in_real_and_imaginary_parts(name):
     assert got.ys["z"].dtype == jnp.complex128
     for a, b in [
         (got.ys, join(expected.ys)),
-        (got.evaluate(0.37), join(expected.evaluate(0.37))),
+        (evaluated(got, 0.37), join(evaluated(expected, 0.37))),
     ]:
         for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
             np.testing.assert_allclose(x, y, rtol=1e-11)
@@ -172,36 +201,65 @@ def test_adaptive_steps_directions_and_formulas():
             saveat=dfx.SaveAt(t0=True, steps=True),
         )
         assert sol.result == dfx.RESULTS.successful
-        assert jnp.max(jnp.abs(dfc.drift(sol, number, ARGS)["q"])) < 4e-15
+        assert largest(drift_of(sol, number, ARGS)) < 4e-15
 
 
-def test_derivatives_agree_with_those_in_parts():
-    def run(vf, manifold, adjoint):
-        def end(y0, args):
-            ys = solve(SIMPLIFIED, y0, args, vf, manifold, adjoint=adjoint).ys
-            return jax.tree.map(lambda x: x[-1], ys)
+def end_of_a_solve(vf, manifold, adjoint):
+    def end(y0, args):
+        # The simplest of all solvers, as what is compared is the projection.
+        ys = solve(SIMPLIFIED, y0, args, vf, manifold, dfx.Euler(), adjoint=adjoint).ys
+        return jax.tree.map(lambda x: x[-1], ys)
 
-        return end
+    return end
 
+
+def one_projection(vf, manifold, adjoint):
+    del vf, adjoint
+
+    def projected(y, args):
+        candidate = jax.tree.map(lambda x: 1.01 * x, y)
+        value = {"q": quanta(0.0, Z0, ARGS)}
+        return dfc.project(
+            {"q": manifold}, candidate, value=value, args=args, projection=SIMPLIFIED
+        )[0]
+
+    return projected
+
+
+@pytest.mark.parametrize(
+    "run", [one_projection, pytest.param(end_of_a_solve, marks=pytest.mark.slow)]
+)
+def test_derivatives_agree_with_those_in_parts(run):
     reverse, forward = dfx.RecursiveCheckpointAdjoint(), dfx.ForwardMode()
 
     def total(y):
         z, x = y["z"], y["x"]
         return z[0].real + 2 * z[1].real + jnp.sum(z.imag**2) + x[0].real
 
-    got = jax.grad(lambda y, a: total(run(field, QUANTA, reverse)(y, a)), (0, 1))(Z0, ARGS)
-    expected = jax.grad(
-        lambda y, a: total(join(run(real_field, REAL_QUANTA, reverse)(y, a))), (0, 1)
-    )(split(Z0), ARGS)
+    @jax.jit
+    def gradients(y, args):
+        whole, parts = run(field, QUANTA, reverse), run(real_field, REAL_QUANTA, reverse)
+        return (
+            jax.grad(lambda y, a: total(whole(y, a)), (0, 1))(y, args),
+            jax.grad(lambda y, a: total(join(parts(y, a))), (0, 1))(split(y), args),
+        )
+
+    got, expected = gradients(Z0, ARGS)
     # jax's convention of the gradient by a complex number: the conjugate.
     np.testing.assert_allclose(got[0]["z"], expected[0]["re"] - 1j * expected[0]["im"], rtol=1e-10)
     np.testing.assert_allclose(got[1], expected[1], rtol=1e-10)
+
+    @jax.jit
+    def tangents(y, t):
+        _, whole = jax.jvp(lambda y: run(field, QUANTA, forward)(y, ARGS), (y,), (t,))
+        _, parts = jax.jvp(
+            lambda y: run(real_field, REAL_QUANTA, forward)(y, ARGS), (split(y),), (split(t),)
+        )
+        return whole, join(parts)
+
     t = jax.tree.map(lambda x: (0.3 + 0.7j) * x if jnp.iscomplexobj(x) else x, Z0)
-    _, along = jax.jvp(lambda y: run(field, QUANTA, forward)(y, ARGS), (Z0,), (t,))
-    _, parts = jax.jvp(
-        lambda y: run(real_field, REAL_QUANTA, forward)(y, ARGS), (split(Z0),), (split(t),)
-    )
-    np.testing.assert_allclose(along["z"], join(parts)["z"], rtol=1e-10)
+    along, parts = tangents(Z0, t)
+    np.testing.assert_allclose(along["z"], parts["z"], rtol=1e-10)
 
 
 @settings(max_examples=15)

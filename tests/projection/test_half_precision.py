@@ -8,6 +8,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from ..thinned import combinations, some_of
+
 SQUARE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
 WORK = {
     "simplified": dfc.SimplifiedNewton(),
@@ -16,7 +18,7 @@ WORK = {
     "directional": dfc.Directional(),
     "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
 }
-DTYPES = pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+DTYPES = [jnp.float16, jnp.bfloat16]
 
 
 def solve(projection, dtype):
@@ -29,8 +31,10 @@ def solve(projection, dtype):
     )
 
 
-@DTYPES
-@pytest.mark.parametrize("name", WORK)
+CASES = combinations({name: name for name in WORK}, {x.__name__: x for x in DTYPES})
+
+
+@some_of("name,dtype", CASES.values(), ids=CASES, period=2)
 def test_it_works_in_half_precision(name, dtype):
     ys = solve(WORK[name], dtype).ys
     assert ys.dtype == dtype
@@ -41,7 +45,7 @@ def test_it_works_in_half_precision(name, dtype):
     )
 
 
-@DTYPES
+@pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("projection", [dfc.Newton(), dfc.Newton(upper=2.0)])
 def test_it_is_refused_before_compilation(projection, dtype):
     with pytest.raises(TypeError, match="Convert the state to float32"):

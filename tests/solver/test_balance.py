@@ -12,6 +12,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..problems import drift_of, largest
+from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
 
@@ -83,11 +84,11 @@ ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-4)
 @pytest.mark.parametrize(
     "options",
     [
-        {},
+        pytest.param({}, marks=pytest.mark.slow),
         {"stepsize_controller": ADAPTIVE},
         {"t0": 1.0, "t1": -1.0, "dt0": -0.1},
         {"saveat": dfx.SaveAt(t0=True, ts=jnp.linspace(0.03, 1.97, 50), dense=True)},
-        {"solver": dfc.RK4(), "dt0": 0.3},
+        pytest.param({"solver": dfc.RK4(), "dt0": 0.3}, marks=pytest.mark.slow),
     ],
     ids=["fixed", "adaptive", "backwards", "between-the-steps", "rk4"],
 )
@@ -153,7 +154,12 @@ def test_the_order_survives(solver, step, order):
     )
 
 
-@pytest.mark.parametrize("balance", [BALANCE, dfc.FirstIntegral(energy, rate=power, value=0.1)])
+@some_of(
+    "balance",
+    [BALANCE, dfc.FirstIntegral(energy, rate=power, value=0.1)],
+    ids=["of-the-start", "given"],
+    period=2,
+)
 def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
     late = dfx.SaveAt(ts=jnp.array([0.5, 1.0]), dense=True)
     assert worst(solve(manifold=balance, saveat=late), balance) <= 4 * EPS
@@ -301,8 +307,11 @@ def test_mistakes_are_named():
         dct.assert_conserved(solve(), BALANCE, ARGS)
 
 
-@pytest.mark.parametrize(
-    ("solver", "step"), [(dfx.Heun(), 0.02), (dfx.Bosh3(), 0.05), (dfx.Tsit5(), 0.1)]
+@some_of(
+    "solver,step",
+    [(dfx.Heun(), 0.02), (dfx.Bosh3(), 0.05), (dfx.Tsit5(), 0.1)],
+    ids=["heun", "bosh3", "tsit5"],
+    period=3,
 )
 def test_the_dissipated_entropy_of_arkode(solver, step):
     """`u' = -e^u` with the entropy `e^u`: no worse than without, by more than a fifth."""

@@ -114,7 +114,7 @@ def test_backsolve_adjoint_explains_and_works_with_the_inner_solver():
 
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=inner\)"):
         jax.grad(final)(OMEGA0, dfx.BacksolveAdjoint())
-    got = jax.grad(final)(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
+    got = eqx.filter_jit(jax.grad(final))(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
     assert bool(jnp.all(jnp.isfinite(got)))
 
 
@@ -245,7 +245,9 @@ def test_nan_from_the_vector_field_is_no_success():
     [
         pytest.param(jax.jit, id="jit"),
         pytest.param(jax.checkpoint, id="checkpoint", marks=pytest.mark.slow),
-        pytest.param(lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[0], id="vmap"),
+        pytest.param(
+            lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[0], id="vmap", marks=pytest.mark.slow
+        ),
         pytest.param(
             lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=1)[0],
             id="scan",
@@ -296,7 +298,7 @@ def test_strict_promotion_rank_promotion_and_nan_debugging():
                 ).ys
             )
 
-        assert bool(jnp.all(jnp.isfinite(jax.grad(final)(OMEGA0))))
+        assert bool(jnp.all(jnp.isfinite(jax.jit(jax.grad(final))(OMEGA0))))
 
 
 def test_nothing_is_compiled_twice():
