@@ -20,7 +20,7 @@ _State = TypeVar("_State")
 _BLOCKS = 32
 # The reciprocal of the fraction of lanes that is finished at a time, and the least number of such
 # lanes: for fewer lanes, starting the computation costs more than the arithmetic.
-_SHARES = 8
+_SHARES = 32
 _LEAST_WIDTH = 64
 
 
