@@ -3,6 +3,7 @@
     python benchmarks/learned/equal_cost.py  # all systems; writes results/equal_cost.json
     python benchmarks/learned/equal_cost.py --system double-pendulum
     python benchmarks/learned/equal_cost.py --system double-pendulum --network FILE  # another
+    python benchmarks/learned/equal_cost.py --single  # the vector field in float32; writes nothing
     python benchmarks/learned/equal_cost.py --table  # only print the tables of the results
     python benchmarks/learned/equal_cost.py --smoke  # toy sizes, to see that it runs
 
@@ -20,6 +21,7 @@ import dataclasses
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -78,6 +80,19 @@ class Contestant:
 
     solver: dfx.AbstractSolver
     pieces: int = 1
+
+
+class SingleField(eqx.Module):
+    """A system whose vector field is evaluated in float32, for states in float64."""
+
+    system: Any
+
+    def vector_field(self, t, y, args):
+        single, t, y32 = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (self.system, t, y))
+        return jax.tree.map(lambda f, x: f.astype(x.dtype), single.vector_field(t, y32, args), y)
+
+    def __getattr__(self, name):
+        return getattr(self.system, name)
 
 
 def contestants(system, networks, pieces):
@@ -174,7 +189,7 @@ def costs(system, found, y0s, steps, rounds):
     return {key: 1e9 * t.seconds / steps / lanes for key, t in best.items()}
 
 
-def measure(name, networks, size=None, pieces=None):
+def measure(name, networks, size=None, pieces=None, single=False):
     system = dfc.systems.get(name)
     size = Size() if size is None else size
     dt, t1 = zoo.times_of(system)
@@ -183,17 +198,18 @@ def measure(name, networks, size=None, pieces=None):
     y0s = initial_states(system, size.states)
     reference = jax.vmap(lambda y0: system.reference(ts, y0))(y0s)
     found = contestants(system, networks, PIECES[name] if pieces is None else pieces)
+    solved = SingleField(system) if single else system
     many = initial_states(system, size.batch)
     first = jax.tree.map(lambda x: x[:1], y0s)
     ns = {
-        "batch": costs(system, found, many, size.batch_steps, size.rounds),
-        "alone": costs(system, found, first, size.alone_steps, size.rounds),
+        "batch": costs(solved, found, many, size.batch_steps, size.rounds),
+        "alone": costs(solved, found, first, size.alone_steps, size.rounds),
     }
     rows = []
     for key, contestant in found.items():
         row = dict(zip(("method", "pieces", "projected"), key, strict=True))
         most = max(k[1] for k in found if k[::2] == key[::2])
-        row |= errors(system, contestant, y0s, ts, reference, most)
+        row |= errors(solved, contestant, y0s, ts, reference, most)
         rows.append(row | {f"ns_{place}": round(ns[place][key], 1) for place in COSTS})
     return {"system": name, "steps": steps, "dt": dt, "states": size.states, "rows": rows}
 
@@ -263,6 +279,7 @@ def tables(record):
 def main(argv=None):
     parser = trained.parser(__doc__, PIECES)
     parser.add_argument("--network", type=Path, help="a file, instead of the shipped networks")
+    parser.add_argument("--single", action="store_true", help="the vector field in float32")
     options = parser.parse_args(argv)
     if options.table:
         for record in trained.read_results(RESULTS):
@@ -278,11 +295,11 @@ def main(argv=None):
             pieces = {"RK4": (1, 2)}
             records.append(measure(name, networks, SMOKE, pieces))
             continue
-        record = measure(name, networks)
+        record = measure(name, networks, single=options.single)
         record["machine"] = measuring.machine()
         records.append(record)
         print(tables(record), end="\n\n", flush=True)
-        if options.network is None:
+        if options.network is None and not options.single:
             RESULTS.mkdir(parents=True, exist_ok=True)
             (RESULTS / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
     if options.smoke:

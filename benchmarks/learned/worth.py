@@ -227,7 +227,7 @@ def figure(rows):
         ratios = [row["batches"][batch]["ratio"] for row in rows]
         ax.semilogy(places, ratios, "o-", label=f"batch of {int(batch):,}")
     ax.axhline(1, color="black", linewidth=0.8)
-    ax.set_xticks(places, [row["field"] for row in rows])
+    ax.set_xticks(places, [row["field"].replace(", ", ",\n") for row in rows])
     ax.set(xlabel="force added to the pendulum", ylabel="classical time over learned time")
     ax.legend()
     fig.savefig(IMAGES / "worth.png", dpi=150)
