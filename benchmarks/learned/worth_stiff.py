@@ -1,7 +1,8 @@
 """A learned step of POLLU against stiff solvers: time for a step of two minutes at equal error.
 
-    python benchmarks/learned/worth_stiff.py FILE       # a network of `chemistry.py --out FILE`
-    python benchmarks/learned/worth_stiff.py --smoke    # toy sizes, to see that it runs
+    python benchmarks/learned/worth_stiff.py          # writes ../results/worth_stiff.json
+    python benchmarks/learned/worth_stiff.py FILE     # a network of `chemistry.py --out FILE`
+    python benchmarks/learned/worth_stiff.py --smoke  # toy sizes, to see that it runs
 
 A batch of states from solves as in `chemistry.py`. Kvaerno3 and Kvaerno5 are those of diffrax,
 adaptive, from a first step of one minute. The Rosenbrock method is written out here for a batch:
@@ -125,12 +126,11 @@ def untrained(states):
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("network", type=Path, nargs="?", help="what `chemistry.py --out` wrote")
+    shipped = dfc.learned.pretrained_path("pollu")
+    parser.add_argument("network", type=Path, nargs="?", default=shipped)
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     options = parser.parse_args(argv)
     smoke = options.smoke
-    if not smoke and options.network is None:
-        parser.error("name the file of a network, from `chemistry.py --out FILE`")
     count, steps, tolerance = (2, 2, 1e-4) if smoke else (50, 20, 1e-8)
     y0s = jax.vmap(SYSTEM.sample)(jr.split(jr.key(77), count))
     ts = FIRST + STEP * jnp.arange(steps + 1)
