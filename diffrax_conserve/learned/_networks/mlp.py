@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 Activation = Callable[[Array], Array]
 
-
 # Names, by which a file refers to an activation function.
 ACTIVATIONS: dict[str, Activation] = {
     "tanh": jnp.tanh,
