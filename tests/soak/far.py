@@ -48,12 +48,14 @@ def compiled(name: str, mode: str) -> Any:
         return y, info.result == optx.RESULTS.successful
 
     def step(start: Any, candidate: Any, a: Any, value: Any, answer: Any) -> Any:
+        # Of its dtype: diffrax promotes a state to the dtype of the times.
+        zero, half = jnp.zeros((), start.dtype), jnp.full((), 0.5, start.dtype)
         sol = dfx.diffeqsolve(
             dfx.ODETerm(lambda t, y, args: args[1]),
             dfc.ManifoldProjection(dfx.Euler(), manifold, projection=projection),
-            0.0,
-            0.5,
-            0.5,
+            zero,
+            half,
+            half,
             start,
             (a, 2 * (candidate - start)),
             saveat=dfx.SaveAt(t1=True),
@@ -104,6 +106,7 @@ def run(seed: int, number: int, lanes: int) -> Tally:
     lane = draw(name, dtype, rng, lanes)
     inputs = [lane[k].T for k in ("start", "candidate", "a", "value", "answer")]
     y, okay = map(np.asarray, compiled(name, mode)(*inputs))
+    assert y.dtype == dtype
     start, value = None, lane["value"]
     if mode.startswith("step") and not family.constraint:
         # The solve keeps the value that it computes itself.
