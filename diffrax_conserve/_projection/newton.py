@@ -4,6 +4,7 @@ import functools as ft
 from typing import Any, ClassVar, final
 
 import equinox as eqx
+import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -142,10 +143,14 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     return y, multiplier, report(outcome, count, equations.candidate, y, before, after, scale, rank)
 
 
-def _state_norm(unknowns: tuple[Y, Vector]) -> Array:
-    # Where gradients are nearly parallel, only the state is well determined, not the multipliers.
-    y, _ = unknowns
-    return optx.max_norm(y)
+class _SVD(lx.SVD):
+    """Singular values of a matrix, NaN if it is not finite. LAPACK never returns from a matrix with
+    an infinite element."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
+        matrix = operator.as_matrix()
+        finite_or_nan = jnp.where(jnp.isfinite(matrix), matrix, jnp.nan)
+        return super().init(lx.MatrixLinearOperator(finite_or_nan), options)
 
 
 def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -> tuple[Y, Vector]:
@@ -186,21 +191,28 @@ def _nearest(
     rtol = eps ** (2 / 3)
     if tree_size((candidate, multiplier)) <= SYSTEM_DENSE_MAX:
         # Dependent constraints make the system singular but consistent.
-        linear_solver = lx.AutoLinearSolver(well_posed=False)
+        linear_solver = _SVD()
     else:
         linear_solver = lx.GMRES(rtol=rtol, atol=rtol)
     y = jtu.tree_map(jnp.divide, start, roots)
     atol: Any = tolerance(y, multiplier)
     parameters = residual, candidate, weights, roots, norms
+    unknowns, unravel = jfu.ravel_pytree((y, multiplier))
+
+    def state_norm(x: Array) -> Array:
+        # Where gradients are nearly parallel, only the state is well determined, not the
+        # multipliers.
+        return optx.max_norm(unravel(x)[0])
+
     solution = optx.root_find(
-        scaled,
-        optx.Newton(rtol=rtol, atol=atol, norm=_state_norm, linear_solver=linear_solver),
-        (y, multiplier),
+        lambda x, parameters: jfu.ravel_pytree(scaled(unravel(x), parameters))[0],
+        optx.Newton(rtol=rtol, atol=atol, norm=state_norm, linear_solver=linear_solver),
+        unknowns,
         parameters,
         max_steps=max_steps,
         throw=False,
     )
-    y, multiplier = solution.value
+    y, multiplier = unravel(solution.value)
     # Judged with the tolerance at the end, because multipliers may be much smaller at the start.
     off, _ = scaled((y, multiplier), parameters)
     arrived = optx.max_norm(off) <= tolerance(y, multiplier)

@@ -172,3 +172,14 @@ def test_a_solve_that_succeeds_has_no_nan_at_saved_times():
     finite = np.all(np.isfinite(np.concatenate(ys, axis=-1)), axis=(1, 2))
     assert np.mean(okay) > 0.2
     assert np.all(finite[okay])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+def test_an_infinite_derivative_does_not_keep_newton_from_ending(dtype):
+    """The soak found it: LAPACK's singular values never end for a matrix with an infinity."""
+    fn = lambda t, y, args: jnp.exp(1.9 * jnp.log(y[0] ** 2)) + 2e-3 * y[1] ** 2  # noqa: E731
+    candidate = jnp.array([1.5637957, 0.07024307], dtype)
+    _, info = dfc.project(
+        dfc.FirstIntegral(fn), candidate, value=jnp.asarray(-3536.0, dtype), projection=dfc.Newton()
+    )
+    assert not info.ok
