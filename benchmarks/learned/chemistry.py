@@ -38,8 +38,8 @@ jax.config.update("jax_enable_x64", True)
 RESULTS = Path(__file__).parents[1] / "results"
 # The times of a step at which there are data, by half its length, and more in the first two steps.
 WITHIN = np.array([0.0, 0.1, 0.5, 1.0])
-EARLY = np.array([0.02, 0.05, 0.2, 0.3, 0.4, 0.65, 0.8, 1.2, 1.4, 1.6, 1.8])
-EARLY = np.concatenate([EARLY, [2.25, 2.75, 3.25, 3.5, 3.75]])
+FIRST = [0.02, 0.05, 0.2, 0.3, 0.4, 0.65, 0.8, 1.2, 1.4, 1.6, 1.8]
+EARLY = np.array([*FIRST, 2.25, 2.75, 3.25, 3.5, 3.75])
 BOXCOX = dfc.learned.BoxCox(0.125)
 CHUNK = 300  # a batch of solves waits for its slowest
 TRACE = 1e-10  # smaller concentrations do not count

@@ -1,11 +1,10 @@
 """Networks that are evaluated in single precision, for states in double precision."""
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
 
 from .cores import AbstractCore
 
@@ -20,7 +19,7 @@ def single_precision(flow_map: _Model) -> _Model:
     the normalisation of the inputs stay in their own precision, and so does a projection, which
     keeps conserved values to roundoff of float64. If the network's own error is larger than this
     rounding, nothing is lost. On a CPU evaluation takes about half as long, and a file about half
-    the space; many GPUs gain much more.
+    the space.
 
     Convert a network after training: its training needs the precision of the state.
 
@@ -56,10 +55,7 @@ def _is_core(x: object) -> bool:
 
 
 def _rounded(part: object) -> object:
-    if not isinstance(part, AbstractCore):
-        return part
+    def single(x: Any) -> Any:
+        return x.astype(jnp.float32) if eqx.is_array(x) and x.dtype == jnp.float64 else x
 
-    def single(x: Array) -> Array:
-        return x.astype(jnp.float32) if x.dtype == jnp.float64 else x
-
-    return jtu.tree_map(lambda x: single(x) if eqx.is_inexact_array(x) else x, part)
+    return jtu.tree_map(single, part) if _is_core(part) else part
