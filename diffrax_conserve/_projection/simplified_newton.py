@@ -40,6 +40,7 @@ from .bounded import box_of, check_bounds, project_into
 from .certainty import certain
 from .elimination import Vector
 from .iteration import Equations, Start, iterate
+from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
 from .residual import ROUNDOFF_MULTIPLE, within
@@ -133,36 +134,70 @@ def _project(
     equations: Equations, anchor: Y | None, *, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
     inline, _, join = _in_scalars(equations)
-    before, jacobian = linearise(inline.residual, inline.candidate)
-    gram_solver = inline.gram_solver(jacobian)
-    y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
-    last, at_y, count = before, jacobian, min(jacobian.inline_steps, max_steps)
-    for step in range(count):
-        change = gram_solver.solve(g)
-        subtract = tree_cancel if step == count - 1 else tree_sub
-        y = subtract(y, inline.correction(jacobian, change))
-        multiplier = tree_sub(multiplier, change)
-        last = g
-        g, at_y = linearise(inline.residual, y)
-    scale = inline.scale(at_y, y)
-    # XLA may compute `y` twice, for `g` and for the result, with different rounding. After a large
-    # correction whose terms cancel, these would be different states.
-    roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
-    small = inline.tolerance(
-        jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
-    )
-    close = within(last, tree_scale(roundoff ** (-2 / 3), small))
-    done = close & inline.safely_satisfied(g, scale)
+    before, jacobian = at_candidate = linearise(inline.residual, inline.candidate)
+    count = min(jacobian.inline_steps, max_steps)
+    start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
+    y, multiplier, done = _iterations(inline, at_candidate, start, at_candidate, count)
     # The few steps that need more iterations linearise again: sharing the values known here would
     # write them to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
     finish = ft.partial(_finish, max_steps)
-    y, multiplier, count, outcome = continue_if_any(finish, ~done, state, (equations, anchor))
+    rounds = max_steps - count if count > 0 else 0
+    y, multiplier, count, outcome = continue_if_any(
+        finish, ~done, state, (equations, anchor), crowd=_once_more, rounds=rounds
+    )
     # The rest is computed only if the report is used.
     after, at_y = linearise(equations.residual, y)
-    scale, rank = equations.scale(at_y, y), gram_solver.rank
+    scale, rank = equations.scale(at_y, y), inline.gram_solver(jacobian).rank
     info = report(outcome, count, equations.candidate, y, as_array(before), after, scale, rank)
     return y, multiplier, info
+
+
+_Linearised = tuple[Vector, AbstractJacobian]
+
+
+def _iterations(
+    equations: Equations,
+    at_candidate: _Linearised,
+    start: tuple[Y, Vector],
+    at_start: _Linearised,
+    count: int,
+) -> tuple[Y, Vector, Bool[Array, ""]]:
+    """`count` iterations with the Gram matrix at the start, and whether they are enough."""
+    (before, base), (g, jacobian) = at_candidate, at_start
+    gram_solver = equations.gram_solver(jacobian, None if jacobian is base else base)
+    y, multiplier = start
+    last = g
+    for step in range(count):
+        change = gram_solver.solve(g)
+        subtract = tree_cancel if step == count - 1 else tree_sub
+        y = subtract(y, equations.correction(base, change))
+        multiplier = tree_sub(multiplier, change)
+        last = g
+        g, jacobian = linearise(equations.residual, y)
+    scale = equations.scale(jacobian, y)
+    # XLA may compute `y` twice, for `g` and for the result, with different rounding. After a large
+    # correction whose terms cancel, these would be different states.
+    roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
+    small = equations.tolerance(
+        jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
+    )
+    close = within(last, tree_scale(roundoff ** (-2 / 3), small))
+    return y, multiplier, close & equations.safely_satisfied(g, scale)
+
+
+def _once_more(
+    state: _State, operands: tuple[Equations, Y | None]
+) -> tuple[Bool[Array, ""], _State]:
+    """One more iteration from `state`, and whether that is not enough."""
+    y, multiplier, count, outcome = state
+    equations, split, join = _in_scalars(operands[0])
+    if isinstance(equations.magnitude, tuple):
+        multiplier = tuple(multiplier)
+    start = split(y), multiplier
+    candidate, here = (linearise(equations.residual, x) for x in (equations.candidate, start[0]))
+    y, multiplier, done = _iterations(equations, candidate, start, here, 1)
+    return ~done, (join(y), as_array(multiplier), count + 1, outcome)
 
 
 # The same equations in another form, and the maps to the new form of the state and back.
