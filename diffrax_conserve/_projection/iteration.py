@@ -11,7 +11,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_cancel, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
+from .._tree import tree_cancel, tree_max, tree_mul, tree_scale, tree_sub
 from .base import Problem
 from .elimination import GramSolver, Vector
 from .jacobian import AbstractJacobian, lineax_solver
@@ -142,7 +142,7 @@ def iterate(
     `start` is more than a hundredth of the candidate's, the iteration begins at the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
-    first = _first_scale(equations, at_candidate)
+    first = _most_scale(equations, at_candidate, equations.candidate)
 
     # In a batch, a loop evaluates its condition in two places. If these round differently, the loop
     # may never end, so the condition is evaluated once and carried.
@@ -163,8 +163,9 @@ def iterate(
 
         base = at_candidate if frozen else jacobian
         # Near a state where all terms vanish, the residual never becomes small relative to their
-        # size there, so the scale of the candidate bounds it from below.
-        vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
+        # size there.
+        most = jtu.tree_map(jnp.maximum, first, _most_scale(equations, jacobian, y))
+        vanishing = jnp.minimum(1e-2, equations.merit(g, most))
         change = equations.gram_solver(jacobian, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
 
@@ -181,16 +182,12 @@ def iterate(
     return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
 
 
-def _first_scale(equations: Equations, at_candidate: AbstractJacobian) -> Vector:
-    """The scale at the candidate. Because a term may vanish there but not at the next state, it is
-    at least one unit of roundoff times the scale that equal components, all as large as the
-    largest, would have."""
-    candidate = equations.candidate
-    eps = float(jnp.finfo(working_dtype(candidate)).eps)
-    roundoff = eps * tree_max(candidate)
-    uniform = jtu.tree_map(lambda x: jnp.full_like(x, roundoff.astype(x.dtype)), candidate)
-    scale = equations.scale(at_candidate, candidate)
-    return jtu.tree_map(jnp.maximum, scale, at_candidate.scale(uniform))
+def _most_scale(equations: Equations, jacobian: AbstractJacobian, y: Y) -> Vector:
+    """The scale that the residual would have if all components of `y` were as large as the
+    largest. A term may vanish at one state and not at the next; this one does not."""
+    largest = tree_max(y)
+    uniform = jtu.tree_map(lambda x: jnp.full_like(x, largest.astype(x.dtype)), y)
+    return equations.scale(jacobian, uniform)
 
 
 def _begin(
