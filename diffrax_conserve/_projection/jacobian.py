@@ -15,7 +15,7 @@ import lineax as lx
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import Y
-from .._tree import tree_dot, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
+from .._tree import tree_dot, tree_max, tree_mul, working_dtype
 from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
 # Up to this many constraints are unrolled, enough for the ten integrals of the N-body problem.
@@ -63,10 +63,10 @@ class AbstractJacobian(eqx.Module):
         """The Jacobian with each row divided by its largest element, and these divisors; unchanged
         where rows are not formed."""
 
-    @abc.abstractmethod
     def sines(self, weights: Y) -> Real[Array, " m"] | None:
         """The sine of the angle between each row and the span of those before it, in the norm of
-        `W`; `None` where rows are never formed."""
+        `W`; `None` where no matrix is formed."""
+        del weights
 
 
 @final
@@ -106,24 +106,6 @@ class Unrolled(AbstractJacobian):
                 ]
             )
         return unrolled_solver(gram, damping).scaled(row_sizes, column_sizes)
-
-    def sines(self, weights: Y) -> Real[Array, " m"]:
-        # Gram-Schmidt, not the pivots of the Gram matrix: those are squares of sines, with half the
-        # digits.
-        dtype = working_dtype(weights)
-        roots = jtu.tree_map(jnp.sqrt, weights)
-        basis: list[Y] = []
-        sines = []
-        for row in self._normalised()[0]:
-            rest = row = tree_mul(row, roots)
-            for unit in basis:
-                rest = tree_sub(rest, tree_scale(tree_dot(unit, rest, dtype), unit))
-            norms = [jnp.sqrt(tree_dot(x, x, dtype)) for x in (rest, row)]
-            length, whole = (jnp.where(x > 0, x, 1) for x in norms)
-            basis.append(tree_scale(1 / length, rest))
-            # A zero gradient counts as parallel to none.
-            sines.append(jnp.where(norms[1] > 0, norms[0] / whole, 1))
-        return jnp.stack(sines)
 
     def unit_rows(self) -> tuple["Unrolled", Vector]:
         rows, sizes = self._normalised(always=True)
@@ -266,9 +248,6 @@ class MatrixFree(AbstractJacobian):
 
     def unit_rows(self) -> tuple["MatrixFree", Vector]:
         return self, jnp.ones(())
-
-    def sines(self, weights: Y) -> None:
-        del weights
 
     def _product(self, x: Vector, weights: Y, other: "MatrixFree") -> Vector:
         return self.forward(tree_mul(other.backward(x), weights))
