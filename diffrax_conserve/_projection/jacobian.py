@@ -85,9 +85,8 @@ class Unrolled(AbstractJacobian):
         return tuple(tree_dot(row, y, dtype) for row in self.rows)
 
     def scale(self, y: Y) -> Vector:
-        magnitude = jtu.tree_map(jnp.abs, y)
-        dtype = working_dtype(y)
-        return tuple(tree_dot(jtu.tree_map(jnp.abs, r), magnitude, dtype) for r in self.rows)
+        rows, y = jtu.tree_map(jnp.abs, (self.rows, y))
+        return Unrolled(rows).pushforward(y)
 
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
@@ -136,11 +135,8 @@ class Dense(AbstractJacobian):
         return jax.vmap(lambda row: tree_dot(row, y, dtype))(self.rows)
 
     def scale(self, y: Y) -> Vector:
-        magnitude = jtu.tree_map(jnp.abs, y)
-        dtype = working_dtype(y)
-        return jax.vmap(lambda row: tree_dot(jtu.tree_map(jnp.abs, row), magnitude, dtype))(
-            self.rows
-        )
+        rows, y = jtu.tree_map(jnp.abs, (self.rows, y))
+        return Dense(rows).pushforward(y)
 
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
