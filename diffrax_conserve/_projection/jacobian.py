@@ -212,9 +212,6 @@ def _contract(a: Array, b: Array) -> Array:
 _SMALL = 4096
 
 
-# The relative tolerance of one iterative solve. The outer iteration corrects the remaining error,
-# so the total number of inner iterations hardly depends on it.
-_SOLVE_RTOL = 1e-4
 # With two different Jacobians, the number of corrections of the solve with one of them, which reach
 # roundoff.
 _CORRECTIONS = 7
@@ -267,26 +264,10 @@ class MatrixFree(AbstractJacobian):
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
     ) -> GramSolver:
-        squares = jnp.square(estimated_norms(self.forward, jtu.tree_map(jnp.sqrt, weights)))
-        diagonal = jnp.where(squares > 0, squares, 1)
-        struct = jax.eval_shape(lambda: diagonal)
-
-        def symmetric(x: Vector) -> Vector:
-            return self.forward(tree_mul(self.backward(x), weights)) + damping * diagonal * x
-
-        tag = lx.positive_semidefinite_tag
-        operator = lx.FunctionLinearOperator(symmetric, struct, tag)
-        preconditioner = lx.TaggedLinearOperator(lx.DiagonalLinearOperator(1 / diagonal), tag)
-        solver = lx.CG(rtol=_SOLVE_RTOL, atol=float(jnp.finfo(diagonal.dtype).tiny))
-
-        def solve(b: Vector) -> Vector:
-            options = dict(preconditioner=preconditioner)
-            return lx.linear_solve(operator, b, solver, options=options, throw=False).value
-
-        def corrected(b: Vector) -> Vector:
-            return _corrected(solve, lambda x: self._product(x, weights, other), b)
-
-        return GramSolver(solve if other is None else corrected, jnp.asarray(diagonal.size))
+        # The outer iteration corrects the remaining error, so the total number of inner iterations
+        # hardly depends on the tolerance.
+        solver = lx.CG(rtol=1e-4, atol=float(jnp.finfo(working_dtype(weights)).tiny))
+        return lineax_solver(solver, self, weights, other, damping)
 
 
 def lineax_solver(
@@ -309,21 +290,26 @@ def lineax_solver(
         g = rows.pushforward(tree_mul(columns.pullback(x), weights))
         return jtu.tree_map(lambda g, d, x: g + damping * d * x, g, diagonal, x)
 
-    struct = jax.eval_shape(lambda: diagonal)
-    operator = lx.FunctionLinearOperator(product, struct, lx.positive_semidefinite_tag)
+    struct, tag = jax.eval_shape(lambda: diagonal), lx.positive_semidefinite_tag
+    operator, options = lx.FunctionLinearOperator(product, struct, tag), {}
+    if isinstance(jacobian, MatrixFree):
+        inverse = lx.DiagonalLinearOperator(1 / jnp.where(diagonal > 0, diagonal, 1))
+        options = dict(preconditioner=lx.TaggedLinearOperator(inverse, tag))
+        rank = jnp.asarray(diagonal.size)
+    else:
+        rank = jacobian.gram_solver(weights).rank
 
     def solve(b: Vector) -> Vector:
         # An absolute tolerance is relative to `b`, and zero is solved by zero.
         size = tree_max(b)
         found = jnp.where((size > 0) & (size < jnp.inf), size, 1)
         unit = jtu.tree_map(lambda b: jnp.where(size == 0, 1, b / found), b)
-        x = lx.linear_solve(operator, unit, linear_solver, throw=False).value
+        x = lx.linear_solve(operator, unit, linear_solver, options=options, throw=False).value
         return jtu.tree_map(lambda x: jnp.where(size == 0, 0, x * found), x)
 
     def corrected(b: Vector) -> Vector:
         return _corrected(solve, lambda x: product(x, columns), b)
 
-    rank = jacobian.gram_solver(weights).rank
     return GramSolver(solve if other is None else corrected, rank).scaled(row_sizes, column_sizes)
 
 
