@@ -1,8 +1,10 @@
-"""The linear systems of the implicit function theorem, for the state and the multipliers."""
+"""The implicit function theorem, for the state and the multipliers of a projection."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.lax as lax
@@ -12,8 +14,11 @@ import lineax as lx
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Y
+from .._tree import tree_add, tree_mul, tree_scale, tree_sub, tree_tangents
+from .certainty import certain
 from .elimination import Vector
 from .jacobian import AbstractJacobian
+from .linearise import linearise
 
 # Systems with more unknowns are solved iteratively, without forming the matrix.
 SYSTEM_DENSE_MAX = 256
@@ -75,3 +80,60 @@ def _shortest(matrix: Array, b: Array, rcond: float) -> Array:
 
     solution = lax.custom_linear_solve(lambda x: matrix @ x, b, solve, transposed)
     return jnp.where(finite, 1, jnp.nan) * solution
+
+
+def optimality(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
+    """`y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`."""
+    g, _, x = _displaced(*unknowns, parameters)
+    return tree_sub(unknowns[0], x), g
+
+
+def _displaced(base: Y, multiplier: Vector, parameters: Any) -> tuple[Vector, Y, Y]:
+    """`g(base)`, `ŷ + M⁻¹ G(base)ᵀ λ`, and this clipped to the box, if there is one."""
+    residual, candidate, weights, box = parameters
+    g, vjp = eqx.filter_vjp(residual, base)  # by one reverse pass, not row by row
+    (direction,) = vjp(multiplier)
+    z = tree_add(candidate, tree_mul(direction, weights))
+    return g, z, z if box is None else box.clip(z)
+
+
+def differentiated(
+    solution: tuple[Y, Vector, Any], primals: Any, tangents: Any, *, frozen: bool
+) -> tuple[Any, Any]:
+    """A projection's `solution` (the state, the multipliers and the report) and its tangents, where
+    `primals` are the equations and the box or `None`. Components at a bound are constant.
+
+    With `frozen`, let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at
+    constant `λ`. Then `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is
+    `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`. Otherwise the unknowns of the optimality system are `y` and `λ`.
+    """
+    (y, multiplier, info), (equations, box) = solution, primals
+    given, t_given = ((x.residual, x.candidate, x.weights, b) for x, b in (primals, tangents))
+    _, at_y = linearise(equations.residual, y)
+    active = equations.weights
+    if box is not None:
+        _, z, _ = _displaced(equations.candidate if frozen else y, multiplier, given)
+        active = tree_mul(active, box.inside(z))
+    if frozen:
+
+        def displaced(given: Any) -> tuple[Y, Vector]:
+            _, _, x = _displaced(given[1], multiplier, given)
+            return x, given[0](x)
+
+        _, at_candidate = linearise(equations.residual, equations.candidate)
+        t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, (given,), (t_given,)))
+        gram_solver = at_y.derivative_solver(active, at_candidate)
+        t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
+        t_y = tree_add(t_y, tree_mul(at_candidate.pullback(t_multiplier), active))
+    else:
+        unknowns = y, multiplier
+        _, right = eqx.filter_jvp(lambda p: optimality(unknowns, p), (given,), (t_given,))
+        right = jtu.tree_map(jnp.negative, tree_tangents(unknowns, right))
+        t_y, t_multiplier = solve_linearised(
+            lambda x: optimality(x, given), unknowns, right, units(at_y, equations.weights)
+        )
+    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
+    inside = dataclasses.replace(equations, weights=active)
+    factor = jnp.where(info.ok, certain(inside, y, at_y), 1)
+    t_y = tree_scale(lax.stop_gradient(factor), t_y)
+    return solution, (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))

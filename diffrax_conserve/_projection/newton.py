@@ -5,7 +5,6 @@ from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -14,12 +13,9 @@ from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import (
-    tree_add,
     tree_mul,
-    tree_scale,
     tree_size,
     tree_sub,
-    tree_tangents,
     working_dtype,
 )
 from .base import (
@@ -34,11 +30,10 @@ from .base import (
     report,
 )
 from .bounded import box_of, check_bounds, project_into
-from .certainty import certain
 from .elimination import Vector
-from .implicit import SYSTEM_DENSE_MAX, solve_linearised, units
+from .implicit import SYSTEM_DENSE_MAX, differentiated, optimality, units
 from .iteration import Equations, iterate
-from .linearise import Residual, linearise
+from .linearise import linearise
 from .residual import ROUNDOFF_MULTIPLE, within
 
 
@@ -153,15 +148,6 @@ class _SVD(lx.SVD):
         return super().init(lx.MatrixLinearOperator(finite_or_nan), options)
 
 
-def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -> tuple[Y, Vector]:
-    """`y - ŷ - M⁻¹ G(y)ᵀ λ` and `g(y)`."""
-    y, multiplier = unknowns
-    residual, candidate, weights = parameters
-    g, vjp = eqx.filter_vjp(residual, y)
-    (direction,) = vjp(multiplier)
-    return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
-
-
 def _nearest(
     equations: Equations, start: Y, max_steps: int
 ) -> tuple[Y, Vector, Int[Array, ""], Bool[Array, ""]]:
@@ -177,8 +163,8 @@ def _nearest(
 
     def scaled(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
         (y, multiplier), (residual, candidate, weights, roots, norms) = unknowns, parameters
-        given = (lambda y: residual(y) / norms), candidate, weights
-        off, g = _optimality((tree_mul(y, roots), multiplier), given)
+        given = (lambda y: residual(y) / norms), candidate, weights, None
+        off, g = optimality((tree_mul(y, roots), multiplier), given)
         return jtu.tree_map(jnp.divide, off, roots), g
 
     def tolerance(y: Y, multiplier: Vector) -> Array:
@@ -221,26 +207,5 @@ def _nearest(
 
 @_project.def_jvp
 def _project_jvp(primals, tangents, *, max_steps):
-    """The implicit function theorem for the optimality system, in the unknowns `y` and `λ`."""
-    (equations,), (t_equations,) = primals, tangents
-    y, multiplier, info = _project(equations, max_steps=max_steps)
-
-    def parameters(x: Any) -> tuple[Any, Any, Any]:
-        return x.residual, x.candidate, x.weights
-
-    unknowns = y, multiplier
-    _, right = eqx.filter_jvp(
-        lambda p: _optimality(unknowns, p), (parameters(equations),), (parameters(t_equations),)
-    )
-    right = tree_tangents(unknowns, right)
-    given = parameters(equations)
-    _, jacobian = linearise(given[0], y)
-    measured_in = units(jacobian, given[2])
-    t_y, t_multiplier = solve_linearised(
-        lambda x: _optimality(x, given), unknowns, right, measured_in
-    )
-    factor = jnp.where(info.ok, certain(equations, y, jacobian), 1)
-    t_y = tree_scale(lax.stop_gradient(factor), t_y)
-    minus = lambda x: jtu.tree_map(jnp.negative, x)  # noqa: E731
-    t_info = jtu.tree_map(lambda _: None, info)
-    return (y, multiplier, info), (minus(t_y), minus(t_multiplier), t_info)
+    solution = _project(*primals, max_steps=max_steps)
+    return differentiated(solution, (*primals, None), (*tangents, None), frozen=False)

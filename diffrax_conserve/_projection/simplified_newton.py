@@ -4,7 +4,7 @@ frozen at the candidate, for candidates as close as an integrator's local error.
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.lax as lax
@@ -18,11 +18,9 @@ from .._custom_types import Y
 from .._tree import (
     tree_add,
     tree_cancel,
-    tree_mul,
     tree_scale,
     tree_size,
     tree_sub,
-    tree_tangents,
     working_dtype,
 )
 from .base import (
@@ -37,12 +35,12 @@ from .base import (
     report,
 )
 from .bounded import box_of, check_bounds, project_into
-from .certainty import certain
 from .elimination import Vector
+from .implicit import differentiated
 from .iteration import Equations, Start, iterate
 from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
-from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
+from .linearise import Elements, Joined, as_array, flattened, linearise, written_out
 from .residual import ROUNDOFF_MULTIPLE, within
 
 
@@ -307,32 +305,6 @@ def _from_between(
 
 @_project.def_jvp
 def _project_jvp(primals, tangents, *, max_steps):
-    """The implicit function theorem for `λ` in `g(ŷ + M⁻¹ G(ŷ)ᵀ λ) = 0`.
-
-    Let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at constant `λ`. Then
-    `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`.
-    """
-    y, multiplier, info = _project(*primals, max_steps=max_steps)
-    equations, _ = primals
-    t_equations, _ = tangents
-
-    def displaced(residual: Residual, candidate: Y, weights: Y) -> tuple[Y, Vector]:
-        # `Gᵀ λ` by one reverse pass, not row by row.
-        _, vjp = eqx.filter_vjp(residual, candidate)
-        (direction,) = vjp(multiplier)
-        y = tree_add(candidate, tree_mul(direction, weights))
-        return y, residual(y)
-
-    def moving(x: Any) -> tuple[Any, Any, Any]:
-        return x.residual, x.candidate, x.weights
-
-    t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, moving(equations), moving(t_equations)))
-    _, at_candidate = linearise(equations.residual, equations.candidate)
-    _, at_y = linearise(equations.residual, y)
-    gram_solver = at_y.derivative_solver(equations.weights, at_candidate)
-    t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
-    t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
-    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
-    factor = jnp.where(info.ok, certain(equations, y, at_y), 1)
-    t_y = tree_scale(lax.stop_gradient(factor), t_y)
-    return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))
+    solution = _project(*primals, max_steps=max_steps)
+    (equations, _), (t_equations, _) = primals, tangents
+    return differentiated(solution, (equations, None), (t_equations, None), frozen=True)
