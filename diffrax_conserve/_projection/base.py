@@ -286,22 +286,15 @@ class Outcome(eqx.Module):
         )
         result = kinds.where(tree_all_finite(before), result, kinds.nonfinite)
         result = kinds.where(success, kinds.successful, result)
-        ratios = jnp.concatenate(
-            [jnp.atleast_1d(x) for x in jtu.tree_leaves(relative(_smaller(before, after), scale))]
-        )
-        worst = jnp.argmax(jnp.where(jnp.isnan(ratios), jnp.inf, ratios)).astype(jnp.int32)
+
+        def sizes(residual: Vector) -> Array:
+            ratios = jtu.tree_leaves(relative(residual, scale))
+            size = jnp.abs(jnp.concatenate([jnp.atleast_1d(x) for x in ratios]))
+            return jnp.where(jnp.isnan(size), jnp.inf, size)
+
+        # The smaller of both, so that none is blamed for an iteration that diverged.
+        worst = jnp.argmax(jnp.minimum(sizes(before), sizes(after))).astype(jnp.int32)
         return cls(result, jnp.where(success, 0, worst))
-
-
-def _smaller(before: Vector, after: Vector) -> Vector:
-    """The smaller of both residuals, so that a constraint is not blamed for an iteration that
-    diverged."""
-
-    def smaller(a: Array, b: Array) -> Array:
-        a, b = (jnp.where(jnp.isnan(x), jnp.inf, jnp.abs(x)) for x in (a, b))
-        return jnp.minimum(a, b)
-
-    return jtu.tree_map(smaller, before, after)
 
 
 def _member(result: optx.RESULTS) -> optx.RESULTS:
