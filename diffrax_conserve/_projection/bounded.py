@@ -30,10 +30,10 @@ from .._tree import (
     tree_sub,
     working_dtype,
 )
-from .base import Outcome, ProjectionInfo, check_like, report
+from .base import check_like
 from .elimination import Vector
+from .equations import Equations, ProjectionInfo
 from .implicit import differentiated
-from .iteration import Equations
 from .jacobian import AbstractJacobian
 from .linearise import linearise
 from .residual import largest, relative
@@ -151,11 +151,8 @@ def project_into(
         return jtu.tree_map(lambda a, b: jnp.where(settled, a, b), a, b)
 
     y, count = choose((free, free_info.num_steps), (end.y, end.num_steps))
-    after, at_y = linearise(equations.residual, y)
-    scale = equations.scale(at_y, y)
-    outcome = Outcome.of(before, after, scale, equations.tolerance)
     rank = at_candidate.gram_solver(equations.weights).rank
-    info = report(outcome, count, candidate, y, before, after, scale, rank)
+    info = equations.report(y, before, count, rank)
     # Only the nearest point has a derivative.
     moving = jnp.asarray(False) if frozen else end.last > eps**0.5
     multiplier = jtu.tree_map(lambda x: jnp.where(moving, jnp.nan, x), end.multiplier)

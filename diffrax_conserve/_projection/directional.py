@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Int, Real
 from .._custom_types import Y
 from .._tree import tree_add, tree_dot, tree_max, tree_norm, tree_scale, tree_tangents
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
-from .iteration import SAFELY
+from .equations import SAFELY
 from .linearise import Joined, linearise
 from .residual import Tolerance, within
 

@@ -21,20 +21,18 @@ from .._tree import (
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
-    Outcome,
     Problem,
-    ProjectionInfo,
     check_options,
     option,
     positive_weights,
-    report,
 )
 from .bounded import box_of, check_bounds, project_into
 from .elimination import Vector
+from .equations import Equations, ProjectionInfo
 from .implicit import SYSTEM_DENSE_MAX, differentiated, optimality, units
-from .iteration import Equations, iterate
+from .iteration import iterate
 from .linearise import linearise
-from .residual import ROUNDOFF_MULTIPLE, within
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
 @final
@@ -100,7 +98,8 @@ class Newton(AbstractProjection):
                 "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
                 "pass `projection=SimplifiedNewton()`."
             )
-        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
+        tolerance = Tolerance(self.rtol, self.atol)
+        equations = problem.equations(candidate, tolerance, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         unbounded = ft.partial(_project, max_steps=steps)
@@ -121,21 +120,13 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     before, reached = iterate(equations, frozen=False, max_steps=max_steps)
     nearest, multiplier, num_steps, arrived = _nearest(equations, reached.y, max_steps)
 
-    def residuals(y: Y) -> tuple[Vector, Vector]:
-        g, jacobian = linearise(equations.residual, y)
-        return g, equations.scale(jacobian, y)
-
-    g, scale = residuals(nearest)
-    found = within(g, equations.tolerance(scale)) & arrived
+    g, jacobian = linearise(equations.residual, nearest)
+    found = within(g, equations.tolerance(equations.scale(jacobian, nearest))) & arrived
     y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
-    after, scale = residuals(y)
-    outcome = Outcome.of(before, after, scale, equations.tolerance)
-    # Only the multipliers of the nearest point have a derivative.
-    reached_only = (outcome.result == optx.RESULTS.successful) & ~found
-    multiplier = jnp.where(reached_only, jnp.nan, multiplier)
     rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
-    count = reached.num_steps + num_steps
-    return y, multiplier, report(outcome, count, equations.candidate, y, before, after, scale, rank)
+    info = equations.report(y, before, reached.num_steps + num_steps, rank)
+    # Only the multipliers of the nearest point have a derivative.
+    return y, jnp.where(info.ok & ~found, jnp.nan, multiplier), info
 
 
 class _SVD(lx.SVD):

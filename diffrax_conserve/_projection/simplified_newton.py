@@ -26,22 +26,20 @@ from .._tree import (
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
-    Outcome,
     Problem,
-    ProjectionInfo,
     check_options,
     option,
     positive_weights,
-    report,
 )
 from .bounded import box_of, check_bounds, project_into
 from .elimination import Vector
+from .equations import Equations, Outcome, ProjectionInfo
 from .implicit import differentiated
-from .iteration import Equations, Start, iterate
+from .iteration import Start, iterate
 from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
 from .linearise import Elements, Joined, as_array, flattened, linearise, written_out
-from .residual import ROUNDOFF_MULTIPLE, within
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
 @final
@@ -97,7 +95,8 @@ class SimplifiedNewton(AbstractProjection):
         check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
+        tolerance = Tolerance(self.rtol, self.atol)
+        equations = problem.equations(candidate, tolerance, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         if box is None:
@@ -145,10 +144,8 @@ def _project(
         finish, ~done, state, (equations, anchor), crowd=_once_more, rounds=rounds
     )
     # The rest is computed only if the report is used.
-    after, at_y = linearise(equations.residual, y)
-    scale, rank = equations.scale(at_y, y), inline.gram_solver(jacobian).rank
-    info = report(outcome, count, equations.candidate, y, as_array(before), after, scale, rank)
-    return y, multiplier, info
+    rank = inline.gram_solver(jacobian).rank
+    return y, multiplier, equations.report(y, as_array(before), count, rank, outcome)
 
 
 _Linearised = tuple[Vector, AbstractJacobian]

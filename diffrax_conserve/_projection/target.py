@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Real
 from .._balance import integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._tree import tree_add, tree_all_finite, working_dtype
-from .base import AbstractProjection, Outcome, ProjectionInfo
+from .base import AbstractProjection
+from .equations import Outcome, ProjectionInfo
 from .project import apply, relative_residual
 from .step import Step
 
