@@ -38,7 +38,7 @@ from .implicit import differentiated
 from .iteration import Start, iterate
 from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
-from .linearise import Elements, Joined, as_array, flattened, linearise, written_out
+from .linearise import Converted, Elements, Joined, as_array, flattened, linearise, written_out
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
@@ -130,7 +130,7 @@ _STARTS = 8
 def _project(
     equations: Equations, anchor: Y | None, *, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    inline, _, join = _in_scalars(equations)
+    inline, _, join = _converted(equations)
     before, jacobian = at_candidate = linearise(inline.residual, inline.candidate)
     count = min(jacobian.inline_steps, max_steps)
     start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
@@ -186,7 +186,7 @@ def _once_more(
 ) -> tuple[Bool[Array, ""], _State]:
     """One more iteration from `state`, and whether that is not enough."""
     y, multiplier, count, outcome = state
-    equations, split, join = _in_scalars(operands[0])
+    equations, split, join = _converted(operands[0])
     if isinstance(equations.magnitude, tuple):
         multiplier = tuple(multiplier)
     start = split(y), multiplier
@@ -195,36 +195,17 @@ def _once_more(
     return ~done, (join(y), as_array(multiplier), count + 1, outcome)
 
 
-# The same equations in another form, and the maps to the new form of the state and back.
-_Converted = tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]
-
-
-def _in_scalars(equations: Equations) -> _Converted:
-    """The equations in scalars, if they are few and small."""
+def _converted(
+    equations: Equations, convert: Callable[[Joined, Y], Converted] = written_out
+) -> tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same equations in another form, and the maps to the new form of the state and back."""
     assert isinstance(equations.residual, Joined)
-    residual, magnitude, split, join = written_out(
-        equations.residual, equations.magnitude, equations.candidate
-    )
-    return _of_states(equations, residual, split, magnitude=magnitude), split, join
-
-
-def _in_vectors(equations: Equations) -> _Converted:
-    """The equations with the state in one vector."""
-    assert isinstance(equations.residual, Joined)
-    residual, split, join = flattened(equations.residual, equations.candidate)
-    return _of_states(equations, residual, split), split, join
-
-
-def _of_states(
-    equations: Equations, residual: Joined | Elements, split: Callable[[Y], Y], **changes: Vector
-) -> Equations:
-    return dataclasses.replace(
-        equations,
-        residual=residual,
-        candidate=split(equations.candidate),
-        weights=split(equations.weights),
-        **changes,
-    )
+    residual, split, join = convert(equations.residual, equations.candidate)
+    candidate, weights = split(equations.candidate), split(equations.weights)
+    magnitude = equations.magnitude
+    magnitude = tuple(magnitude) if isinstance(residual, Elements) else magnitude
+    changes = dict(residual=residual, candidate=candidate, weights=weights, magnitude=magnitude)
+    return dataclasses.replace(equations, **changes), split, join
 
 
 def _finish(
@@ -242,8 +223,8 @@ def _finish(
 
     def attempt(equations: Equations, start: Start, enabled: Bool[Array, ""]) -> _State:
         products = equations.magnitude.size**2 * tree_size(equations.candidate)
-        convert = _in_scalars if products <= _RARE_SCALARS_MAX else _in_vectors
-        equations, split, join = convert(equations)
+        convert = written_out if products <= _RARE_SCALARS_MAX else flattened
+        equations, split, join = _converted(equations, convert)
         y, multiplier, count = start
         if isinstance(equations.magnitude, tuple):
             multiplier = tuple(multiplier)
