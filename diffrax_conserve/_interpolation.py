@@ -93,14 +93,7 @@ class MakeManifoldInterpolation:
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 
     def __call__(
-        self,
-        *,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        inner: DenseInfo,
-        ends: tuple[Y, Y],
-        error: Y | None,
-        target: PackedTarget,
+        self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, **fields: Any
     ) -> ManifoldInterpolation:
-        interpolation = self.inner_cls(t0=t0, t1=t1, **inner)
-        return ManifoldInterpolation(t0, t1, interpolation, ends, error, target)
+        inner = self.inner_cls(t0=t0, t1=t1, **inner)
+        return ManifoldInterpolation(t0=t0, t1=t1, inner=inner, **fields)

@@ -198,7 +198,6 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
-        values = jtu.tree_map(jnp.asarray, values)
         num_constraints = sum(jnp.size(value) for value in jtu.tree_leaves(values))
         return State(
             self.solver.init(terms, t0, t1, y0, args),
