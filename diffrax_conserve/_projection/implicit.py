@@ -67,9 +67,7 @@ def solve_linearised(
 def _shortest(matrix: Array, b: Array, rcond: float) -> Array:
     """By singular values, because dependent constraints make the system singular but consistent. If
     `matrix` is not finite the solution is NaN, in forward and in reverse mode."""
-    finite = jnp.all(jnp.isfinite(matrix))
-    matrix = jnp.where(finite, matrix, jnp.eye(len(b), dtype=matrix.dtype))
-    u, s, vt = jnp.linalg.svd(lax.stop_gradient(matrix))
+    u, s, vt = jnp.linalg.svd(lax.stop_gradient(finite_or_nan(matrix)))
     inverse = jnp.where(s > rcond * s[0], 1 / s, 0)
 
     def solve(_: Any, b: Array) -> Array:
@@ -78,8 +76,12 @@ def _shortest(matrix: Array, b: Array, rcond: float) -> Array:
     def transposed(_: Any, b: Array) -> Array:
         return u @ (inverse * (vt @ b))
 
-    solution = lax.custom_linear_solve(lambda x: matrix @ x, b, solve, transposed)
-    return jnp.where(finite, 1, jnp.nan) * solution
+    return lax.custom_linear_solve(lambda x: matrix @ x, b, solve, transposed)
+
+
+def finite_or_nan(matrix: Array) -> Array:
+    """Without infinities: LAPACK's singular value decomposition never returns from one."""
+    return jnp.where(jnp.isfinite(matrix), matrix, jnp.nan)
 
 
 def optimality(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:

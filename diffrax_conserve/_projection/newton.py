@@ -29,7 +29,7 @@ from .base import (
 from .bounded import box_of, check_bounds, project_into
 from .elimination import Vector
 from .equations import Equations, ProjectionInfo
-from .implicit import SYSTEM_DENSE_MAX, differentiated, optimality, units
+from .implicit import SYSTEM_DENSE_MAX, differentiated, finite_or_nan, optimality, units
 from .iteration import iterate
 from .linearise import linearise
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
@@ -130,13 +130,8 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
 
 
 class _SVD(lx.SVD):
-    """Singular values of a matrix, NaN if it is not finite. LAPACK never returns from a matrix with
-    an infinite element."""
-
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        matrix = operator.as_matrix()
-        finite_or_nan = jnp.where(jnp.isfinite(matrix), matrix, jnp.nan)
-        return super().init(lx.MatrixLinearOperator(finite_or_nan), options)
+        return super().init(lx.MatrixLinearOperator(finite_or_nan(operator.as_matrix())), options)
 
 
 def _nearest(
