@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection import SimplifiedNewton, Target
+from ._projection.simplified_newton import SimplifiedNewton
+from ._projection.target import Target
 from ._tree import tree_sub
 
 

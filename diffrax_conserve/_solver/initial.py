@@ -7,8 +7,10 @@ from jaxtyping import Array, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, FirstIntegral, is_entry
-from .._projection import AbstractProjection, SimplifiedNewton, largest, measure, relative
+from .._projection.base import AbstractProjection
 from .._projection.project import apply
+from .._projection.residual import largest, measure, relative
+from .._projection.simplified_newton import SimplifiedNewton
 from .._tree import tree_all_finite, tree_stop_gradient, working_dtype
 from .._with_jacobian import WithJacobian
 
