@@ -113,9 +113,8 @@ def apply(
     """`project` without its checks."""
     residual, magnitude = residual_of(manifold, values, t, candidate, args)
     weights = inverse_metric(projection.metric, real_view(candidate))
-    anchor, step = real_view(anchor), None if step is None else step.view()
     like = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), candidate)
-    problem = Problem(residual, magnitude, weights, t, args, values, like, anchor, step)
+    problem = Problem(residual, magnitude, weights, t, args, values, like, real_view(anchor), step)
     y, info = projection.solve(problem, real_view(candidate))
     return from_view(y, candidate), info
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Real
 
 from .._balance import integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._tree import tree_add, tree_all_finite, tree_stop_gradient, working_dtype
+from .._tree import real_view, tree_add, tree_all_finite, tree_stop_gradient, working_dtype
 from .base import AbstractProjection
 from .equations import Outcome, ProjectionInfo
 from .project import apply
@@ -71,7 +71,7 @@ class Target(eqx.Module):
         if not self.projection.sees_step:
             return None
         start, end = start * self.direction, end * self.direction
-        return Step(start, end, y0, error, path(), self.direction)
+        return Step(start, end, real_view(y0), real_view(error), path(), self.direction)
 
     def project(
         self,
