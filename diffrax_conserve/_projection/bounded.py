@@ -175,12 +175,6 @@ def _polished(
     return y, multiplier
 
 
-class _Inner(NamedTuple):
-    unfinished: Bool[Array, ""]
-    multiplier: Vector
-    num_steps: Int[Array, ""]
-
-
 def _quadratic_program(
     equations: Equations, box: Box, base: AbstractJacobian, g: Vector, y: Y, multiplier: Vector
 ) -> Vector:
@@ -193,7 +187,7 @@ def _quadratic_program(
     dtype = working_dtype(candidate)
     scale = equations.scale(base, y)
 
-    def body(carry: _Inner) -> _Inner:
+    def body(carry: tuple[Array, Vector, Array]) -> tuple[Array, Vector, Array]:
         _, multiplier, count = carry
         z = tree_add(candidate, equations.correction(base, multiplier))
         x = box.clip(z)
@@ -217,10 +211,10 @@ def _quadratic_program(
         length = _least(slope_at, dtype)
         multiplier = tree_add(multiplier, tree_scale(length, change))
         unfinished = (merit > float(jnp.finfo(dtype).eps)) & (slope < 0) & (merit < jnp.inf)
-        return _Inner(unfinished & (count + 1 < _INNER_STEPS), multiplier, count + 1)
+        return unfinished & (count + 1 < _INNER_STEPS), multiplier, count + 1
 
-    start = _Inner(jnp.asarray(True), multiplier, jnp.asarray(0))
-    return lax.while_loop(lambda carry: carry.unfinished, body, start).multiplier
+    start = jnp.asarray(True), multiplier, jnp.asarray(0)
+    return lax.while_loop(lambda carry: carry[0], body, start)[1]
 
 
 def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
