@@ -266,7 +266,7 @@ class MatrixFree(AbstractJacobian):
     ) -> GramSolver:
         # The outer iteration corrects the remaining error, so the total number of inner iterations
         # hardly depends on the tolerance.
-        solver = lx.CG(rtol=1e-4, atol=float(jnp.finfo(working_dtype(weights)).tiny))
+        solver = lx.CG(rtol=1e-4, atol=1e-4)
         return lineax_solver(solver, self, weights, other, damping)
 
 
