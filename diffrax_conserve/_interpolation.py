@@ -96,5 +96,5 @@ class MakeManifoldInterpolation:
     def __call__(
         self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, **fields: Any
     ) -> ManifoldInterpolation:
-        inner = self.inner_cls(t0=t0, t1=t1, **inner)
-        return ManifoldInterpolation(t0=t0, t1=t1, inner=inner, **fields)
+        path = self.inner_cls(t0=t0, t1=t1, **inner)
+        return ManifoldInterpolation(t0=t0, t1=t1, inner=path, **fields)
