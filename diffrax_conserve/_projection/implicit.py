@@ -50,18 +50,34 @@ def solve_linearised(
     def scaled(x: tuple[Y, Vector]) -> tuple[Y, Vector]:
         return divided(fn(jtu.tree_map(jnp.multiply, x, columns)), rows)
 
-    x, b = divided(unknowns, columns), divided(right, rows)
-    flat, unravel = jfu.ravel_pytree(x)
-    eps = float(jnp.finfo(flat.dtype).eps)
-    if flat.size > SYSTEM_DENSE_MAX:
-        tolerance = eps ** (2 / 3)
-        operator = lx.JacobianLinearOperator(lambda y, _: scaled(y), x)
-        solver = lx.GMRES(rtol=tolerance, atol=tolerance)
-        solution = lx.linear_solve(operator, b, solver, throw=False).value
+    x, unravel = jfu.ravel_pytree(divided(unknowns, columns))
+    b, _ = jfu.ravel_pytree(divided(right, rows))
+
+    def flat(x: Array) -> Array:
+        return jfu.ravel_pytree(scaled(unravel(x)))[0]
+
+    if x.size > SYSTEM_DENSE_MAX:
+
+        def product(v: Array) -> Array:
+            return jax.jvp(flat, (x,), (v,))[1]
+
+        solution = lax.custom_linear_solve(product, b, _iteratively, _iteratively)
     else:
-        matrix = jax.jacfwd(lambda x: jfu.ravel_pytree(scaled(unravel(x)))[0])(flat)
-        solution = unravel(_shortest(matrix, jfu.ravel_pytree(b)[0], 64 * eps))
-    return jtu.tree_map(jnp.multiply, solution, columns)
+        rcond = 64 * float(jnp.finfo(x.dtype).eps)
+        solution = _shortest(jax.jacfwd(flat)(x), b, rcond)
+    return jtu.tree_map(jnp.multiply, unravel(solution), columns)
+
+
+def _iteratively(product: Callable[[Array], Array], b: Array) -> Array:
+    """The solution of `product(x) = b`, NaN where it is not found."""
+    eps = float(jnp.finfo(b.dtype).eps)
+    largest = jnp.max(jnp.abs(b))
+    size = jnp.where(largest > 0, largest, 1)  # because tolerances are absolute
+    operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: b))
+    solver = lx.GMRES(rtol=eps ** (2 / 3), atol=eps ** (2 / 3))
+    x = lx.linear_solve(operator, b / size, solver, throw=False).value
+    found = jnp.max(jnp.abs(product(x) - b / size)) <= jnp.sqrt(eps)
+    return jnp.where(found, x, jnp.nan) * size
 
 
 def _shortest(matrix: Array, b: Array, rcond: float) -> Array:

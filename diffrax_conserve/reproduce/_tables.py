@@ -181,7 +181,9 @@ def _line(system: AbstractSystem, ts: np.ndarray, ys: Any) -> dict[str, np.ndarr
         (t0, y0), (t1, y1) = take((ts, ys), k - 1), take((ts, ys), k)
         k0 = tree_scale(t1 - t0, system.vector_field(t0, y0, system.args))
         k1 = tree_scale(t1 - t0, system.vector_field(t1, y1, system.args))
-        path = dfx.ThirdOrderHermitePolynomialInterpolation(t0=t0, t1=t1, y0=y0, y1=y1, k0=k0, k1=k1)
+        path = dfx.ThirdOrderHermitePolynomialInterpolation(
+            t0=t0, t1=t1, y0=y0, y1=y1, k0=k0, k1=k1
+        )
         return path.evaluate(t)
 
     return _paths(system, state(jnp.linspace(ts[0], ts[-1], _POINTS * (ts.size - 1) + 1)))

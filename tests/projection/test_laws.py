@@ -126,6 +126,12 @@ def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
     b=np.zeros(2),
     weights=np.zeros(4),
 )
+@example(  # the first constraint vanishes where it is met, with every term
+    y=np.zeros(4),
+    matrix=np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]]),
+    b=np.array([0.0, 1.0]),
+    weights=np.log([3.3, 7.3, 0.53, 0.16]),
+)
 @example(
     y=np.zeros(4),
     matrix=np.array([[1, 0, 2**-9, 0], [1, 0, 0, 2**-9]]),
