@@ -207,15 +207,15 @@ def leave_a_lane_of_a_batch_unfinished(package):
 def judge_success_by_the_scale_at_the_candidate(package):
     linearise = package.find("linearise")
 
-    def mutate(iterate):
-        def mutated(equations, **options):
-            before, last = iterate(equations, **options)
-            _, jacobian = linearise(equations.residual, equations.candidate)
-            return before, last._replace(scale=equations.scale(jacobian, equations.candidate))
+    def mutate(scale):
+        def mutated(self, jacobian, y):
+            del jacobian, y
+            _, at_candidate = linearise(self.residual, self.candidate)
+            return scale(self, at_candidate, self.candidate)
 
         return mutated
 
-    package.function("iterate", mutate)
+    package.method("Equations.scale", mutate)
 
 
 @noticed_by("tests/laws/test_never_silent.py", "-k", "parallel")
