@@ -12,7 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._networks import AbstractFlowMap, args_domain_of, as_flow_map, at_args
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
+from .._networks.with_args import at_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import check_learned_terms, check_nodes, check_output
 from .error_estimate import estimate

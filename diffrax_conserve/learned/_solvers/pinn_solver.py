@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._solver.terms import time_direction
 from ..._tree import working_dtype
-from .._networks import PINN
+from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
 from .checks import check_learned_terms, check_nodes, check_output
 

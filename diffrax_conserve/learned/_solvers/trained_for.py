@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import Args, RealScalarLike, Y
-from .._networks import AbstractFlowMap
+from .._networks.flow_map import AbstractFlowMap
 from .sweeps import increment
 
 # The largest accepted difference of the two slopes, relative to the larger one. The slope of a

@@ -16,17 +16,12 @@ from ..._manifold import check_manifold, check_outputs
 from ..._options import check_number
 from ..._projection import check_state
 from ..._tree import tree_shapes
-from .._networks import (
-    PINN,
-    AbstractFlowMap,
-    AbstractTrainable,
-    DeepONet,
-    Points,
-    as_flow_map,
-    has_arrays,
-)
+from .._networks.deeponet import DeepONet
 from .._networks.flat import stacked_vectors
-from .._solvers import check_output
+from .._networks.flow_map import AbstractFlowMap, as_flow_map, has_arrays
+from .._networks.pinn import PINN
+from .._networks.trainable import AbstractTrainable, Points
+from .._solvers.checks import check_output
 from .defect import VectorField
 from .pool import Pool
 from .recipe import Recipe

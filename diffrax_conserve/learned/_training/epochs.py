@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._tree import tree_all_finite
-from .._networks import LayerSchedule, Points
+from .._networks.trainable import LayerSchedule, Points
 from .data import draw_points
 from .defect import squared_norms
 from .objective import Carry, Objective

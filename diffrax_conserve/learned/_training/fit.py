@@ -15,16 +15,10 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks import (
-    PINN,
-    OfPairs,
-    PairField,
-    PairSampler,
-    Sampler,
-    args_domain_of,
-    as_flow_map,
-    restored,
-)
+from .._networks.flow_map import args_domain_of, as_flow_map, restored
+from .._networks.pinn import PINN
+from .._networks.trainable import Sampler
+from .._networks.with_args import OfPairs, PairField, PairSampler
 from .arguments import (
     check_arguments,
     check_family,

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args
-from .._networks import AbstractTrainable, LayerSchedule, Points, Sampler
+from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
 from .data import Data, draw_points, mismatch
 from .defect import (
     VectorField,

@@ -22,8 +22,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, Y
-from .._networks import AbstractFlowMap, AbstractTrainable, Points, Sampler, Window
 from .._networks.flat import flatten, stacked_vectors, unflatten
+from .._networks.flow_map import AbstractFlowMap
+from .._networks.pinn import Window
+from .._networks.trainable import AbstractTrainable, Points, Sampler
 from .data import Data
 from .defect import VectorField
 

@@ -16,7 +16,9 @@ from ..._custom_types import Args, Manifold, RealScalarLike, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection import project
 from ..._tree import tree_all_finite
-from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
+from .._networks.domain import AbstractDomain
+from .._networks.flow_map import AbstractFlowMap
+from .._networks.trainable import Points, Sampler
 
 # A function from steps, each given by an initial state and a length, to the squared norms of the
 # defects at their ends.

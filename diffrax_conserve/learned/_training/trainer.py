@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args
-from .._networks import AbstractTrainable, Sampler
+from .._networks.trainable import AbstractTrainable, Sampler
 from .data import Data
 from .defect import VectorField
 from .epochs import advance

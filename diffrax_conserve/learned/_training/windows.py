@@ -15,9 +15,9 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._custom_types import Args, Manifold
 from ..._manifold import conserved_values
 from ..._projection import project
-from .._networks import PINN, Window, fresh, initial_slope
 from .._networks.flat import flatten
-from .._networks.mlp import MLP
+from .._networks.mlp import MLP, fresh, initial_slope
+from .._networks.pinn import PINN, Window
 from .objective import Objective
 from .path_error import relative, window_errors
 from .state import FitState, Windows
