@@ -95,14 +95,9 @@ def window_errors(
     initial: Float[Array, " n"],
     substeps: int,
 ) -> PathErrors:
-    """The errors of a window that starts without an error, and with the error `initial`."""
-
-    def twice(x: Array) -> Array:
-        return jnp.stack([x, x])
-
-    both = jnp.stack([jnp.zeros_like(initial), initial])
-    paths = Points(twice(window.start), None)
-    return path_errors(window, vector_field, args, paths, twice(window.length), both, substeps)
+    """The errors of a window, as a single path, that starts with the error `initial`."""
+    paths, lengths = Points(window.start[None], None), window.length[None]
+    return path_errors(window, vector_field, args, paths, lengths, initial[None], substeps)
 
 
 def step_error(

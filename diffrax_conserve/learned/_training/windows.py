@@ -247,12 +247,12 @@ def _errors_along(trainer: Trainer, pinn: PINN) -> list[float]:
     for k in range(pinn.windows):
         window = pinn.window(k)
         found = window_errors(window, trainer.vector_field, trainer.args, error, trainer.substeps)
-        largest.append(np.asarray(found.largest[1]))
-        sizes.append(np.asarray(found.size[1]))
+        largest.append(np.asarray(found.largest[0]))
+        sizes.append(np.asarray(found.size[0]))
         if k + 1 < pinn.windows:
             # The next window starts at another state, but the exact solution is continuous.
             end = flatten(window(window.start + window.length))
-            error = found.end[1] + end - flatten(pinn.window(k + 1).y0)
+            error = found.end[0] + end - flatten(pinn.window(k + 1).y0)
     size = np.max(sizes, axis=0)
     return [relative(e, size, pinn.y0) for e in largest]
 
