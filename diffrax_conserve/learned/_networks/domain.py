@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real, Shaped
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Y
 from .flat import as_state
@@ -54,14 +54,8 @@ class Box(AbstractDomain):
         ```
     """
 
-    lower: PyTree[Real[Array, "..."]]
-    upper: PyTree[Real[Array, "..."]]
-
-    def __init__(
-        self, lower: PyTree[Shaped[ArrayLike, "..."]], upper: PyTree[Shaped[ArrayLike, "..."]]
-    ):
-        self.lower = as_state(lower)
-        self.upper = as_state(upper)
+    lower: PyTree[Real[Array, "..."]] = eqx.field(converter=as_state)
+    upper: PyTree[Real[Array, "..."]] = eqx.field(converter=as_state)
 
     def __check_init__(self):
         lower, upper = jtu.tree_structure(self.lower), jtu.tree_structure(self.upper)

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
 
 from ..._custom_types import Y
 from ..._tree import working_dtype
@@ -29,7 +29,7 @@ def unflatten(vector: Float[Array, " n"], like: Y) -> Y:
     return jtu.tree_unflatten(treedef, out)
 
 
-def as_state(y: Y) -> Y:
+def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`y` with arrays as leaves; raises unless they are real and floating-point."""
     leaves = jtu.tree_leaves(y)
     if not leaves:

@@ -177,7 +177,7 @@ FlowMap.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-def as_flow_map(model: Any) -> AbstractFlowMap:
+def as_flow_map(model: AbstractFlowMap | Callable[..., Any]) -> AbstractFlowMap:
     """`model` as a flow map, also for a function with an attribute `max_step`."""
     if isinstance(model, AbstractFlowMap):
         return model

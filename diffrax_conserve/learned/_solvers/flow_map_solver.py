@@ -1,7 +1,7 @@
 """A learned flow map as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._projection import option
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.with_args import at_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
@@ -104,35 +105,16 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         equations", BIT 40 (2000), for correction by sweeps.
     """
 
-    flow_map: AbstractFlowMap
-    outside: AbstractPolicy | None
-    max_error: RealScalarLike | None
-    sweep: AbstractSweep
-    nodes: int = eqx.field(static=True)
-    corrections: int = eqx.field(static=True)
-    check_field: bool = eqx.field(static=True)
+    flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
+    nodes: int = option(12, static=True)
+    corrections: int = option(0, static=True)
+    sweep: AbstractSweep = option(Picard())
+    outside: AbstractPolicy | None = eqx.field(default=None, kw_only=True, converter=as_policy)
+    max_error: RealScalarLike | None = option(None)
+    check_field: bool = option(True, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
-
-    def __init__(
-        self,
-        flow_map: AbstractFlowMap | Callable[..., Any],
-        *,
-        nodes: int = 12,
-        corrections: int = 0,
-        sweep: AbstractSweep = Picard(),
-        outside: AbstractPolicy | dfx.AbstractSolver | None = None,
-        max_error: RealScalarLike | None = None,
-        check_field: bool = True,
-    ):
-        self.flow_map = as_flow_map(flow_map)
-        self.nodes = nodes
-        self.corrections = corrections
-        self.sweep = sweep
-        self.outside = as_policy(outside)
-        self.max_error = max_error
-        self.check_field = check_field
 
     def __check_init__(self):
         check_nodes(self.nodes)

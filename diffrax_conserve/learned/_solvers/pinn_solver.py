@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._projection import option
 from ..._solver.terms import time_direction
 from ..._tree import working_dtype
 from .._networks.pinn import PINN
@@ -59,14 +60,10 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
     """
 
     pinn: PINN
-    nodes: int = eqx.field(static=True)
+    nodes: int = option(12, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
-
-    def __init__(self, pinn: PINN, *, nodes: int = 12):
-        self.pinn = pinn
-        self.nodes = nodes
 
     def __check_init__(self):
         check_nodes(self.nodes)

@@ -196,7 +196,7 @@ def _step_of(solver: dfx.AbstractSolver, inputs: StepInputs, nodes: int) -> Step
     return StepResult(y1, error, coefficients, result)
 
 
-def as_policy(outside: Any) -> AbstractPolicy | None:
+def as_policy(outside: AbstractPolicy | dfx.AbstractSolver | None) -> AbstractPolicy | None:
     """`outside` as a policy; a diffrax solver becomes `Replace(solver)`."""
     if isinstance(outside, dfx.AbstractSolver):
         return Replace(outside)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection import check_state
+from ..._projection import check_state, option
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import check_ode
 from .chebyshev import ChebyshevInterpolation
@@ -92,15 +92,11 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         methods", J. Numer. Anal. Ind. Appl. Math. 5 (2010), for polynomials.
     """
 
-    features: int = eqx.field(static=True)
-    seed: int = eqx.field(static=True)
+    features: int = eqx.field(default=16, static=True)
+    seed: int = option(0, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
-
-    def __init__(self, features: int = 16, *, seed: int = 0):
-        self.features = features
-        self.seed = seed
 
     def __check_init__(self):
         if not (isinstance(self.features, int) and _FEWEST <= self.features <= _MOST):

@@ -152,7 +152,8 @@ def fit(
     check_arguments(model, sample, data, manifold)
     check_limits(state, target, seconds)
     recipe = second_order(model) if recipe is None else recipe
-    flow_map = None if isinstance(model, PINN) else as_flow_map(model)
+    given: Any = model
+    flow_map = None if isinstance(model, PINN) else as_flow_map(given)
     if flow_map is not None and (domain := args_domain_of(flow_map)) is not None:
         check_family(sample, args)
         flow_map = OfPairs(flow_map)
