@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection import option
+from ..._tree import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.with_args import at_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
@@ -21,11 +22,10 @@ from .error_estimate import estimate
 from .policies import (
     AbstractPolicy,
     DomainStatistics,
-    StepInputs,
     StepResult,
     as_policy,
     check_policy,
-    small_enough,
+    step_of,
 )
 from .step_length import refuse_backwards, reject_too_long
 from .sweeps import AbstractSweep, Increment, Path, Picard, correct, increment
@@ -182,10 +182,14 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         step = self._learned(flow_map, h, y0, increment(terms, t0, t1, y0, args))
         if self.outside is not None and solver_state is not None:
             inside = flow_map.inside(y0, h)
-            accurate = self._accurate(step.error)
+            accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
             solver_state = solver_state.add(t0, inside & accurate)
-            inputs = StepInputs(terms, t0, t1, y0, args)
-            step = self.outside(step, inside, accurate, inputs, self.nodes)
+            step = self.outside(
+                step,
+                inside,
+                accurate,
+                lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args),
+            )
         step = reject_too_long(step, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, solver_state, step.result
@@ -207,9 +211,6 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
             y1 = unravel(path[-1])
         states = jax.vmap(unravel)(path)
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
-
-    def _accurate(self, error: Y) -> Array:
-        return jnp.asarray(True if self.max_error is None else small_enough(error, self.max_error))
 
 
 def _path(flow_map: AbstractFlowMap, nodes: int, h: Array, y0: Y) -> Path:
