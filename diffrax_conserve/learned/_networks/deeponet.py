@@ -10,10 +10,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import working_dtype
+from ..._tree import unflatten, working_dtype
 from .cores import AbstractCore, Product, Sizes
 from .domain import Box, FramedBox
-from .flat import as_state, flatten, stacked_vectors, unflatten
+from .flat import as_state, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, check_args_domain, checked_args
 from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer

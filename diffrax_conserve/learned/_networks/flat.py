@@ -1,7 +1,5 @@
 """Conversion of states to vectors, the inputs and outputs of a network."""
 
-import math
-
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
@@ -15,18 +13,6 @@ def flatten(y: Y) -> Float[Array, " n"]:
     dtype = working_dtype(y)
     leaves = [jnp.asarray(x).astype(dtype).reshape(-1) for x in jtu.tree_leaves(y)]
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
-
-
-def unflatten(vector: Float[Array, " n"], like: Y) -> Y:
-    """The components of `vector` in the structure, shapes and dtypes of `like`."""
-    leaves, treedef = jtu.tree_flatten(like)
-    out, start = [], 0
-    for leaf in leaves:
-        shape = jnp.shape(leaf)
-        stop = start + math.prod(shape)
-        out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
-        start = stop
-    return jtu.tree_unflatten(treedef, out)
 
 
 def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:

@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, Y
-from .._networks.flat import flatten, stacked_vectors, unflatten
+from ..._tree import unflatten
+from .._networks.flat import flatten, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import Window
 from .._networks.trainable import AbstractTrainable, Points, Sampler
