@@ -7,7 +7,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax.flatten_util import ravel_pytree
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection import check_state, option
@@ -15,7 +15,8 @@ from ..._solver.diffrax_private import member, register
 from ..._solver.terms import check_ode
 from .chebyshev import ChebyshevInterpolation
 from .feature_basis import feature_basis
-from .galerkin import StepEquations, dense_series, error, flatten, solve
+from .galerkin import StepEquations, dense_series, error, solve
+from .sweeps import increment
 
 # With fewer features none is random; with more they cannot be distinguished in double precision.
 _FEWEST, _MOST = 3, 32
@@ -140,24 +141,18 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, None, dfx.RESULTS]:
         del solver_state, made_jump
-        start, unflatten = flatten(y0)
-        t0, control = jnp.asarray(t0), terms.contr(t0, t1)
-
-        def increment(fraction: Array, state: Array) -> Array:
-            t = t0 + (t1 - t0) * fraction.astype(t0.dtype)
-            slope, _ = flatten(terms.vf_prod(t, unflatten(state), args, control))
-            return slope.astype(state.dtype)
-
-        equations = StepEquations(feature_basis(self.features, self.seed), increment, start)
+        start, unravel = ravel_pytree(y0)
+        basis = feature_basis(self.features, self.seed)
+        equations = StepEquations(basis, increment(terms, t0, t1, y0, args), start)
         coefficients, found = solve(equations)
         errors = error(equations, coefficients)
         series = dense_series(equations, coefficients, errors)
         # Only the first row changes the end of the step: the other members have a mean of zero.
         known = found & jnp.all(jnp.isfinite(errors[0]))
         return (
-            unflatten(start + coefficients[0]),
-            unflatten(jnp.where(known, jnp.abs(errors[0]), jnp.inf)),
-            dict(coefficients=jax.vmap(unflatten)(series)),
+            unravel(start + coefficients[0]),
+            unravel(jnp.where(known, jnp.abs(errors[0]), jnp.inf)),
+            dict(coefficients=jax.vmap(unravel)(series)),
             None,
             dfx.RESULTS.where(found, dfx.RESULTS.successful, member(_UNSOLVED)),
         )
