@@ -13,11 +13,14 @@ difference of neighbouring points is needed, so the roundoff is that of the stat
 To first order in $e$ that is the linearised defect equation $e' = \partial f\, e + (f(p) - p')$.
 """
 
+from collections.abc import Callable
+
 import jax.lax as lax
 import jax.numpy as jnp
 from jax import vmap
 from jaxtyping import Array, Inexact
 
+from ..._custom_types import RealScalarLike
 from .chebyshev import at, fractions, integrals
 from .sweeps import Increment, Path
 
@@ -35,16 +38,26 @@ def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
     states, fields = at(places, path + rho), at(places, values)
     times = jnp.asarray(places, real)
 
-    def slope(index: Array | int, d: Array) -> Array:
+    def slope(index: Array, d: Array) -> Array:
         return increment(times[index], states[index] + d) - fields[index]
 
-    def substep(d: Array, start: Array) -> tuple[Array, None]:
-        h = 1 / _SUBSTEPS
-        k1 = slope(start, d)
-        k2 = slope(start + 1, d + h / 2 * k1)
-        k3 = slope(start + 1, d + h / 2 * k2)
-        k4 = slope(start + 2, d + h * k3)
-        return d + h / 6 * (k1 + 2 * (k2 + k3) + k4), None
-
-    d, _ = lax.scan(substep, jnp.zeros_like(path[0]), 2 * jnp.arange(_SUBSTEPS))
+    d, _ = rk4_errors(slope, jnp.zeros_like(path[0]), 1 / _SUBSTEPS, _SUBSTEPS)
     return rho[-1] + d
+
+
+def rk4_errors(
+    slope: Callable[[Array, Array], Array], start: Array, h: RealScalarLike | Array, substeps: int
+) -> tuple[Array, Array]:
+    """The error at the end, and after each substep, by RK4 steps of length `h` for `d' = slope`.
+
+    The first argument of `slope` counts half substeps."""
+
+    def substep(d: Array, i: Array) -> tuple[Array, Array]:
+        k1 = slope(i, d)
+        k2 = slope(i + 1, d + h / 2 * k1)
+        k3 = slope(i + 1, d + h / 2 * k2)
+        k4 = slope(i + 2, d + h * k3)
+        d = d + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        return d, d
+
+    return lax.scan(substep, start, 2 * jnp.arange(substeps))

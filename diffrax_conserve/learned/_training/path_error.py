@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -27,6 +26,7 @@ from .._networks.flat import flatten, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import Window
 from .._networks.trainable import AbstractTrainable, Points, Sampler
+from .._solvers.error_estimate import rk4_errors
 from .data import Data
 from .defect import VectorField
 
@@ -75,17 +75,8 @@ def path_errors(
 
         return jax.vmap(one)(ts[i], us[i] + e) - rates[i]
 
-    def substep(e: Array, i: Array) -> tuple[Array, Array]:
-        h = (lengths / substeps)[:, None]
-        k1 = slope(i, e)
-        k2 = slope(i + 1, e + h / 2 * k1)
-        k3 = slope(i + 1, e + h / 2 * k2)
-        k4 = slope(i + 2, e + h * k3)
-        e = e + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-        return e, jnp.abs(e)
-
-    end, history = lax.scan(substep, initial, 2 * jnp.arange(substeps))
-    largest = jnp.maximum(jnp.max(history, axis=0), jnp.abs(initial))
+    end, history = rk4_errors(slope, initial, (lengths / substeps)[:, None], substeps)
+    largest = jnp.maximum(jnp.max(jnp.abs(history), axis=0), jnp.abs(initial))
     return PathErrors(largest, end, jnp.max(jnp.abs(us), axis=0))
 
 
