@@ -23,9 +23,17 @@ class AbstractIntegratedSystem(AbstractSystem):
 
 
 def integrate(
-    system: AbstractSystem, ts: Float[Array, " times"], y0: Any, *, atol: float = 1e-15
+    system: AbstractSystem,
+    ts: Float[Array, " times"],
+    y0: Any,
+    *,
+    solver: dfx.AbstractSolver = dfx.Dopri8(),
+    rtol: float = 1e-15,
+    atol: float = 1e-15,
+    max_steps: int = 10**7,
 ) -> Any:
-    """The states at `ts` by the eighth-order method of Dormand and Prince, in float64.
+    """The states at `ts`, in float64 and by default by the eighth-order method of Dormand and
+    Prince.
 
     The solver steps exactly to `ts`, because dense output has errors of 1e-10 even at tolerances
     near roundoff. The tolerances are at roundoff because local errors add up: over the default time
@@ -33,10 +41,10 @@ def integrate(
     1e-13 to 4e-11, with 1.6 times the steps (compared with closed forms, and with a tolerance of
     1e-16).
     """
-    controller = dfx.ClipStepSizeController(dfx.PIDController(rtol=1e-15, atol=atol), step_ts=ts)
+    controller = dfx.ClipStepSizeController(dfx.PIDController(rtol, atol), step_ts=ts)
     sol = dfx.diffeqsolve(
         dfx.ODETerm(system.vector_field),
-        dfx.Dopri8(),
+        solver,
         t0=0.0,
         t1=ts[-1],
         dt0=None,
@@ -44,6 +52,6 @@ def integrate(
         args=system.args,
         saveat=dfx.SaveAt(ts=ts),
         stepsize_controller=controller,
-        max_steps=10**7,
+        max_steps=max_steps,
     )
     return sol.ys
