@@ -250,14 +250,9 @@ def _first(trainer: Trainer, model: Any, given: FitState | None) -> FitState:
 def _log(trainer: Trainer, state: FitState, ended: str, error: float, errors: Any = ()) -> FitLog:
     past = state.past.and_then(state.carry, state.checked, state.criteria)
     return FitLog(
+        **vars(past),
         error=error,
         errors=np.asarray(errors),
-        losses=past.losses,
-        checked=past.checked,
-        criteria=past.criteria,
-        best_epoch=past.best_epoch,
-        best=past.best,
-        skipped=past.skipped,
         ended=ended,
         seconds=time.perf_counter() - trainer.begun - trainer.compile_seconds,
         compile_seconds=trainer.compile_seconds,
