@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Y
-from .flat import as_state
+from .flat import as_state, as_states
 from .frame import Frame, MakeFrame, frame_at
 
 
@@ -69,12 +69,7 @@ class Box(AbstractDomain):
     @classmethod
     def around(cls, states: Y) -> "Box":
         """The smallest box around `states`, which are stacked along a leading axis."""
-        states = as_state(states)
-        if any(jnp.ndim(x) == 0 or jnp.shape(x)[0] == 0 for x in jtu.tree_leaves(states)):
-            raise ValueError(
-                "`states` must be at least one state, stacked along a leading axis. For a single "
-                "state write `jax.tree.map(lambda x: x[None], y0)`."
-            )
+        states = as_states(states)
         lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
         return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
 

@@ -29,6 +29,20 @@ def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]
     return jtu.tree_map(_floating, y)
 
 
+def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
+    """`as_state` of states that are stacked along a leading axis; raises unless they are."""
+    states = as_state(states)
+    shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
+    lengths = {shape[:1] for shape in shapes}
+    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
+        raise ValueError(
+            "`states` must be at least one state, stacked along a leading axis, but its leaves "
+            f"have shapes {shapes}. For a single state write "
+            "`jax.tree.map(lambda x: x[None], y0)`."
+        )
+    return states
+
+
 def _floating(leaf: ArrayLike) -> Array:
     """`leaf` as an array with a floating-point dtype."""
     dtype = jnp.result_type(leaf)
