@@ -206,6 +206,12 @@ def check_args_domain(domain: Any) -> None:
         )
 
 
+def known_args(flow_map: AbstractFlowMap, args: Args) -> tuple[Args, ...]:
+    """What the flow map is called with between the state and the step: `(args,)`, or nothing."""
+    domain = args_domain_of(flow_map)
+    return () if domain is None else (checked_args(domain, args),)
+
+
 def checked_args(domain: Box, args: Args) -> Args:
     """`args` as arrays; raises unless they have the structure and shapes of those of the domain."""
     expected, got = (tree_shapes(x) for x in (domain.lower, args))

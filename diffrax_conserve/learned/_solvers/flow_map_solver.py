@@ -14,8 +14,7 @@ from jaxtyping import Array
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection import option
 from ..._tree import tree_max
-from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
-from .._networks.with_args import at_args
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import check_learned_terms, check_nodes, check_output
 from .error_estimate import estimate
@@ -160,10 +159,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         args: Args,
     ) -> DomainStatistics | None:
         check_learned_terms(terms, "FlowMapSolver")
-        flow_map = at_args(self.flow_map, args)
-        check_output(flow_map, (y0, t1 - t0), y0, "flow_map")
+        known = known_args(self.flow_map, args)
+        check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
         if self.check_field:
-            refuse_another_field(flow_map, terms, t0, t1, y0, args)
+            refuse_another_field(self.flow_map, known, terms, t0, t1, y0, args)
         return None if self.outside is None else DomainStatistics.zero(t0)
 
     def step(
@@ -177,11 +176,13 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
         del made_jump
-        flow_map = at_args(self.flow_map, args)
+        flow_map, known = self.flow_map, known_args(self.flow_map, args)
         h = refuse_backwards(jnp.asarray(t1 - t0), terms, flow_map.max_step)
-        step = self._learned(flow_map, h, y0, increment(terms, t0, t1, y0, args))
+        step = self._learned(known, h, y0, increment(terms, t0, t1, y0, args))
         if self.outside is not None and solver_state is not None:
-            inside = flow_map.inside(y0, h)
+            inside = flow_map.inside(y0, *known, h)
+            if (box := args_domain_of(flow_map)) is not None:
+                inside &= box.contains(*known)
             accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
             solver_state = solver_state.add(t0, inside & accurate)
             step = self.outside(
@@ -198,13 +199,14 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         return terms.vf(t0, y0, args)
 
     def _learned(
-        self, flow_map: AbstractFlowMap, h: Array, y0: Y, increment: Increment
+        self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
     ) -> StepResult:
         """The step of the flow map, after the correction sweeps."""
         _, unravel = ravel_pytree(y0)
-        path = _path(flow_map, self.nodes, h, y0)
+        path = _path(self.flow_map, self.nodes, known, h, y0)
         if self.corrections == 0:
-            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), flow_map(y0, h), y0)
+            y1 = self.flow_map(y0, *known, h)
+            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), y1, y0)
             error = estimate(increment, path)
         else:
             path, error = correct(self.sweep, increment, path, self.corrections)
@@ -213,12 +215,12 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
 
-def _path(flow_map: AbstractFlowMap, nodes: int, h: Array, y0: Y) -> Path:
+def _path(flow_map: AbstractFlowMap, nodes: int, known: tuple[Args, ...], h: Array, y0: Y) -> Path:
     """The states of the flow map at the nodes; the first is the initial state."""
     start, _ = ravel_pytree(y0)
 
     def state(fraction: Array) -> Array:
-        return ravel_pytree(flow_map(y0, fraction * h))[0].astype(start.dtype)
+        return ravel_pytree(flow_map(y0, *known, fraction * h))[0].astype(start.dtype)
 
     rows = jax.vmap(state)(fractions(nodes, h.dtype)[1:])
     return jnp.concatenate([start[None], rows])

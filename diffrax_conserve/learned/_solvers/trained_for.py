@@ -23,6 +23,7 @@ _LITTLE = 1e-3
 
 def refuse_another_field(
     flow_map: AbstractFlowMap,
+    known: tuple[Args, ...],
     terms: dfx.AbstractTerm,
     t0: RealScalarLike,
     t1: RealScalarLike,
@@ -35,7 +36,7 @@ def refuse_another_field(
     """
     start, _ = ravel_pytree(y0)
     length = jnp.asarray(t1 - t0)
-    slope = ravel_pytree(flow_map.slope(y0))[0].astype(start.dtype)
+    slope = ravel_pytree(flow_map.slope(y0, *known))[0].astype(start.dtype)
     field = increment(terms, t0, t1, y0, args)(jnp.zeros_like(length), start) / length
     slope, field = lax.stop_gradient(slope), lax.stop_gradient(field)
     difference, size = _norm(slope - field), jnp.maximum(_norm(slope), _norm(field))
