@@ -8,6 +8,7 @@ from .directional import Directional as Directional
 from .newton import Newton as Newton
 from .project import check_metric as check_metric
 from .project import check_state as check_state
+from .project import given_values as given_values
 from .project import project as project
 from .project import tangential as tangential
 from .residual import largest as largest

@@ -17,12 +17,12 @@ from .._manifold import (
     Constraint,
     FirstIntegral,
     check_manifold,
-    check_values,
     conserved_values,
     evaluate,
     is_entry,
     named_entries,
 )
+from .._projection import given_values
 from .._projection import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
 
@@ -146,7 +146,7 @@ def assert_on_manifold(
     check_manifold(manifold)
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float))
-    values = _given_values(manifold, value, t, y, args)
+    values = given_values(manifold, value, t, y, args)
     ts, ys = t[None], jtu.tree_map(lambda x: x[None], y)
     lane = jtu.tree_map(lambda x: x[None], (ts, ys, t, y))
     measured = _measure_lanes(manifold, values, lane, args)
@@ -246,28 +246,6 @@ def _check_comparable(ts: Float[Array, "..."], manifold: Manifold) -> None:
                 f"`solution` holds one saved state, with nothing to compare `{name}` with. Pass "
                 "`y0=...`, or save the initial state too, as in `SaveAt(t0=True, t1=True)`."
             )
-
-
-def _given_values(manifold: Manifold, value: Values | None, t: Array, y: Y, args: Args) -> Values:
-    for name, entry in named_entries(manifold):
-        if value is None and isinstance(entry, FirstIntegral) and entry.value is None:
-            raise ValueError(
-                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, or "
-                "write `FirstIntegral(fn, value=...)`."
-            )
-    own = conserved_values(manifold, t, y, args)
-    if value is None:
-        return own
-    check_values(manifold, value, t, y, args)
-    return jtu.tree_map(
-        lambda entry, given, own: (
-            own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
-        ),
-        manifold,
-        value,
-        own,
-        is_leaf=is_entry,
-    )
 
 
 def _limits(
