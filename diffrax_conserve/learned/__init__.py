@@ -38,7 +38,6 @@ from ._solvers.sweeps import AbstractSweep as AbstractSweep
 from ._solvers.sweeps import NewtonSweep as NewtonSweep
 from ._solvers.sweeps import Picard as Picard
 from ._training.fit import fit as fit
-from ._training.log import FitLog as FitLog
 from ._training.loss import Bounded as Bounded
 from ._training.loss import mean_square as mean_square
 from ._training.pool import Pool as Pool
@@ -55,6 +54,7 @@ from ._training.schedule import ramped_weight as ramped_weight
 from ._training.schedule import staged_iterations as staged_iterations
 from ._training.second_order import SPRING as SPRING
 from ._training.second_order import LevenbergMarquardt as LevenbergMarquardt
+from ._training.state import FitLog as FitLog
 from ._training.state import FitState as FitState
 from ._training.times import grid_times as grid_times
 from ._training.times import uniform_times as uniform_times

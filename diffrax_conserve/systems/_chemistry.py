@@ -11,9 +11,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
+from ._base import AbstractSystem, integrate, real
 from ._mechanism import Mechanism
-from ._reference import integrate
 
 State = Float[Array, " species"]
 

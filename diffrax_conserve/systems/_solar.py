@@ -9,8 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
-from ._reference import integrate
+from ._base import AbstractSystem, integrate, real
 
 Vectors = Float[Array, "bodies 3"]
 State = tuple[Vectors, Vectors]

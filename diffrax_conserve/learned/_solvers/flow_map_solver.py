@@ -16,8 +16,14 @@ from ..._projection import option
 from ..._tree import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
-from .checks import check_learned_terms, check_nodes, check_output
-from .error_estimate import estimate
+from .checks import (
+    check_learned_terms,
+    check_nodes,
+    check_output,
+    refuse_another_field,
+    refuse_backwards,
+    reject_too_long,
+)
 from .policies import (
     AbstractPolicy,
     DomainStatistics,
@@ -26,9 +32,7 @@ from .policies import (
     check_policy,
     step_of,
 )
-from .step_length import refuse_backwards, reject_too_long
-from .sweeps import AbstractSweep, Increment, Path, Picard, correct, increment
-from .trained_for import refuse_another_field
+from .sweeps import AbstractSweep, Increment, Path, Picard, correct, estimate, increment
 
 
 @final

@@ -29,14 +29,12 @@ from .arguments import (
 )
 from .data import as_data
 from .defect import VectorField
-from .log import FitLog
 from .objective import Objective
 from .path_error import data_error, step_error
 from .pool import Pool, with_domain
-from .progress import Progress
 from .recipe import Recipe, second_order
-from .state import FitState, Past, continued, fingerprint, read_checkpoint
-from .trainer import Trainer
+from .state import FitLog, FitState, Past, continued, fingerprint, read_checkpoint
+from .trainer import Progress, Trainer
 from .windows import WindowEnds, solution_error, train_windows, windows_of
 
 _Model = TypeVar("_Model", bound=eqx.Module)
