@@ -45,8 +45,7 @@ class ConservativeLayer(eqx.Module):
     include the layer. They follow from the implicit function theorem for $g(y) = r$, where $r$ is
     the remaining residual; no iteration is unrolled.
 
-    With few iterations, the output is near the manifold, and on it to roundoff only if the output
-    of the network is already close. For a state exactly on the manifold, wrap the solver in
+    For a state on the manifold to roundoff, wrap the solver in
     [`diffrax_conserve.ManifoldProjection`][].
 
     !!! example

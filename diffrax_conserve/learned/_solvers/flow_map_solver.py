@@ -62,14 +62,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
     `outside` determines what happens to a step that starts outside `flow_map.domain`, or whose
-    estimated error has a component larger than `max_error`:
-
-    - `None`: nothing, the default.
-    - [`diffrax_conserve.learned.Report`][]`()`: it is counted, for
-        [`diffrax_conserve.learned.domain_statistics`][].
-    - [`diffrax_conserve.learned.Refuse`][]`()`: it is counted, and the solve fails.
-    - [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver: that solver takes
-        the step, and it is counted.
+    estimated error has a component larger than `max_error`.
 
     Dense output follows the (corrected) path inside the step: it is the polynomial through its
     states at the `nodes` points, which without sweeps are computed only if dense output, saved
@@ -241,7 +234,11 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 - `corrections`: the number $k$ of correction sweeps.
 - `sweep`: [`diffrax_conserve.learned.Picard`][]`()` or
     [`diffrax_conserve.learned.NewtonSweep`][]`()`.
-- `outside`: the policy for steps outside the domain.
+- `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
+    counts them, for [`diffrax_conserve.learned.domain_statistics`][];
+    [`diffrax_conserve.learned.Refuse`][]`()` also fails; with
+    [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver, that solver takes
+    them. Default: nothing happens.
 - `max_error`: the largest estimated error of a component, in its own units, of a step that counts
     as inside. Default: only the domain decides.
 - `check_field`: whether to raise an error if the vector field at the initial state differs from the

@@ -78,12 +78,10 @@ def fit(
     windows are trained again, to smaller errors. If the solution is still wrong, a warning names
     the window and the error.
 
-    A training can be interrupted and continued. It stops after the recipe's epochs, at a `target`,
-    after `seconds`, or at a keyboard interrupt, and returns the best model so far. With
-    `state=log.state` and otherwise the same arguments the next call continues it, and with a
-    `checkpoint` another process does; the result is the same, bit for bit, as without the stop. A
-    finished training can be continued with a recipe of more epochs. The result is that of all
-    epochs at once unless the optimiser depends on their number, as SPRING does.
+    A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
+    same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
+    continued with a recipe of more epochs. The result is that of all epochs at once unless the
+    optimiser depends on their number, as SPRING does.
 
     **Arguments:**
 

@@ -37,9 +37,8 @@ class Pool(eqx.Module):
     average. A move costs one evaluation of the network, whereas
     [`diffrax_conserve.learned.reachable_states`][] solves equations.
 
-    A step is accepted only if its defect at the end is small. An inaccurate network therefore takes
-    few steps and first learns the states of `sample`, and states are not moved where no solution
-    goes, or by steps too long for the solution.
+    A step is accepted only if its defect at the end is small. An inaccurate network therefore first
+    learns the states of `sample`.
 
     Construct the network with `states` that cover about the region of the solutions: they normalise
     its inputs.
