@@ -55,8 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if ok else 1
 
 
-def _run() -> int:
-    """Runs `main` and flushes standard output."""
+def run() -> int:
+    """Runs `main` and flushes standard output: what the installed command calls."""
     try:
         status = main()
         sys.stdout.flush()
@@ -128,4 +128,4 @@ def _positive(text: str) -> float:
 
 
 if __name__ == "__main__":
-    sys.exit(_run())
+    sys.exit(run())

@@ -1,6 +1,7 @@
 """PyTree arithmetic: states as vectors, with real dtypes kept leaf by leaf."""
 
 import functools as ft
+import math
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real
+from jaxtyping import Array, PyTree, Real, Shaped
 
 from ._custom_types import RealScalarLike, Y
 
@@ -103,6 +104,18 @@ def tree_all_finite(a: PyTree[Array]) -> Array:
     """Whether there is no NaN and no infinity in `a`."""
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]
     return jnp.all(jnp.stack(finite)) if finite else jnp.asarray(True)
+
+
+def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
+    """The components of `vector` in the structure, shapes and dtypes of `like`."""
+    leaves, treedef = jtu.tree_flatten(like)
+    out, start = [], 0
+    for leaf in leaves:
+        shape = jnp.shape(leaf)
+        stop = start + math.prod(shape)
+        out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
+        start = stop
+    return jtu.tree_unflatten(treedef, out)
 
 
 def working_dtype(y: Y) -> jnp.dtype:

@@ -7,6 +7,8 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -234,9 +236,16 @@ def test_a_full_disk(tmp_path, monkeypatch, capsys, only_rk4):
     assert found.endswith("\nerror: cannot write metrics.json: No space left on device\n")
 
 
+PROJECT = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").read_text())
+MODULE, FUNCTION = PROJECT["project"]["scripts"]["diffrax-conserve"].split(":")
+
+
 @pytest.mark.parametrize("redirection", ["| head -1", "> /dev/full"])
-def test_an_output_that_ends_early(redirection):
-    command = f"set -o pipefail; {sys.executable} -m diffrax_conserve list {redirection}"
+@pytest.mark.parametrize(
+    "start", ["-m diffrax_conserve", f"-c 'import sys, {MODULE} as m; sys.exit(m.{FUNCTION}())'"]
+)
+def test_an_output_that_ends_early(start, redirection):
+    command = f"set -o pipefail; {sys.executable} {start} list {redirection}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr

@@ -22,10 +22,11 @@ import jax
 import jax.numpy as jnp
 import measuring
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._solvers.feature_basis import feature_basis, tabulate
-from diffrax_conserve.learned._solvers.galerkin import StepEquations, flatten, solve
+from diffrax_conserve.learned._solvers.galerkin import StepEquations, solve
 
 OUT = Path(__file__).parent.parent / "results" / "random_features.json"
 
@@ -200,18 +201,18 @@ def polynomials(count, names):
     rows = []
     for name in names:
         system = dfc.systems.get(name)
-        y0, unflatten = flatten(system.y0)
+        y0, unravel = ravel_pytree(system.y0)
 
-        def end(h, basis, system=system, y0=y0, unflatten=unflatten):
+        def end(h, basis, system=system, y0=y0, unravel=unravel):
             def increment(s, y):
-                return h * flatten(system.vector_field(s * h, unflatten(y), None))[0]
+                return h * ravel_pytree(system.vector_field(s * h, unravel(y), None))[0]
 
             return y0 + solve(StepEquations(basis, increment, y0))[0][0]
 
         ends = {label: jax.jit(ft.partial(end, basis=basis)) for label, basis in bases.items()}
         for step in np.geomspace(1, 16, 5) * 2 * system.dt:
             states = system.solution(jnp.array([0.0, step]), system.y0)
-            exact = flatten(jax.tree.map(lambda y: y[1], states))[0]
+            exact = ravel_pytree(jax.tree.map(lambda y: y[1], states))[0]
             errors = {
                 label: float(jnp.max(jnp.abs(end(step) - exact))) for label, end in ends.items()
             }

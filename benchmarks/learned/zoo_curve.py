@@ -71,6 +71,8 @@ def table(results):
 
 
 def draw(results, path):
+    import matplotlib as mpl
+
     from diffrax_conserve.reproduce import _plot
 
     panels = {}
@@ -82,7 +84,26 @@ def draw(results, path):
             errors = [np.nan if p[key] is None else p[key] for p in points]
             curves[label] = (epochs, np.array(errors))
         panels[dfc.systems.get(name).title] = curves
-    _plot.save(_plot.error_of_training(panels), Path(path))
+    with mpl.rc_context(_plot._STYLE):
+        _plot.save(error_of_training(_plot, panels), Path(path))
+
+
+def error_of_training(plot, panels):
+    """One panel for each problem, one curve for each kind of error."""
+    figure = plot.Figure(figsize=(3.5 * len(panels), 2.7), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, (title, curves) in zip(axes, panels.items(), strict=True):
+        for name, (epochs, errors) in curves.items():
+            colour = plot._colour(name, curves)
+            ax.plot(epochs, errors, "o-", markersize=3, label=name, color=colour)
+        ax.set_xlim(left=0)
+        ax.xaxis.set_major_locator(plot.MaxNLocator(5))
+        ax.set_yscale("log")
+        ax.set_title(title)
+        ax.set_xlabel("epochs of training")
+    axes[0].set_ylabel("error")
+    plot._legend(figure, *axes[0].get_legend_handles_labels())
+    return figure
 
 
 def main(argv=None):

@@ -17,6 +17,7 @@ from .._manifold import (
     check_values,
     conserved_values,
     is_entry,
+    named_entries,
 )
 from .._options import dtype_of
 from .._tree import from_view, real_view, tree_mul, tree_sub
@@ -77,27 +78,31 @@ def project(
     y = jtu.tree_map(jnp.asarray, y)
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
-    if value is None:
-        for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
-            if isinstance(entry, FirstIntegral) and entry.value is None:
-                raise ValueError(
-                    "`project` was given a `FirstIntegral` without a conserved value, so every "
-                    "state would do. Pass `value=...`, for example "
-                    "`value=integral.fn(t, y_start, args)`, or write "
-                    "`FirstIntegral(fn, value=...)`."
-                )
+    values = given_values(manifold, value, t, y, args)
+    return apply(projection, manifold, values, t, y, args)
+
+
+def given_values(
+    manifold: Manifold, value: Values | None, t: RealScalarLike, y: Y, args: Args
+) -> Values:
+    """The conserved values that are given by `value`, or by the entries of the manifold."""
+    for name, entry in named_entries(manifold):
+        if value is None and isinstance(entry, FirstIntegral) and entry.value is None:
+            raise ValueError(
+                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, for "
+                "example `value=integral.fn(t, y_start, args)`, or write "
+                "`FirstIntegral(fn, value=...)`."
+            )
     values = conserved_values(manifold, t, y, args)
     if value is not None:
         check_values(manifold, value, t, y, args)
-        values = jtu.tree_map(
-            lambda entry, given, own: own if isinstance(entry, Constraint) else given,
-            manifold,
-            value,
-            values,
-            is_leaf=is_entry,
-        )
+
+        def choose(entry: FirstIntegral | Constraint, given: Values, own: Values) -> Values:
+            return own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
+
+        values = jtu.tree_map(choose, manifold, value, values, is_leaf=is_entry)
     check_values(manifold, values, t, y, args)
-    return apply(projection, manifold, values, t, y, args)
+    return values
 
 
 def apply(

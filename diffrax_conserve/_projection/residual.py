@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate
-from .._tree import from_view, real_view, tree_max, working_dtype
+from .._tree import from_view, real_view, tree_max, unflatten, working_dtype
 from .elimination import Vector
 from .linearise import Joined, linearise
 
@@ -66,16 +66,7 @@ def measure(
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     largest = tree_max(y)
     sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), view) if uniform else view
-    return shaped(g, like), shaped(magnitude + jacobian.scale(sizes), like)
-
-
-def shaped(vector: Real[Array, " m"], like: PyTree) -> Values:
-    leaves, treedef = jtu.tree_flatten(like)
-    ends = [sum(x.size for x in leaves[: i + 1]) for i in range(len(leaves))]
-    parts = [vector[end - x.size : end] for x, end in zip(leaves, ends, strict=True)]
-    return jtu.tree_unflatten(
-        treedef, [p.reshape(x.shape).astype(x.dtype) for p, x in zip(parts, leaves, strict=True)]
-    )
+    return unflatten(g, like), unflatten(magnitude + jacobian.scale(sizes), like)
 
 
 def relative(residual: PyTree[Array], scale: PyTree[Array]) -> PyTree[Array]:

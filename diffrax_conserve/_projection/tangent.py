@@ -24,11 +24,11 @@ from .._manifold import (
     rate_of,
 )
 from .._options import check_number, check_vector_field
-from .._tree import from_view, real_view, tree_add, tree_mul
+from .._tree import from_view, real_view, tree_add, tree_mul, unflatten
 from .base import positive_weights
 from .linearise import as_array, linearise, written_out
 from .project import check_metric, check_state, inverse_metric
-from .residual import residual_of, shaped
+from .residual import residual_of
 
 
 def tangent(
@@ -172,7 +172,7 @@ class TangentField(eqx.Module):
         solution = rows.gram_solver(weights).solve(jtu.tree_map(jnp.divide, wrong, sizes))
         correction = from_view(join(tree_mul(rows.pullback(solution), weights)), y)
         multiplier = jtu.tree_map(jnp.divide, solution, sizes)
-        return slope, correction, shaped(as_array(multiplier), values)
+        return slope, correction, unflatten(as_array(multiplier), values)
 
     def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
         """`rate - (∂g/∂t + G f + gain g)`, where `rate` is that of a balance law and otherwise

@@ -1,5 +1,6 @@
 """The main job: a system of the catalogue, solved with and without projection, and compared."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from ..systems import AbstractSystem
 from ._compare import compare
 from ._setup import SetupError, check_times, import_plot, make_writable
 from ._solve import run
-from ._tables import figures, json_text, metrics, table
+from ._tables import figures, metrics, table
 from ._trained import (
     KINDS,
     Learned,
@@ -46,7 +47,6 @@ def reproduce(
     anew: bool = False,
     seed: int = 0,
     epochs: int = 5000,
-    write: Callable[[str], None] = print,
     progress: Callable[[str], None] = lambda _: None,
 ) -> bool:
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
@@ -67,7 +67,7 @@ def reproduce(
     make_writable(out)
     networks: dict[str, Learned] = {}
     if is_learned(system):
-        networks = _train(system, out, seed, epochs, write) if anew else pretrained(system)
+        networks = _train(system, out, seed, epochs) if anew else pretrained(system)
     chosen = solvers(system, {kind: found.network for kind, found in networks.items()})
     runs = {}
     for i, (name, solver) in enumerate(chosen.items(), start=1):
@@ -81,25 +81,23 @@ def reproduce(
         assert plot is not None
         for suffix in ("png", "pdf"):
             replace_file(out / f"{name}.{suffix}", lambda path, f=figure: plot.save(f, path))
-    text = json_text(numbers)
+    text = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
     replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    write(table(system, numbers, t1, dt, states))
+    print(table(system, numbers, t1, dt, states))
     if plot is None:
-        write("\nThere are no figures: they need matplotlib. Install it by")
-        write("    pip install 'diffrax-conserve[plots]'")
-    write(f"\n{'metrics.json is' if plot is None else 'The figures and metrics.json are'} in {out}")
+        print("\nThere are no figures: they need matplotlib. Install it by")
+        print("    pip install 'diffrax-conserve[plots]'")
+    print(f"\n{'metrics.json is' if plot is None else 'The figures and metrics.json are'} in {out}")
     return comparison.failure is None and all(run.failure is None for run in runs.values())
 
 
-def _train(
-    system: AbstractSystem, out: Path, seed: int, epochs: int, write: Callable[[str], None]
-) -> dict[str, Learned]:
+def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:
     """Trains the standard and the conservative network, and saves them beside the figures."""
     networks = {}
     for kind in KINDS:
-        write(f"Training the {kind} network: {epochs} epochs, seed {seed}")
+        print(f"Training the {kind} network: {epochs} epochs, seed {seed}")
         network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
-        write(
+        print(
             f"  {log.seconds:.0f} s after {log.compile_seconds:.0f} s of compilation; "
             f"loss {log.best:.3g} at epoch {log.best_epoch}"
         )

@@ -1,4 +1,4 @@
-"""The figures of `reproduce` and of the zoo, for print. Only this module imports matplotlib."""
+"""The figures of `reproduce`, for print. Only this module imports matplotlib."""
 
 from pathlib import Path
 from typing import Any
@@ -58,83 +58,60 @@ _MARKERS = (("o", 5.0), (".", 3.0), ("s", 5.0), ("x", 4.0), ("^", 4.0))
 _Curves = dict[str, np.ndarray]  # by solver, or by part of the system
 
 
+@mpl.rc_context(_STYLE)
 def save(figure: Figure, path: Path) -> None:
     """Writes `figure` in the format given by the suffix of `path`."""
     # Without the date, equal figures give equal files.
     metadata = {"CreationDate": None} if path.suffix == ".pdf" else {}
-    with mpl.rc_context(_STYLE):
-        figure.savefig(path, metadata=metadata)
+    figure.savefig(path, metadata=metadata)
 
 
+@mpl.rc_context(_STYLE)
 def drift(times: _Curves, drifts: dict[str, _Curves], time_unit: str) -> Figure:
     """One panel for each integral, one curve for each solver."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(max(3.5, 2.2 * len(drifts) + 0.4), 2.7), layout="constrained")
-        panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
-        for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
-            ax.axhline(_EPS, **_ROUNDOFF)
-            curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
-            _over_time(ax, times, curves, time_unit)
-            ax.set_title(integral)
-        panels[0].set_ylabel("relative drift")
-        _legend(figure, *panels[0].get_legend_handles_labels())
-        note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
-        figure.legend([Line2D([], [], **_ROUNDOFF)], [note], loc="outside lower center")
-        return figure
+    figure = Figure(figsize=(max(3.5, 2.2 * len(drifts) + 0.4), 2.7), layout="constrained")
+    panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
+    for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
+        ax.axhline(_EPS, **_ROUNDOFF)
+        curves = {name: np.maximum(values, _FLOOR) for name, values in curves.items()}
+        _over_time(ax, times, curves, time_unit)
+        ax.set_title(integral)
+    panels[0].set_ylabel("relative drift")
+    _legend(figure, *panels[0].get_legend_handles_labels())
+    note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
+    figure.legend([Line2D([], [], **_ROUNDOFF)], [note], loc="outside lower center")
+    return figure
 
 
+@mpl.rc_context(_STYLE)
 def state_error(times: _Curves, errors: _Curves, time_unit: str, unit: str) -> Figure:
     """One curve for each solver."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.5, 2.7), layout="constrained")
-        ax = figure.subplots()
-        # An error of exactly 0 is drawn at the smallest positive one.
-        smallest = min(
-            np.min(values, where=values > 0, initial=np.inf) for values in errors.values()
-        )
-        floor = smallest if np.isfinite(smallest) else _FLOOR
-        curves = {name: np.maximum(values, floor) for name, values in errors.items()}
-        _over_time(ax, times, curves, time_unit)
-        ax.set_ylabel(_label("state error", unit))
-        _legend(figure, *ax.get_legend_handles_labels())
-        return figure
+    figure = Figure(figsize=(3.5, 2.7), layout="constrained")
+    ax = figure.subplots()
+    # An error of exactly 0 is drawn at the smallest positive one.
+    smallest = min(np.min(values, where=values > 0, initial=np.inf) for values in errors.values())
+    floor = smallest if np.isfinite(smallest) else _FLOOR
+    curves = {name: np.maximum(values, floor) for name, values in errors.items()}
+    _over_time(ax, times, curves, time_unit)
+    ax.set_ylabel(_label("state error", unit))
+    _legend(figure, *ax.get_legend_handles_labels())
+    return figure
 
 
+@mpl.rc_context(_STYLE)
 def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
     """The training loss against the epoch, one curve for each network."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.5, 2.7), layout="constrained")
-        ax = figure.subplots()
-        for name, (epochs, losses) in curves.items():
-            ax.plot(epochs, losses, label=_NAMES.get(name, name), color=_colour(name, curves))
-        ax.set_yscale("log")
-        ax.yaxis.set_minor_formatter(NullFormatter())
-        ax.xaxis.set_major_locator(MaxNLocator(5))
-        ax.set_xlabel("epoch")
-        ax.set_ylabel("training loss")
-        _legend(figure, *ax.get_legend_handles_labels())
-        return figure
-
-
-def error_of_training(
-    panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]],
-) -> Figure:
-    """Errors against the epochs of training: one panel for each problem, one curve for each kind
-    of error."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.5 * len(panels), 2.7), layout="constrained")
-        axes = figure.subplots(1, len(panels), squeeze=False)[0]
-        for ax, (title, curves) in zip(axes, panels.items(), strict=True):
-            for name, (epochs, errors) in curves.items():
-                ax.plot(epochs, errors, "o-", markersize=3, label=name, color=_colour(name, curves))
-            ax.set_xlim(left=0)
-            ax.xaxis.set_major_locator(MaxNLocator(5))
-            ax.set_yscale("log")
-            ax.set_title(title)
-            ax.set_xlabel("epochs of training")
-        axes[0].set_ylabel("error")
-        _legend(figure, *axes[0].get_legend_handles_labels())
-        return figure
+    figure = Figure(figsize=(3.5, 2.7), layout="constrained")
+    ax = figure.subplots()
+    for name, (epochs, losses) in curves.items():
+        ax.plot(epochs, losses, label=_NAMES.get(name, name), color=_colour(name, curves))
+    ax.set_yscale("log")
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    ax.set_xlabel("epoch")
+    ax.set_ylabel("training loss")
+    _legend(figure, *ax.get_legend_handles_labels())
+    return figure
 
 
 def _in_space(paths: dict[str, _Curves], axis_labels: tuple[str, ...]) -> bool:
@@ -148,6 +125,7 @@ def shows_lines(paths: dict[str, _Curves], axis_labels: tuple[str, ...]) -> bool
     return _in_space(paths, axis_labels) and not any(_is_long(c) for c in paths.values())
 
 
+@mpl.rc_context(_STYLE)
 def trajectory(
     paths: dict[str, _Curves],
     lines: dict[str, _Curves],
@@ -156,31 +134,30 @@ def trajectory(
 ) -> Figure:
     """One panel for each part of the system: the reference, and the last steps of each solver, with
     `lines` between them if there are any."""
-    with mpl.rc_context(_STYLE):
-        parts = list(next(iter(paths.values())))
-        solid = _in_space(paths, axis_labels)
-        labels = axis_labels if solid else axis_labels[:2]
-        columns = min(len(parts), 3)
-        rows = -(-len(parts) // columns)
-        figure = Figure(figsize=(max(3.5, 2.3 * columns), 2.5 * rows + 0.5), layout="constrained")
-        if solid:
-            figure.set_size_inches(3.5, 3.5)
-        keywords = dict(projection="3d") if solid else {}
-        panels = figure.subplots(rows, columns, squeeze=False, subplot_kw=keywords)
-        for ax, part in zip(panels.flat, parts, strict=False):
-            path = None if reference is None else reference[part]
-            _draw_paths(ax, {name: curves[part] for name, curves in paths.items()}, path, labels)
-            for name, curves in lines.items():
-                ax.plot(*curves[part].T, color=_colour(name, paths), linewidth=0.6)
-            if len(parts) > 1:
-                ax.set_title(part)
-        for ax in panels.flat[len(parts) :]:
-            ax.set_axis_off()
-        _legend(figure, *panels[0, 0].get_legend_handles_labels())
-        if any(_is_long(curves) for curves in paths.values()):
-            note = f"The last {_MARKED_MAX} steps are marked."
-            figure.legend([], [], title=note, title_fontsize=8, loc="outside lower center")
-        return figure
+    parts = list(next(iter(paths.values())))
+    solid = _in_space(paths, axis_labels)
+    labels = axis_labels if solid else axis_labels[:2]
+    columns = min(len(parts), 3)
+    rows = -(-len(parts) // columns)
+    figure = Figure(figsize=(max(3.5, 2.3 * columns), 2.5 * rows + 0.5), layout="constrained")
+    if solid:
+        figure.set_size_inches(3.5, 3.5)
+    keywords = dict(projection="3d") if solid else {}
+    panels = figure.subplots(rows, columns, squeeze=False, subplot_kw=keywords)
+    for ax, part in zip(panels.flat, parts, strict=False):
+        path = None if reference is None else reference[part]
+        _draw_paths(ax, {name: curves[part] for name, curves in paths.items()}, path, labels)
+        for name, curves in lines.items():
+            ax.plot(*curves[part].T, color=_colour(name, paths), linewidth=0.6)
+        if len(parts) > 1:
+            ax.set_title(part)
+    for ax in panels.flat[len(parts) :]:
+        ax.set_axis_off()
+    _legend(figure, *panels[0, 0].get_legend_handles_labels())
+    if any(_is_long(curves) for curves in paths.values()):
+        note = f"The last {_MARKED_MAX} steps are marked."
+        figure.legend([], [], title=note, title_fontsize=8, loc="outside lower center")
+    return figure
 
 
 # ---- Within one panel ----

@@ -119,26 +119,17 @@ def _failure(
     """The failure at the first initial state with one, and the number of initial states with a
     failure."""
     values = [*jtu.tree_leaves(ys), *drifts.values()]
-    reasons = [
-        _failure_of_one(
-            jtu.tree_map(lambda x, i=i: x[i], result),
-            ts[: counts[i]],
-            [x[i, : counts[i]] for x in values],
-        )
-        for i in range(len(counts))
-    ]
-    failed = [reason for reason in reasons if reason is not None]
-    if not failed:
+    wrong = np.any([~np.isfinite(x).reshape(*x.shape[:2], -1).all(axis=2) for x in values], axis=0)
+    wrong &= np.arange(ts.size) < counts[:, None]
+    stopped = np.asarray(result != dfx.RESULTS.successful)
+    failed = stopped | wrong.any(axis=1)
+    if not failed.any():
         return None
-    return failed[0] if len(reasons) == 1 else f"for {len(failed)} of {len(reasons)}: {failed[0]}"
-
-
-def _failure_of_one(result: dfx.RESULTS, ts: np.ndarray, values: list[np.ndarray]) -> str | None:
-    if result != dfx.RESULTS.successful:
-        reason = " ".join(dfx.RESULTS[result].split())
-        return f"after t = {ts[-1]:.6g}: {reason}"
-    finite = np.all([np.isfinite(x).reshape(len(ts), -1).all(axis=1) for x in values], axis=0)
-    if not finite.all():
-        first = ts[np.argmin(finite)]
-        return f"at t = {first:.6g}: the state is not finite any more. Choose a smaller dt."
-    return None
+    first = int(np.argmax(failed))
+    if stopped[first]:
+        message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], result)]
+        reason = f"after t = {ts[counts[first] - 1]:.6g}: {' '.join(message.split())}"
+    else:
+        t = ts[np.argmax(wrong[first])]
+        reason = f"at t = {t:.6g}: the state is not finite any more. Choose a smaller dt."
+    return reason if failed.size == 1 else f"for {failed.sum()} of {failed.size}: {reason}"

@@ -1,6 +1,5 @@
 """The output: the metrics, the table and the figures."""
 
-import json
 import platform
 from collections.abc import Callable
 from typing import Any
@@ -32,10 +31,6 @@ run, compile: wall time of the second run of the compiled solve, and of its comp
 _MANY = """\
 State errors are medians over {states} initial states, drifts the largest over all of them; the
     picture of the trajectory is that of the first one."""
-
-
-def json_text(numbers: dict[str, Any]) -> str:
-    return json.dumps(numbers, indent=2, allow_nan=False) + "\n"
 
 
 def metrics(

@@ -1,4 +1,5 @@
 from ._attitude import RigidBodyAttitude as RigidBodyAttitude
+from ._base import AbstractIntegratedSystem as AbstractIntegratedSystem
 from ._base import AbstractSystem as AbstractSystem
 from ._cartesian_pendulum import CartesianPendulum as CartesianPendulum
 from ._chemistry import AbstractChemistry as AbstractChemistry
@@ -15,7 +16,6 @@ from ._lotka_volterra import LotkaVolterra as LotkaVolterra
 from ._mechanism import Balance as Balance
 from ._mechanism import Mechanism as Mechanism
 from ._oscillator import HarmonicOscillator as HarmonicOscillator
-from ._reference import AbstractIntegratedSystem as AbstractIntegratedSystem
 from ._registry import get as get
 from ._registry import names as names
 from ._rigid_body import RigidBody as RigidBody

@@ -9,9 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import real
-from ._reference import AbstractIntegratedSystem
-from ._sampling import direction, shell
+from ._base import AbstractIntegratedSystem, direction, real, shell
 
 State = tuple[Float[Array, "4"], Float[Array, "3"]]
 

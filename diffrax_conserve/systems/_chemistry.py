@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
+from ._base import AbstractSystem, integrate, real
 from ._mechanism import Mechanism
 
 State = Float[Array, " species"]
@@ -37,18 +37,8 @@ class AbstractChemistry(AbstractSystem):
         return self.y0 * factors
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        controller = dfx.PIDController(rtol=1e-8, atol=1e-20)
-        return dfx.diffeqsolve(
-            dfx.ODETerm(self.vector_field),
-            dfx.Kvaerno5(),
-            t0=0.0,
-            t1=ts[-1],
-            dt0=None,
-            y0=y0,
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.ClipStepSizeController(controller, step_ts=ts),
-            max_steps=10**6,
-        ).ys
+        solver = dfx.Kvaerno5()
+        return integrate(self, ts, y0, solver=solver, rtol=1e-8, atol=1e-20, max_steps=10**6)
 
     def period(self, y0: Any = None) -> None:
         del y0

@@ -9,9 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import real
-from ._reference import AbstractIntegratedSystem
-from ._sampling import annulus
+from ._base import AbstractIntegratedSystem, annulus, real
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]

@@ -10,8 +10,7 @@ from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import real
-from ._reference import AbstractIntegratedSystem
+from ._base import AbstractIntegratedSystem, real
 
 Wave = Float[Array, " points"]
 Modes = Complex[Array, " modes"]

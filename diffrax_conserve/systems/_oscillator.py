@@ -8,8 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
-from ._sampling import annulus
+from ._base import AbstractSystem, annulus, real
 
 State = Float[Array, "2"]
 

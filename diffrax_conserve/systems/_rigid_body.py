@@ -8,9 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
+from ._base import AbstractSystem, real, shell
 from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
-from ._sampling import shell
 
 State = Float[Array, "3"]
 

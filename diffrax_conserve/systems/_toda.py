@@ -9,8 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import real
-from ._reference import AbstractIntegratedSystem
+from ._base import AbstractIntegratedSystem, real
 
 Vector = Float[Array, " particles"]
 State = tuple[Vector, Vector]

@@ -12,10 +12,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import real
+from ._base import AbstractIntegratedSystem, annulus, real
 from ._reduced import Reduced
-from ._reference import AbstractIntegratedSystem
-from ._sampling import annulus
 
 State = Float[Array, "vortices 2"]
 

@@ -1,6 +1,5 @@
 """Assertions that a solution, or a state, lies on its manifold."""
 
-import functools
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -9,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Real
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Real
 
 from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
@@ -17,13 +17,14 @@ from .._manifold import (
     Constraint,
     FirstIntegral,
     check_manifold,
-    check_values,
     conserved_values,
     evaluate,
     is_entry,
     named_entries,
 )
+from .._projection.project import given_values
 from .._projection.residual import measure as residuals
+from .._tree import tree_all_finite
 from ._report import Sample, report_constraints, unsuccessful
 
 # Twice the default tolerance of a projection, because the residual is evaluated again here.
@@ -100,8 +101,7 @@ def assert_conserved(
             lambda x: jnp.reshape(x, (-1, *x.shape[len(lanes) :])), (ts, ys, *reference)
         )
         measured = _measure_lanes(manifold, None, batch, args)
-        limits = _limits(measured, rtol, atol, ys)
-        samples += _samples(manifold, kind, lanes, batch[:2], measured, limits)
+        samples += _samples(manifold, kind, lanes, batch[:2], measured, args, rtol, atol)
     report_constraints(samples)
 
 
@@ -146,22 +146,21 @@ def assert_on_manifold(
     check_manifold(manifold)
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float))
-    values = _given_values(manifold, value, t, y, args)
+    values = given_values(manifold, value, t, y, args)
     ts, ys = t[None], jtu.tree_map(lambda x: x[None], y)
     lane = jtu.tree_map(lambda x: x[None], (ts, ys, t, y))
     measured = _measure_lanes(manifold, values, lane, args)
-    limits = _limits(measured, rtol, atol, ys)
-    report_constraints(_samples(manifold, "given", (), lane[:2], measured, limits))
+    report_constraints(_samples(manifold, "given", (), lane[:2], measured, args, rtol, atol))
 
 
 class Measured(NamedTuple):
-    """Arrays of shape `(lanes, times, ...)`, in PyTrees like the values of the manifold."""
+    """The `m` scalar constraints of a manifold at each time, in each lane after `jax.vmap`."""
 
-    residual: Any
-    scale: Any
-    found: Any
-    target: Any  # of shape `(lanes, ...)`
-    finite: Array  # whether the state is finite, of shape `(lanes, times)`
+    residual: Real[Array, "*lanes times m"]
+    scale: Real[Array, "*lanes times m"]
+    found: Real[Array, "*lanes times m"]
+    target: Real[Array, "*lanes m"]
+    finite: Bool[Array, "*lanes times"]  # whether the state is finite
 
 
 @eqx.filter_jit
@@ -183,19 +182,23 @@ def measure(
     target = conserved_values(manifold, t0, y0, args) if values is None else values
     _, initial_scale = residuals(manifold, target, t0, y0, args)
 
-    def at(t: Array, y: Y) -> tuple[Values, Values, Values, Array]:
+    def at(t: Array, y: Y) -> tuple[Array, Array, Array, Array]:
         padded = jnp.isinf(t)
         t = jnp.where(padded, t0.astype(t.dtype), t)
         y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
         found = evaluate(manifold, t, y, args)
         residual, scale = residuals(manifold, target, t, y, args)
-        residual = jtu.tree_map(lambda g: jnp.where(padded, 0, g), residual)
-        scale = jtu.tree_map(jnp.maximum, scale, initial_scale)
-        finite = [jnp.all(jnp.isfinite(x)) for x in (t, *jtu.tree_leaves(y))]
-        return residual, scale, found, jnp.all(jnp.stack(finite))
+        residual = jnp.where(padded, 0, _vector(residual))
+        scale = jnp.maximum(_vector(scale), _vector(initial_scale))
+        return residual, scale, _vector(found), tree_all_finite((t, y))
 
     residual, scale, found, finite = jax.vmap(at)(ts, ys)
-    return Measured(residual, scale, found, target, finite)
+    return Measured(residual, scale, found, _vector(target), finite)
+
+
+def _vector(values: Values) -> Real[Array, " m"]:
+    with jax.numpy_dtype_promotion("standard"):
+        return ravel_pytree(values)[0]
 
 
 def _refuse_unsuccessful(solution: dfx.Solution) -> None:
@@ -248,82 +251,53 @@ def _check_comparable(ts: Float[Array, "..."], manifold: Manifold) -> None:
             )
 
 
-def _given_values(manifold: Manifold, value: Values | None, t: Array, y: Y, args: Args) -> Values:
-    for name, entry in named_entries(manifold):
-        if value is None and isinstance(entry, FirstIntegral) and entry.value is None:
-            raise ValueError(
-                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, or "
-                "write `FirstIntegral(fn, value=...)`."
-            )
-    own = conserved_values(manifold, t, y, args)
-    if value is None:
-        return own
-    check_values(manifold, value, t, y, args)
-    return jtu.tree_map(
-        lambda entry, given, own: (
-            own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
-        ),
-        manifold,
-        value,
-        own,
-        is_leaf=is_entry,
-    )
-
-
-def _limits(
-    measured: Measured, rtol: RealScalarLike | None, atol: RealScalarLike, ys: Any
-) -> tuple[Any, float]:
-    """The largest accepted residuals, and the unit of roundoff of the coarsest dtype."""
-    dtypes = [x.dtype for x in jtu.tree_leaves((ys, measured.residual))]
-    eps = max(float(jnp.finfo(dtype).eps) for dtype in dtypes)
-    relative = ULPS * eps if rtol is None else rtol
-    limits = jtu.tree_map(lambda s: relative * np.asarray(s, np.float64) + atol, measured.scale)
-    return limits, eps
-
-
 def _samples(
     manifold: Manifold,
     kind: str,
     lanes: tuple[int, ...],
     rows: tuple[Array, Any],
     measured: Measured,
-    limits: tuple[Any, float],
+    args: Args,
+    rtol: RealScalarLike | None,
+    atol: RealScalarLike,
 ) -> list[Sample]:
-    """One sample for each scalar constraint, with a readable name."""
-    treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
-    limit, eps = limits
-    trees = (measured.residual, measured.scale, measured.found, limit, measured.target)
-    entries = zip(
-        named_entries(manifold), *(treedef.flatten_up_to(tree) for tree in trees), strict=True
-    )
-    samples = []
-    for (name, entry), *parts in entries:
-        paths = jtu.tree_flatten_with_path(parts[0])[0]
-        leaves = [jtu.tree_leaves(part) for part in parts]
-        for (path, residual), *arrays in zip(paths, *leaves, strict=True):
-            for index in np.ndindex(residual.shape[2:]):
-                label = name + jtu.keystr(path) + (f"[{', '.join(map(str, index))}]" * bool(index))
-                pick = functools.partial(_element, index)
-                samples.append(
-                    Sample(
-                        label,
-                        isinstance(entry, Constraint),
-                        kind,
-                        lanes,
-                        np.asarray(rows[0]),
-                        rows[1],
-                        np.asarray(measured.finite),
-                        residual=pick(residual),
-                        scale=pick(arrays[1]),
-                        found=pick(arrays[2]),
-                        limit=pick(arrays[3]),
-                        target=pick(arrays[4]),
-                        eps=eps,
-                    )
-                )
-    return samples
+    """One sample for each scalar constraint."""
+    t, y = jtu.tree_map(lambda x: x[0, 0], rows)
+    values = eqx.filter_eval_shape(evaluate, manifold, t, y, args)
+    # The unit of roundoff of the coarsest dtype.
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves((y, values)))
+    residual, scale, found, target, finite = map(np.asarray, measured)
+    limit = np.asarray((ULPS * eps if rtol is None else rtol) * scale.astype(np.float64) + atol)
+    return [
+        Sample(
+            name,
+            is_constraint,
+            kind,
+            lanes,
+            np.asarray(rows[0]),
+            rows[1],
+            finite,
+            residual=residual[..., i],
+            scale=scale[..., i],
+            found=found[..., i],
+            limit=limit[..., i],
+            target=target[..., i],
+            eps=eps,
+        )
+        for i, (name, is_constraint) in enumerate(_labels(manifold, values))
+    ]
 
 
-def _element(index: tuple[int, ...], x: Any) -> np.ndarray:
-    """One scalar of each value."""
-    return np.asarray(x)[(..., *index)]
+def _labels(manifold: Manifold, values: Any) -> list[tuple[str, bool]]:
+    """The name of each scalar constraint, and whether it is one of a `Constraint`."""
+
+    def kinds(entry: FirstIntegral | Constraint, value: Any) -> Any:
+        return jtu.tree_map(lambda _: isinstance(entry, Constraint), value)
+
+    found = jtu.tree_leaves(jtu.tree_map(kinds, manifold, values, is_leaf=is_entry))
+    leaves = jtu.tree_flatten_with_path(values)[0]
+    return [
+        (f"manifold{jtu.keystr(path)}" + f"[{', '.join(map(str, index))}]" * bool(index), kind)
+        for (path, value), kind in zip(leaves, found, strict=True)
+        for index in np.ndindex(value.shape)
+    ]

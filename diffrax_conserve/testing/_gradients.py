@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._custom_types import RealScalarLike
-from .._tree import working_dtype
+from .._tree import tree_max, working_dtype
 
 
 def assert_gradients(
@@ -151,4 +151,4 @@ def _dot(a: PyTree[Array], b: PyTree[Array]) -> tuple[float, float]:
 
 
 def _largest(tree: PyTree[Array]) -> float:
-    return max((float(jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(tree) if x.size), default=0.0)
+    return float(tree_max(tree)) if jtu.tree_leaves(tree) else 0.0

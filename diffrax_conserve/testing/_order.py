@@ -7,9 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
+from .._tree import tree_max, tree_sub
 
 _REFINEMENTS = np.array([1, 2, 3, 4, 6])
 # Errors below this many units of roundoff of the state are dominated by roundoff.
@@ -79,7 +80,7 @@ def assert_order(
     problem = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
     finals = [_final(solver, problem, n, max_steps=int(counts[-1]) + 2) for n in counts]
     exact = _reference(solver, problem, count) if reference is None else reference
-    errors = np.array([float(_distance(y, exact)) for y in finals])
+    errors = np.array([float(tree_max(tree_sub(y, exact))) for y in finals])
     _check_slope(errors, float(span) / counts, float(order), float(margin), _roundoff(exact))
 
 
@@ -108,16 +109,10 @@ def _reference(solver: dfx.AbstractSolver, problem: tuple[Any, ...], count: int)
     return _final(solver, problem, n, max_steps=n + 2)
 
 
-def _distance(y: Y, exact: Y) -> Float[Array, ""]:
-    gaps = jtu.tree_map(lambda a, b: jnp.max(jnp.abs(a - b)).astype(float), y, exact)
-    return jnp.max(jnp.stack(jtu.tree_leaves(gaps)))
-
-
 def _roundoff(exact: Y) -> float:
     """One unit of roundoff of the largest component."""
-    leaves = [jnp.asarray(x) for x in jtu.tree_leaves(exact)]
-    eps = max(float(jnp.finfo(x.dtype).eps) for x in leaves)
-    return eps * max(float(jnp.max(jnp.abs(x))) for x in leaves)
+    eps = max(float(jnp.finfo(jnp.result_type(x)).eps) for x in jtu.tree_leaves(exact))
+    return eps * float(tree_max(exact))
 
 
 def _check_slope(

@@ -1,6 +1,5 @@
 """A strategy for PyTree structures that repack one state in many ways."""
 
-import math
 from collections.abc import Callable
 from typing import Any, final
 
@@ -14,6 +13,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, ConstraintFn, Manifold, RealScalarLike
 from .._manifold import Constraint, FirstIntegral, is_entry, rate_of
+from .._tree import unflatten
 
 
 @final
@@ -49,11 +49,11 @@ class Restructuring(eqx.Module):
 
     def pack(self, y: Any) -> Any:
         """`y` in the new structure."""
-        return _fill(self.shapes, y)
+        return unflatten(ravel_pytree(y)[0], self.shapes)
 
     def unpack(self, z: Any) -> Any:
         """The state whose packed form is `z`."""
-        return _fill(self.like, z)
+        return unflatten(ravel_pytree(z)[0], self.like)
 
     def vector_field(self, vector_field: Callable[..., Any]) -> Callable[..., Any]:
         """The vector field `f(t, z, args)` of the packed state."""
@@ -77,25 +77,7 @@ class Restructuring(eqx.Module):
         return jtu.tree_map(repack, manifold, is_leaf=is_entry)
 
     def __repr__(self) -> str:
-        return f"Restructuring({jtu.tree_map(lambda x: _Shape(x.shape), self.shapes)})"
-
-
-class _Shape(tuple):
-    """A shape that prints compactly, like a leaf."""
-
-    def __repr__(self) -> str:
-        return f"<{'×'.join(map(str, self)) or 'scalar'}>"
-
-
-def _fill(shapes: Any, y: Any) -> Any:
-    flat, _ = ravel_pytree(y)
-    leaves, treedef = jtu.tree_flatten(shapes)
-    out, start = [], 0
-    for leaf in leaves:
-        stop = start + math.prod(leaf.shape)
-        out.append(jnp.asarray(flat[start:stop], leaf.dtype).reshape(leaf.shape))
-        start = stop
-    return jtu.tree_unflatten(treedef, out)
+        return f"Restructuring({eqx.tree_pformat(self.shapes, struct_as_array=True)})"
 
 
 def restructurings(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._networks import Points
+from diffrax_conserve.learned._networks.trainable import Points
 from diffrax_conserve.learned._training.defect import defects
 
 from ..learned import CORES, LORENZ, SMALL, flow_map, states

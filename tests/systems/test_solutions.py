@@ -12,12 +12,12 @@ import pytest
 import scipy.special
 
 from diffrax_conserve import systems
+from diffrax_conserve.systems._base import integrate
 from diffrax_conserve.systems._elliptic import (
     complete_elliptic,
     incomplete_elliptic,
     jacobi_elliptic,
 )
-from diffrax_conserve.systems._reference import integrate
 
 TS = np.linspace(0.0, 8.0, 5)
 

@@ -16,9 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._networks import as_flow_map
-from diffrax_conserve.learned._training.epochs import _anew
-from diffrax_conserve.learned._training.objective import start
+from diffrax_conserve.learned._networks.flow_map import as_flow_map
+from diffrax_conserve.learned._training.objective import _anew, start
 from diffrax_conserve.learned._training.pool import moved
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator, states

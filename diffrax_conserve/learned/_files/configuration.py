@@ -14,18 +14,14 @@ import jax.tree_util as jtu
 from ... import systems
 from ..._manifold import is_entry
 from ...systems import AbstractSystem
-from .._networks import (
-    PINN,
-    Box,
-    Concatenated,
-    ConservativeLayer,
-    DeepONet,
-    Gated,
-    MakeFrame,
-    Product,
-    Taylor,
-    activation_name,
-)
+from .._networks.cores import Concatenated, Gated, Product
+from .._networks.deeponet import DeepONet
+from .._networks.domain import Box
+from .._networks.frame import MakeFrame
+from .._networks.layer import ConservativeLayer
+from .._networks.mlp import activation_name
+from .._networks.pinn import PINN
+from .._networks.taylor import Taylor
 
 _CORES = {core.__name__: core for core in (Product, Concatenated, Gated)}
 # The parts that contain functions. A file stores the name of the system to which they belong.

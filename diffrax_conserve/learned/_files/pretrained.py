@@ -3,7 +3,10 @@
 from importlib import resources
 from pathlib import Path
 
-from .._networks import PINN, DeepONet, Repeated, Transformed
+from .._networks.deeponet import DeepONet
+from .._networks.pinn import PINN
+from .._networks.repeated import Repeated
+from .._networks.transformed import Transformed
 from .save import load
 
 _SUFFIX = ".network"

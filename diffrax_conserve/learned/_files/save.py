@@ -9,16 +9,13 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 
-from .._networks import (
-    PINN,
-    BoxCox,
-    ConservativeLayer,
-    DeepONet,
-    MakeFrame,
-    Repeated,
-    Taylor,
-    Transformed,
-)
+from .._networks.deeponet import DeepONet
+from .._networks.frame import MakeFrame
+from .._networks.layer import ConservativeLayer
+from .._networks.pinn import PINN
+from .._networks.repeated import Repeated
+from .._networks.taylor import Taylor
+from .._networks.transformed import BoxCox, Transformed
 from .configuration import (
     PARTS,
     check_header,

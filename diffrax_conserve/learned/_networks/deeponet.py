@@ -10,10 +10,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import working_dtype
+from ..._tree import unflatten, working_dtype
 from .cores import AbstractCore, Product, Sizes
 from .domain import Box, FramedBox
-from .flat import as_state, flatten, stacked_vectors, unflatten
+from .flat import as_state, as_states, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, check_args_domain, checked_args
 from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer
@@ -274,15 +274,7 @@ def _check_args_domain(domain: Any, layer: ConservativeLayer | None, taylor: Tay
 
 
 def _vectors(states: Y) -> Float[Array, "samples n"]:
-    states = as_state(states)
-    shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
-    lengths = {shape[:1] for shape in shapes}
-    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
-        raise ValueError(
-            "`states` must be at least one state, stacked along a leading axis, but its leaves "
-            f"have shapes {shapes}. For a single state write "
-            "`jax.tree.map(lambda x: x[None], y0)`."
-        )
+    states = as_states(states)
     return stacked_vectors(jtu.tree_map(lambda x: x.astype(working_dtype(states)), states))
 
 

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real, Shaped
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Y
-from .flat import as_state
+from .flat import as_state, as_states
 from .frame import Frame, MakeFrame, frame_at
 
 
@@ -54,14 +54,8 @@ class Box(AbstractDomain):
         ```
     """
 
-    lower: PyTree[Real[Array, "..."]]
-    upper: PyTree[Real[Array, "..."]]
-
-    def __init__(
-        self, lower: PyTree[Shaped[ArrayLike, "..."]], upper: PyTree[Shaped[ArrayLike, "..."]]
-    ):
-        self.lower = as_state(lower)
-        self.upper = as_state(upper)
+    lower: PyTree[Real[Array, "..."]] = eqx.field(converter=as_state)
+    upper: PyTree[Real[Array, "..."]] = eqx.field(converter=as_state)
 
     def __check_init__(self):
         lower, upper = jtu.tree_structure(self.lower), jtu.tree_structure(self.upper)
@@ -75,12 +69,7 @@ class Box(AbstractDomain):
     @classmethod
     def around(cls, states: Y) -> "Box":
         """The smallest box around `states`, which are stacked along a leading axis."""
-        states = as_state(states)
-        if any(jnp.ndim(x) == 0 or jnp.shape(x)[0] == 0 for x in jtu.tree_leaves(states)):
-            raise ValueError(
-                "`states` must be at least one state, stacked along a leading axis. For a single "
-                "state write `jax.tree.map(lambda x: x[None], y0)`."
-            )
+        states = as_states(states)
         lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
         return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
 

@@ -1,10 +1,8 @@
 """Conversion of states to vectors, the inputs and outputs of a network."""
 
-import math
-
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
 
 from ..._custom_types import Y
 from ..._tree import working_dtype
@@ -17,19 +15,7 @@ def flatten(y: Y) -> Float[Array, " n"]:
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
 
 
-def unflatten(vector: Float[Array, " n"], like: Y) -> Y:
-    """The components of `vector` in the structure, shapes and dtypes of `like`."""
-    leaves, treedef = jtu.tree_flatten(like)
-    out, start = [], 0
-    for leaf in leaves:
-        shape = jnp.shape(leaf)
-        stop = start + math.prod(shape)
-        out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
-        start = stop
-    return jtu.tree_unflatten(treedef, out)
-
-
-def as_state(y: Y) -> Y:
+def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`y` with arrays as leaves; raises unless they are real and floating-point."""
     leaves = jtu.tree_leaves(y)
     if not leaves:
@@ -41,6 +27,20 @@ def as_state(y: Y) -> Y:
                 "states. Split a complex leaf into its real and its imaginary part."
             )
     return jtu.tree_map(_floating, y)
+
+
+def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
+    """`as_state` of states that are stacked along a leading axis; raises unless they are."""
+    states = as_state(states)
+    shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
+    lengths = {shape[:1] for shape in shapes}
+    if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
+        raise ValueError(
+            "`states` must be at least one state, stacked along a leading axis, but its leaves "
+            f"have shapes {shapes}. For a single state write "
+            "`jax.tree.map(lambda x: x[None], y0)`."
+        )
+    return states
 
 
 def _floating(leaf: ArrayLike) -> Array:

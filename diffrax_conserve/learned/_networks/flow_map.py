@@ -177,7 +177,7 @@ FlowMap.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-def as_flow_map(model: Any) -> AbstractFlowMap:
+def as_flow_map(model: AbstractFlowMap | Callable[..., Any]) -> AbstractFlowMap:
     """`model` as a flow map, also for a function with an attribute `max_step`."""
     if isinstance(model, AbstractFlowMap):
         return model
@@ -204,6 +204,12 @@ def check_args_domain(domain: Any) -> None:
             f"`args_domain` is {domain!r}, but it must be the smallest and the largest `args`: "
             "`diffrax_conserve.learned.Box(lower, upper)`."
         )
+
+
+def known_args(flow_map: AbstractFlowMap, args: Args) -> tuple[Args, ...]:
+    """What the flow map is called with between the state and the step: `(args,)`, or nothing."""
+    domain = args_domain_of(flow_map)
+    return () if domain is None else (checked_args(domain, args),)
 
 
 def checked_args(domain: Box, args: Args) -> Args:

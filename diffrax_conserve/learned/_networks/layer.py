@@ -14,7 +14,7 @@ from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection.elimination import Vector
 from ..._projection.linearise import Elements, Residual, linearise, written_out
-from ..._projection.residual import residual_of
+from ..._projection.residual import relative, residual_of
 from ..._tree import (
     tree_add,
     tree_dot,
@@ -45,8 +45,7 @@ class ConservativeLayer(eqx.Module):
     include the layer. They follow from the implicit function theorem for $g(y) = r$, where $r$ is
     the remaining residual; no iteration is unrolled.
 
-    With few iterations, the output is near the manifold, and on it to roundoff only if the output
-    of the network is already close. For a state exactly on the manifold, wrap the solver in
+    For a state on the manifold to roundoff, wrap the solver in
     [`diffrax_conserve.ManifoldProjection`][].
 
     !!! example
@@ -138,7 +137,8 @@ def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) ->
         y = tree_add(candidate, at_candidate.pullback(multipliers))
         g, at_y = linearise(residual, y)
         scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
-        damping = jnp.minimum(1e-2, _relative_square(g, scale)).astype(dtype)
+        ratio = relative(g, scale)
+        damping = jnp.minimum(1e-2, tree_dot(ratio, ratio, dtype))
         change = at_y.gram_solver(weights, at_candidate, damping).solve(g)
         step = at_candidate.pullback(change)
         shortening = lax.rsqrt(1 + tree_dot(step, step, dtype) / jnp.square(radius))
@@ -206,11 +206,3 @@ def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:
     scalars are stacked to an array.
     """
     return lax.cond(p >= 0, lambda x: x, lambda x: jtu.tree_map(jnp.zeros_like, x), tree)
-
-
-def _relative_square(g: Vector, scale: Vector) -> Array:
-    def square(a: Array, b: Array) -> Array:
-        positive = b > 0
-        return jnp.sum(jnp.square(jnp.where(positive, a / jnp.where(positive, b, 1), a)))
-
-    return sum(jtu.tree_leaves(jtu.tree_map(square, g, scale)))  # pyright: ignore

@@ -12,9 +12,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
-from ..._tree import working_dtype
+from ..._tree import unflatten, working_dtype
 from .cores import Sizes
-from .flat import as_state, flatten, stacked_vectors, unflatten
+from .flat import as_state, flatten, stacked_vectors
 from .layer import ConservativeLayer
 from .mlp import MLP, Activation, check_sizes, find_activation
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times

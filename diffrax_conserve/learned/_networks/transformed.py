@@ -13,7 +13,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike, Y
-from .flat import flatten, stacked_vectors, unflatten
+from ..._tree import unflatten
+from .flat import flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .trainable import LayerSchedule
 

@@ -1,5 +1,4 @@
-"""Flow maps of a family of equations: one member of the family, and the family as a single flow
-map."""
+"""A flow map of a family of equations, as a single flow map."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -8,25 +7,27 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..._custom_types import Args, RealScalarLike, Y
+from ..._custom_types import RealScalarLike, Y
 from .domain import Box
 from .flat import flatten
-from .flow_map import AbstractFlowMap, args_domain_of, checked_args
+from .flow_map import AbstractFlowMap
 from .trainable import LayerSchedule, Sampler
 
 
-def at_args(flow_map: AbstractFlowMap, args: Args) -> AbstractFlowMap:
-    """The flow map `(y0, h) -> y` for these `args`; `flow_map` itself if it takes no `args`."""
-    domain = args_domain_of(flow_map)
-    return flow_map if domain is None else AtArgs(flow_map, checked_args(domain, args))
+@final
+class OfPairs(AbstractFlowMap):
+    """A family of flow maps as a single flow map of the pairs `(y, args)`, with constant `args`.
 
+    For `fit`, `args` are then a part of the state.
+    """
 
-class _AbstractOfFamily(AbstractFlowMap):
-    """A flow map that takes its properties from a family."""
+    flow_map: AbstractFlowMap
 
-    flow_map: eqx.AbstractVar[AbstractFlowMap]
+    # Written out for the same reason as in `FlowMap`.
+    def __init__(self, flow_map: AbstractFlowMap):
+        self.flow_map = flow_map
 
     @property
     def max_step(self) -> RealScalarLike:
@@ -48,68 +49,6 @@ class _AbstractOfFamily(AbstractFlowMap):
 
     def linear_weights(self) -> Any:
         return self.flow_map.linear_weights()
-
-
-@final
-class AtArgs(_AbstractOfFamily):
-    """One member of a family of flow maps."""
-
-    flow_map: AbstractFlowMap
-    args: Args
-
-    # Written out for the same reason as in `FlowMap`.
-    def __init__(self, flow_map: AbstractFlowMap, args: Args):
-        self.flow_map = flow_map
-        self.args = args
-
-    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`, with `step` = `h`."""
-        return self.flow_map(y0, self.args, *step, schedule=schedule)
-
-    def slope(self, y0: Y, *args: Args) -> Y:
-        return self.flow_map.slope(y0, self.args, *args)
-
-    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        known = args_domain_of(self.flow_map)
-        assert known is not None
-        return known.contains(self.args) & self.flow_map.inside(y0, self.args, *step)
-
-    @property
-    def domain(self) -> "ArgsDomain":
-        """The domain of the family, which contains no state if `args` are outside their domain."""
-        known = args_domain_of(self.flow_map)
-        assert known is not None
-        return ArgsDomain(self.flow_map.domain, known, self.args)
-
-    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        return self.flow_map.measure(y0, rate)
-
-
-@final
-class ArgsDomain(eqx.Module):
-    """The states of a domain if `args` are in their domain, otherwise no states."""
-
-    states: Any  # a domain, or None
-    known: Box
-    args: Args
-
-    def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `args` and `y` are in their domains."""
-        inside = self.known.contains(self.args)
-        return inside if self.states is None else inside & self.states.contains(y)
-
-
-@final
-class OfPairs(_AbstractOfFamily):
-    """A family of flow maps as a single flow map of the pairs `(y, args)`, with constant `args`.
-
-    For `fit`, `args` are then a part of the state.
-    """
-
-    flow_map: AbstractFlowMap
-
-    def __init__(self, flow_map: AbstractFlowMap):
-        self.flow_map = flow_map
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The pair a time `h` after the pair `y0`, with `step` = `h`."""

@@ -1,7 +1,7 @@
 """A learned flow map as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,22 +12,27 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._networks import AbstractFlowMap, args_domain_of, as_flow_map, at_args
+from ..._projection.base import option
+from ..._tree import tree_max
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
-from .checks import check_learned_terms, check_nodes, check_output
-from .error_estimate import estimate
+from .checks import (
+    check_learned_terms,
+    check_nodes,
+    check_output,
+    refuse_another_field,
+    refuse_backwards,
+    reject_too_long,
+)
 from .policies import (
     AbstractPolicy,
     DomainStatistics,
-    StepInputs,
     StepResult,
     as_policy,
     check_policy,
-    small_enough,
+    step_of,
 )
-from .step_length import refuse_backwards, reject_too_long
-from .sweeps import AbstractSweep, Increment, Path, Picard, correct, increment
-from .trained_for import refuse_another_field
+from .sweeps import AbstractSweep, Increment, Path, Picard, correct, estimate, increment
 
 
 @final
@@ -57,14 +62,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
     `outside` determines what happens to a step that starts outside `flow_map.domain`, or whose
-    estimated error has a component larger than `max_error`:
-
-    - `None`: nothing, the default.
-    - [`diffrax_conserve.learned.Report`][]`()`: it is counted, for
-        [`diffrax_conserve.learned.domain_statistics`][].
-    - [`diffrax_conserve.learned.Refuse`][]`()`: it is counted, and the solve fails.
-    - [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver: that solver takes
-        the step, and it is counted.
+    estimated error has a component larger than `max_error`.
 
     Dense output follows the (corrected) path inside the step: it is the polynomial through its
     states at the `nodes` points, which without sweeps are computed only if dense output, saved
@@ -103,35 +101,16 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         equations", BIT 40 (2000), for correction by sweeps.
     """
 
-    flow_map: AbstractFlowMap
-    outside: AbstractPolicy | None
-    max_error: RealScalarLike | None
-    sweep: AbstractSweep
-    nodes: int = eqx.field(static=True)
-    corrections: int = eqx.field(static=True)
-    check_field: bool = eqx.field(static=True)
+    flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
+    nodes: int = option(12, static=True)
+    corrections: int = option(0, static=True)
+    sweep: AbstractSweep = option(Picard())
+    outside: AbstractPolicy | None = eqx.field(default=None, kw_only=True, converter=as_policy)
+    max_error: RealScalarLike | None = option(None)
+    check_field: bool = option(True, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
-
-    def __init__(
-        self,
-        flow_map: AbstractFlowMap | Callable[..., Any],
-        *,
-        nodes: int = 12,
-        corrections: int = 0,
-        sweep: AbstractSweep = Picard(),
-        outside: AbstractPolicy | dfx.AbstractSolver | None = None,
-        max_error: RealScalarLike | None = None,
-        check_field: bool = True,
-    ):
-        self.flow_map = as_flow_map(flow_map)
-        self.nodes = nodes
-        self.corrections = corrections
-        self.sweep = sweep
-        self.outside = as_policy(outside)
-        self.max_error = max_error
-        self.check_field = check_field
 
     def __check_init__(self):
         check_nodes(self.nodes)
@@ -177,10 +156,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         args: Args,
     ) -> DomainStatistics | None:
         check_learned_terms(terms, "FlowMapSolver")
-        flow_map = at_args(self.flow_map, args)
-        check_output(flow_map, (y0, t1 - t0), y0, "flow_map")
+        known = known_args(self.flow_map, args)
+        check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
         if self.check_field:
-            refuse_another_field(flow_map, terms, t0, t1, y0, args)
+            refuse_another_field(self.flow_map, known, terms, t0, t1, y0, args)
         return None if self.outside is None else DomainStatistics.zero(t0)
 
     def step(
@@ -194,15 +173,21 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
         del made_jump
-        flow_map = at_args(self.flow_map, args)
+        flow_map, known = self.flow_map, known_args(self.flow_map, args)
         h = refuse_backwards(jnp.asarray(t1 - t0), terms, flow_map.max_step)
-        step = self._learned(flow_map, h, y0, increment(terms, t0, t1, y0, args))
+        step = self._learned(known, h, y0, increment(terms, t0, t1, y0, args))
         if self.outside is not None and solver_state is not None:
-            inside = flow_map.inside(y0, h)
-            accurate = self._accurate(step.error)
+            inside = flow_map.inside(y0, *known, h)
+            if (box := args_domain_of(flow_map)) is not None:
+                inside &= box.contains(*known)
+            accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
             solver_state = solver_state.add(t0, inside & accurate)
-            inputs = StepInputs(terms, t0, t1, y0, args)
-            step = self.outside(step, inside, accurate, inputs, self.nodes)
+            step = self.outside(
+                step,
+                inside,
+                accurate,
+                lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args),
+            )
         step = reject_too_long(step, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, solver_state, step.result
@@ -211,13 +196,14 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         return terms.vf(t0, y0, args)
 
     def _learned(
-        self, flow_map: AbstractFlowMap, h: Array, y0: Y, increment: Increment
+        self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
     ) -> StepResult:
         """The step of the flow map, after the correction sweeps."""
         _, unravel = ravel_pytree(y0)
-        path = _path(flow_map, self.nodes, h, y0)
+        path = _path(self.flow_map, self.nodes, known, h, y0)
         if self.corrections == 0:
-            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), flow_map(y0, h), y0)
+            y1 = self.flow_map(y0, *known, h)
+            y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), y1, y0)
             error = estimate(increment, path)
         else:
             path, error = correct(self.sweep, increment, path, self.corrections)
@@ -225,16 +211,13 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         states = jax.vmap(unravel)(path)
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
-    def _accurate(self, error: Y) -> Array:
-        return jnp.asarray(True if self.max_error is None else small_enough(error, self.max_error))
 
-
-def _path(flow_map: AbstractFlowMap, nodes: int, h: Array, y0: Y) -> Path:
+def _path(flow_map: AbstractFlowMap, nodes: int, known: tuple[Args, ...], h: Array, y0: Y) -> Path:
     """The states of the flow map at the nodes; the first is the initial state."""
     start, _ = ravel_pytree(y0)
 
     def state(fraction: Array) -> Array:
-        return ravel_pytree(flow_map(y0, fraction * h))[0].astype(start.dtype)
+        return ravel_pytree(flow_map(y0, *known, fraction * h))[0].astype(start.dtype)
 
     rows = jax.vmap(state)(fractions(nodes, h.dtype)[1:])
     return jnp.concatenate([start[None], rows])
@@ -251,7 +234,11 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 - `corrections`: the number $k$ of correction sweeps.
 - `sweep`: [`diffrax_conserve.learned.Picard`][]`()` or
     [`diffrax_conserve.learned.NewtonSweep`][]`()`.
-- `outside`: the policy for steps outside the domain.
+- `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
+    counts them, for [`diffrax_conserve.learned.domain_statistics`][];
+    [`diffrax_conserve.learned.Refuse`][]`()` also fails; with
+    [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver, that solver takes
+    them. Default: nothing happens.
 - `max_error`: the largest estimated error of a component, in its own units, of a step that counts
     as inside. Default: only the domain decides.
 - `check_field`: whether to raise an error if the vector field at the initial state differs from the

@@ -10,14 +10,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from ..._custom_types import Y
 from .feature_basis import FeatureBasis
 
 Coefficients = Float[Array, "members n"]
@@ -146,8 +143,3 @@ def dense_series(
 def _multiply(table: np.ndarray, x: Array) -> Array:
     """`table @ x`, never in the reduced precision of accelerators for single-precision products."""
     return jnp.matmul(jnp.asarray(table, x.dtype), x, precision=lax.Precision.HIGHEST)
-
-
-def flatten(y: Y) -> tuple[Float[Array, " n"], Callable[[Array], PyTree[Array]]]:
-    """The state as a vector, and the inverse map, which restores the dtype of each leaf."""
-    return jax.flatten_util.ravel_pytree(jtu.tree_map(jnp.asarray, y))

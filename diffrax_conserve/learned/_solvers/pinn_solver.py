@@ -11,9 +11,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._projection.base import option
 from ..._solver.terms import time_direction
-from ..._tree import working_dtype
-from .._networks import PINN
+from ..._tree import tree_max, tree_sub, working_dtype
+from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
 from .checks import check_learned_terms, check_nodes, check_output
 
@@ -59,14 +60,10 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
     """
 
     pinn: PINN
-    nodes: int = eqx.field(static=True)
+    nodes: int = option(12, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
-
-    def __init__(self, pinn: PINN, *, nodes: int = 12):
-        self.pinn = pinn
-        self.nodes = nodes
 
     def __check_init__(self):
         check_nodes(self.nodes)
@@ -91,14 +88,13 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
         del t1, args
         check_learned_terms(terms, "PINNSolver")
         check_output(self.pinn, (t0,), y0, "pinn")
-        dtype = working_dtype(y0)
         time = _refuse_outside(jnp.asarray(t0), terms, (self.pinn.t0, self.pinn.t1), self.pinn)
-        distance, scale = _distance(y0, self.pinn(time), dtype)
-        tolerance = math.sqrt(jnp.finfo(dtype).eps)
+        state = self.pinn(time)
+        tolerance = math.sqrt(jnp.finfo(working_dtype(y0)).eps)
         interval = jnp.array([self.pinn.t0, self.pinn.t1], time.dtype)
         return eqx.error_if(
             interval,
-            ~(distance <= tolerance * scale),
+            ~(tree_max(tree_sub(y0, state)) <= tolerance * tree_max(state)),
             "`y0` is not the state that the PINN has at the initial time: they differ by more than "
             f"{tolerance:.1g} of their largest component. A PINN is one solution: start with "
             "`y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or use a `DeepONet`.",
@@ -158,14 +154,3 @@ def _refuse_outside(
         f"{pinn.t1:.6g} that the PINN was trained for. Solve within it, or train one for a longer "
         "interval.",
     )
-
-
-def _distance(y0: Y, state: Y, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """The largest difference of two states, and their largest component."""
-
-    def largest(tree: Y) -> Array:
-        leaves = [jnp.max(jnp.abs(x), initial=0).astype(dtype) for x in jtu.tree_leaves(tree)]
-        return jnp.max(jnp.stack(leaves))
-
-    difference = jtu.tree_map(lambda a, b: jnp.asarray(a) - b, y0, state)
-    return largest(difference), largest(state)

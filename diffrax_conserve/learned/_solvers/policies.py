@@ -2,19 +2,19 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
-import jax.core
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
-from ..._options import check_solution
+from ..._options import check_number, check_solution
 from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
@@ -85,14 +85,8 @@ class StepResult(eqx.Module):
     result: dfx.RESULTS
 
 
-class StepInputs(eqx.Module):
-    """The arguments of a solver's `step`."""
-
-    terms: PyTree[dfx.AbstractTerm]
-    t0: RealScalarLike
-    t1: RealScalarLike
-    y0: Y
-    args: Args
+# The same step by another solver.
+TakeStep = Callable[[dfx.AbstractSolver], StepResult]
 
 
 class AbstractPolicy(eqx.Module):
@@ -100,7 +94,7 @@ class AbstractPolicy(eqx.Module):
 
     @abc.abstractmethod
     def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, inputs: StepInputs, nodes: int
+        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
     ) -> StepResult:
         """The result of the step, given that of the flow map."""
 
@@ -110,9 +104,9 @@ class Report(AbstractPolicy):
     """Counts such steps, for [`diffrax_conserve.learned.domain_statistics`][]."""
 
     def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, inputs: StepInputs, nodes: int
+        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
     ) -> StepResult:
-        del inside, accurate, inputs, nodes
+        del inside, accurate, take
         return step
 
 
@@ -124,9 +118,9 @@ class Refuse(AbstractPolicy):
     """
 
     def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, inputs: StepInputs, nodes: int
+        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
     ) -> StepResult:
-        del inputs, nodes
+        del take
         index = jnp.where(inside, _INACCURATE, _OUTSIDE)
         result = dfx.RESULTS.where(inside & accurate, step.result, member(index))
         # The error is infinite only for an inaccurate step: a smaller step may be more accurate,
@@ -164,11 +158,11 @@ class Replace(AbstractPolicy):
             )
 
     def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, inputs: StepInputs, nodes: int
+        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
     ) -> StepResult:
         def other() -> StepResult:
-            found = _step_of(self.solver, inputs, nodes)
-            return jtu.tree_map(lambda a, b: jnp.asarray(a, jnp.result_type(b)), found, step)
+            taken = take(self.solver)
+            return jtu.tree_map(lambda a, b: jnp.asarray(a, jnp.result_type(b)), taken, step)
 
         return lax.cond(inside & accurate, lambda: jtu.tree_map(jnp.asarray, step), other)
 
@@ -183,9 +177,16 @@ Replace.__init__.__doc__ = """**Arguments:**
 """
 
 
-def _step_of(solver: dfx.AbstractSolver, inputs: StepInputs, nodes: int) -> StepResult:
+def step_of(
+    solver: dfx.AbstractSolver,
+    nodes: int,
+    terms: PyTree[dfx.AbstractTerm],
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+) -> StepResult:
     """A step of a classical solver, which has no memory of earlier ones."""
-    terms, t0, t1, y0, args = inputs.terms, inputs.t0, inputs.t1, inputs.y0, inputs.args
     state = solver.init(terms, t0, t1, y0, args)
     y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
@@ -196,7 +197,7 @@ def _step_of(solver: dfx.AbstractSolver, inputs: StepInputs, nodes: int) -> Step
     return StepResult(y1, error, coefficients, result)
 
 
-def as_policy(outside: Any) -> AbstractPolicy | None:
+def as_policy(outside: AbstractPolicy | dfx.AbstractSolver | None) -> AbstractPolicy | None:
     """`outside` as a policy; a diffrax solver becomes `Replace(solver)`."""
     if isinstance(outside, dfx.AbstractSolver):
         return Replace(outside)
@@ -212,9 +213,7 @@ def as_policy(outside: Any) -> AbstractPolicy | None:
 def check_policy(outside: AbstractPolicy | None, max_error: Any, domain: Any) -> None:
     """Raises if a policy is given without a domain or an error bound, or an error bound without a
     policy."""
-    known = max_error is not None and not isinstance(max_error, jax.core.Tracer)
-    if known and eqx.is_array_like(max_error) and not np.all(np.asarray(max_error) > 0):
-        raise ValueError(f"`max_error` is {max_error}, but it must be positive, or `None`.")
+    check_number("max_error", max_error, above=0.0)
     if outside is None and max_error is not None:
         raise ValueError(
             "`max_error` says which steps count as outside, but these are ignored. Pass `outside="
@@ -226,12 +225,6 @@ def check_policy(outside: AbstractPolicy | None, max_error: Any, domain: Any) ->
             "`domain`. Give it one, for example `diffrax_conserve.learned.Box.around(states)` with "
             "the states that it was trained on, or pass `max_error`."
         )
-
-
-def small_enough(error: Y, max_error: RealScalarLike) -> Bool[Array, ""]:
-    """Whether every component of `error` is at most `max_error`; NaN is not."""
-    fine = [jnp.all(jnp.abs(e) <= max_error) for e in jtu.tree_leaves(error)]
-    return jnp.all(jnp.stack(fine))
 
 
 def domain_statistics(sol: dfx.Solution) -> DomainStatistics:

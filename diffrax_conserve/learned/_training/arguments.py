@@ -15,18 +15,12 @@ from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_outputs
 from ..._options import check_number
 from ..._projection.project import check_state
-from ..._tree import tree_shapes
-from .._networks import (
-    PINN,
-    AbstractFlowMap,
-    AbstractTrainable,
-    DeepONet,
-    Points,
-    as_flow_map,
-    has_arrays,
-)
+from .._networks.deeponet import DeepONet
 from .._networks.flat import stacked_vectors
-from .._solvers import check_output
+from .._networks.flow_map import AbstractFlowMap, as_flow_map, has_arrays
+from .._networks.pinn import PINN
+from .._networks.trainable import AbstractTrainable, Points
+from .._solvers.checks import check_output
 from .defect import VectorField
 from .pool import Pool
 from .recipe import Recipe
@@ -140,12 +134,8 @@ def check_field(
     autonomous."""
     starts = model.starts(points)
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
-    rate = eqx.filter_eval_shape(vector_field, starts.ts[0], y0, args)
-    if tree_shapes(rate) != tree_shapes(y0):
-        raise ValueError(
-            f"`vector_field` returns the structure {tree_shapes(rate)}, but the state has "
-            f"{tree_shapes(y0)}. Both must be the same."
-        )
+    t0 = starts.ts[0]
+    check_output(lambda y: vector_field(t0, y, args), (y0,), y0, "vector_field")
     now = _rates(vector_field, starts.ts, starts.y0s, args)
     wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
     if wrong.size:

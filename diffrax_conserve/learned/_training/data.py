@@ -10,7 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from .._networks import AbstractFlowMap, LayerSchedule, Points, Sampler, Times
+from .._networks.flow_map import AbstractFlowMap
+from .._networks.trainable import LayerSchedule, Points, Sampler, Times
 
 
 class Pairs(NamedTuple):

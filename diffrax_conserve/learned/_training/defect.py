@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_sub
-from .._networks import AbstractTrainable, LayerSchedule, Points
+from .._networks.trainable import AbstractTrainable, LayerSchedule, Points
 
 VectorField = Callable[[RealScalarLike, Any, Args], Any]
 

@@ -15,16 +15,10 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks import (
-    PINN,
-    OfPairs,
-    PairField,
-    PairSampler,
-    Sampler,
-    args_domain_of,
-    as_flow_map,
-    restored,
-)
+from .._networks.flow_map import args_domain_of, as_flow_map, restored
+from .._networks.pinn import PINN
+from .._networks.trainable import Sampler
+from .._networks.with_args import OfPairs, PairField, PairSampler
 from .arguments import (
     check_arguments,
     check_family,
@@ -35,14 +29,12 @@ from .arguments import (
 )
 from .data import as_data
 from .defect import VectorField
-from .log import FitLog
 from .objective import Objective
 from .path_error import data_error, step_error
 from .pool import Pool, with_domain
-from .progress import Progress
 from .recipe import Recipe, second_order
-from .state import FitState, Past, continued, fingerprint, read_checkpoint
-from .trainer import Trainer
+from .state import FitLog, FitState, Past, continued, fingerprint, read_checkpoint
+from .trainer import Progress, Trainer
 from .windows import WindowEnds, solution_error, train_windows, windows_of
 
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -86,12 +78,10 @@ def fit(
     windows are trained again, to smaller errors. If the solution is still wrong, a warning names
     the window and the error.
 
-    A training can be interrupted and continued. It stops after the recipe's epochs, at a `target`,
-    after `seconds`, or at a keyboard interrupt, and returns the best model so far. With
-    `state=log.state` and otherwise the same arguments the next call continues it, and with a
-    `checkpoint` another process does; the result is the same, bit for bit, as without the stop. A
-    finished training can be continued with a recipe of more epochs. The result is that of all
-    epochs at once unless the optimiser depends on their number, as SPRING does.
+    A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
+    same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
+    continued with a recipe of more epochs. The result is that of all epochs at once unless the
+    optimiser depends on their number, as SPRING does.
 
     **Arguments:**
 
@@ -158,7 +148,8 @@ def fit(
     check_arguments(model, sample, data, manifold)
     check_limits(state, target, seconds)
     recipe = second_order(model) if recipe is None else recipe
-    flow_map = None if isinstance(model, PINN) else as_flow_map(model)
+    given: Any = model
+    flow_map = None if isinstance(model, PINN) else as_flow_map(given)
     if flow_map is not None and (domain := args_domain_of(flow_map)) is not None:
         check_family(sample, args)
         flow_map = OfPairs(flow_map)
@@ -255,14 +246,9 @@ def _first(trainer: Trainer, model: Any, given: FitState | None) -> FitState:
 def _log(trainer: Trainer, state: FitState, ended: str, error: float, errors: Any = ()) -> FitLog:
     past = state.past.and_then(state.carry, state.checked, state.criteria)
     return FitLog(
+        **vars(past),
         error=error,
         errors=np.asarray(errors),
-        losses=past.losses,
-        checked=past.checked,
-        criteria=past.criteria,
-        best_epoch=past.best_epoch,
-        best=past.best,
-        skipped=past.skipped,
         ended=ended,
         seconds=time.perf_counter() - trainer.begun - trainer.compile_seconds,
         compile_seconds=trainer.compile_seconds,

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -22,8 +21,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, Y
-from .._networks import AbstractFlowMap, AbstractTrainable, Points, Sampler, Window
-from .._networks.flat import flatten, stacked_vectors, unflatten
+from ..._tree import unflatten
+from .._networks.flat import flatten, stacked_vectors
+from .._networks.flow_map import AbstractFlowMap
+from .._networks.pinn import Window
+from .._networks.trainable import AbstractTrainable, Points, Sampler
+from .._solvers.sweeps import rk4_errors
 from .data import Data
 from .defect import VectorField
 
@@ -72,17 +75,8 @@ def path_errors(
 
         return jax.vmap(one)(ts[i], us[i] + e) - rates[i]
 
-    def substep(e: Array, i: Array) -> tuple[Array, Array]:
-        h = (lengths / substeps)[:, None]
-        k1 = slope(i, e)
-        k2 = slope(i + 1, e + h / 2 * k1)
-        k3 = slope(i + 1, e + h / 2 * k2)
-        k4 = slope(i + 2, e + h * k3)
-        e = e + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-        return e, jnp.abs(e)
-
-    end, history = lax.scan(substep, initial, 2 * jnp.arange(substeps))
-    largest = jnp.maximum(jnp.max(history, axis=0), jnp.abs(initial))
+    end, history = rk4_errors(slope, initial, (lengths / substeps)[:, None], substeps)
+    largest = jnp.maximum(jnp.max(jnp.abs(history), axis=0), jnp.abs(initial))
     return PathErrors(largest, end, jnp.max(jnp.abs(us), axis=0))
 
 
@@ -93,14 +87,9 @@ def window_errors(
     initial: Float[Array, " n"],
     substeps: int,
 ) -> PathErrors:
-    """The errors of a window that starts without an error, and with the error `initial`."""
-
-    def twice(x: Array) -> Array:
-        return jnp.stack([x, x])
-
-    both = jnp.stack([jnp.zeros_like(initial), initial])
-    paths = Points(twice(window.start), None)
-    return path_errors(window, vector_field, args, paths, twice(window.length), both, substeps)
+    """The errors of a window, as a single path, that starts with the error `initial`."""
+    paths, lengths = Points(window.start[None], None), window.length[None]
+    return path_errors(window, vector_field, args, paths, lengths, initial[None], substeps)
 
 
 def step_error(

@@ -16,7 +16,9 @@ from ..._custom_types import Args, Manifold, RealScalarLike, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection.project import project
 from ..._tree import tree_all_finite
-from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
+from .._networks.domain import AbstractDomain
+from .._networks.flow_map import AbstractFlowMap
+from .._networks.trainable import Points, Sampler
 
 # A function from steps, each given by an initial state and a length, to the squared norms of the
 # defects at their ends.
@@ -35,9 +37,8 @@ class Pool(eqx.Module):
     average. A move costs one evaluation of the network, whereas
     [`diffrax_conserve.learned.reachable_states`][] solves equations.
 
-    A step is accepted only if its defect at the end is small. An inaccurate network therefore takes
-    few steps and first learns the states of `sample`, and states are not moved where no solution
-    goes, or by steps too long for the solution.
+    A step is accepted only if its defect at the end is small. An inaccurate network therefore first
+    learns the states of `sample`.
 
     Construct the network with `states` that cover about the region of the solutions: they normalise
     its inputs.

@@ -9,7 +9,8 @@ from jaxtyping import Array
 
 from ..._options import check_number
 from ..._tree import tree_size
-from .._networks import PINN, Times
+from .._networks.pinn import PINN
+from .._networks.trainable import Times
 from .loss import Bounded, Loss, mean_square
 from .schedule import every_iteration, ramped_weight, staged_iterations
 from .second_order import SPRING, LevenbergMarquardt, SecondOrder

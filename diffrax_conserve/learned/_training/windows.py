@@ -15,9 +15,9 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._custom_types import Args, Manifold
 from ..._manifold import conserved_values
 from ..._projection.project import project
-from .._networks import PINN, Window, fresh, initial_slope
 from .._networks.flat import flatten
-from .._networks.mlp import MLP
+from .._networks.mlp import MLP, fresh, initial_slope
+from .._networks.pinn import PINN, Window
 from .objective import Objective
 from .path_error import relative, window_errors
 from .state import FitState, Windows
@@ -247,12 +247,12 @@ def _errors_along(trainer: Trainer, pinn: PINN) -> list[float]:
     for k in range(pinn.windows):
         window = pinn.window(k)
         found = window_errors(window, trainer.vector_field, trainer.args, error, trainer.substeps)
-        largest.append(np.asarray(found.largest[1]))
-        sizes.append(np.asarray(found.size[1]))
+        largest.append(np.asarray(found.largest[0]))
+        sizes.append(np.asarray(found.size[0]))
         if k + 1 < pinn.windows:
             # The next window starts at another state, but the exact solution is continuous.
             end = flatten(window(window.start + window.length))
-            error = found.end[1] + end - flatten(pinn.window(k + 1).y0)
+            error = found.end[0] + end - flatten(pinn.window(k + 1).y0)
     size = np.max(sizes, axis=0)
     return [relative(e, size, pinn.y0) for e in largest]
 
