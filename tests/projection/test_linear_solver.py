@@ -1,6 +1,7 @@
 """`linear_solver=`: solves by lineax lead to the projection that elimination leads to."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -128,6 +129,7 @@ def test_with_bounds_and_a_metric():
 
 
 def test_it_is_an_option_of_a_solve():
+    @eqx.filter_jit
     def final(linear_solver):
         solver = dfc.ManifoldProjection(
             dfx.Tsit5(),
