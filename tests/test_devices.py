@@ -120,6 +120,7 @@ def test_shard_map_has_no_communication(spread):
     assert spread["all-reduces"]["shard_map"] == 0
 
 
+@pytest.mark.slow
 def test_a_batch_over_two_processes_is_the_batch_in_one():
     with socket.socket() as free:
         free.bind(("localhost", 0))

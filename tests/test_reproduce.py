@@ -234,7 +234,9 @@ def test_a_full_disk(tmp_path, monkeypatch, capsys, only_rk4):
     assert found.endswith("\nerror: cannot write metrics.json: No space left on device\n")
 
 
-@pytest.mark.parametrize("redirection", ["| head -1", "> /dev/full"])
+@pytest.mark.parametrize(
+    "redirection", [pytest.param("| head -1", marks=pytest.mark.slow), "> /dev/full"]
+)
 def test_an_output_that_ends_early(redirection):
     command = f"set -o pipefail; {sys.executable} -m diffrax_conserve list {redirection}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
@@ -257,14 +259,16 @@ def test_list_names_every_system(capsys):
     assert [line.split()[0] for line in lines] == list(dfc.systems.names())
 
 
-# The others are slow by their number, and for the learned solvers that are compiled.
+# The others are slow by their number, and for the learned solvers that are compiled. They draw, too.
 QUICK = ("kepler",)
 
 
-@pytest.mark.draws
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in dfc.systems.names()],
+    [
+        pytest.param(n, marks=[] if n in QUICK else [pytest.mark.slow, pytest.mark.draws])
+        for n in dfc.systems.names()
+    ],
 )
 def test_every_system(name, tmp_path):
     system = dfc.systems.get(name)

@@ -130,7 +130,9 @@ def test_rk4_is_of_order_four(which, double_end):
     assert fine < 1e-6
 
 
-@pytest.mark.parametrize("which", ["pendulum", "double pendulum"])
+@pytest.mark.parametrize(
+    "which", [pytest.param("pendulum", marks=pytest.mark.slow), "double pendulum"]
+)
 def test_mechanisms_agree_with_angles(which, double_end):
     if which == "pendulum":
         field, manifold, y0, end = ROD, ROD_MANIFOLD, PENDULUM.y0, pendulum_end()

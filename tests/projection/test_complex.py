@@ -173,7 +173,9 @@ def test_it_is_the_projection_in_real_and_imaginary_parts(name):
 
 
 @pytest.mark.parametrize(
-    "inner", [dfx.Euler(), pytest.param(dfx.Bosh3(), marks=pytest.mark.slow)], ids=["euler", "bosh3"]
+    "inner",
+    [dfx.Euler(), pytest.param(dfx.Bosh3(), marks=pytest.mark.slow)],
+    ids=["euler", "bosh3"],
 )
 @pytest.mark.parametrize("name", projections("simplified"))
 def test_it_is_the_solve_in_real_and_imaginary_parts(name, inner):

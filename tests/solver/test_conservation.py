@@ -43,7 +43,7 @@ CASES = combinations(
 )
 
 
-@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=9)
+@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=14)
 def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
     system = dfc.systems.get(name)
     step = jnp.asarray(STEP.get(name, 0.05), dtype)

@@ -43,7 +43,7 @@ def test_implicit_solvers_take_the_tolerances_of_the_controller(solver):
     term = dfx.ODETerm(rigid_body)
     if isinstance(solver, dfx.KenCarp4):
         term = dfx.MultiTerm(term, dfx.ODETerm(lambda t, y, args: 0 * y))
-    sol = dfx.diffeqsolve(
+    sol = eqx.filter_jit(dfx.diffeqsolve)(
         term,
         dfc.ManifoldProjection(solver, RIGID_BODY),
         0.0,

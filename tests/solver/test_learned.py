@@ -56,7 +56,9 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@SOLVERS
+@pytest.mark.parametrize(
+    "solver", [FLOW, pytest.param(FOLLOW, marks=pytest.mark.slow)], ids=["deeponet", "pinn"]
+)
 def test_more_nodes_follow_it_more_closely(solver):
     def error(nodes):
         follows = solver is FOLLOW
@@ -113,7 +115,8 @@ def test_any_flow_map_of_the_user():
     solver = unchecked(Rotation(jnp.array(1.0)))
     term = dfx.ODETerm(lambda t, y, args: (y[1], -y[0]))
     y0 = (jnp.array(1.0), jnp.array(0.0))
-    sol = dfx.diffeqsolve(term, solver, 0.0, 3.0, 0.5, y0, saveat=dfx.SaveAt(ts=[0.7, 3.0]))
+    saveat = dfx.SaveAt(ts=jnp.array([0.7, 3.0]))
+    sol = eqx.filter_jit(dfx.diffeqsolve)(term, solver, 0.0, 3.0, 0.5, y0, saveat=saveat)
     np.testing.assert_allclose(sol.ys[0], np.cos([0.7, 3.0]), atol=1e-12)
 
 
@@ -289,7 +292,14 @@ TRANSFORMS = {
 }
 
 
-@pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
+@pytest.mark.parametrize(
+    "transform",
+    [
+        pytest.param(t, marks=pytest.mark.slow) if n == "filter_jit" else t
+        for n, t in TRANSFORMS.items()
+    ],
+    ids=TRANSFORMS,
+)
 def test_a_step_that_is_too_long(transform):
     """Whether the length is known to the compiler or not."""
 
