@@ -259,7 +259,7 @@ def test_list_names_every_system(capsys):
     assert [line.split()[0] for line in lines] == list(dfc.systems.names())
 
 
-# The others are slow by their number, and for the learned solvers that are compiled. They also draw.
+# The others are slow by their number, and for the learned solvers that they compile. They draw.
 QUICK = ("kepler",)
 
 

@@ -165,6 +165,10 @@ def test_event_lands_on_the_manifold_at_the_right_time_with_a_right_gradient():
     np.testing.assert_allclose(gradient, [0.0, 1.0], atol=1e-6)
 
 
+def cosine(t, y, args):
+    return jnp.cos(t)
+
+
 TIMED = dfc.FirstIntegral(lambda t, y, args: y - jnp.sin(t))
 
 
@@ -173,7 +177,7 @@ def test_time_dependent_integral_in_either_direction(t1):
     """diffrax shows a solver negated times when it solves backwards."""
     ts = jnp.linspace(0, t1, 7)
     sol = solve(
-        lambda t, y, args: jnp.cos(t),
+        cosine,
         dfc.ManifoldProjection(dfx.Euler(), TIMED),
         jnp.array(1.0),
         t1=t1,
