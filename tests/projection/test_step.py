@@ -104,8 +104,9 @@ class Seen(dfc.AbstractProjection):
 def test_a_projection_sees_the_step_of_every_candidate(t1):
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())
     saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 23), dense=True)
-    sol = solve(solver, t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
-    plain = solve(dfx.Bosh3(), t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
+    # Arrays: for other times nothing is compiled anew.
+    times = {"t1": jnp.array(t1), "dt0": jnp.array(0.1 * np.sign(t1)), "saveat": saveat}
+    sol, plain = solve(solver, **times), solve(dfx.Bosh3(), **times)
     assert sol.result == dfx.RESULTS.successful
     np.testing.assert_allclose(sol.ys, plain.ys, atol=1e-14)
     np.testing.assert_allclose(sol.evaluate(0.33 * t1), plain.evaluate(0.33 * t1), atol=1e-14)
@@ -119,7 +120,13 @@ class Unseeing(Seen):
         return candidate, problem.judge(candidate, candidate, atol=1.0)
 
 
-@pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton(), Unseeing()])
+@pytest.mark.parametrize(
+    "projection",
+    [
+        Unseeing(),
+        *(pytest.param(p, marks=pytest.mark.slow) for p in (dfc.SimplifiedNewton(), dfc.Newton())),
+    ],
+)
 def test_what_asks_for_no_step_gets_none_and_saves_none(projection):
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=projection)
     sol = solve(solver, saveat=dfx.SaveAt(dense=True))
