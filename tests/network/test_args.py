@@ -49,8 +49,8 @@ def solve(flow_map, args, check_field=False, **options):
 
 @pytest.fixture(scope="module")
 def trained():
-    recipe = dfc.learned.second_order(family(), epochs=200)
-    recipe = dataclasses.replace(recipe, points=60)
+    recipe = dfc.learned.second_order(family(), epochs=300)
+    recipe = dataclasses.replace(recipe, points=100)
     return dfc.fit(family(1), spring, sample=sample, recipe=recipe, key=jr.key(2))
 
 

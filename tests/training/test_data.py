@@ -58,7 +58,7 @@ def error(flow_map, h):
 )
 def test_a_flow_map_learns_from_trajectories(field):
     before = network()
-    chosen = recipe(before)
+    chosen = recipe(before, epochs=100)
     after, log = dfc.fit(before, field, data=(TS, EXACT), key=KEY, recipe=chosen)
     for h in (0.1, 0.5):
         assert error(after, h) < 5e-3 < error(before, h)

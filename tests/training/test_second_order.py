@@ -110,7 +110,7 @@ def test_the_gradient_is_that_of_any_loss():
 
 
 def test_a_window_is_learned_to_ten_digits():
-    pinn, log = dfc.fit(turns(1.5, width=16), oscillator, key=KEY)
+    pinn, log = dfc.fit(turns(3.0), oscillator, key=KEY)
     assert error(pinn) < 1e-8
     assert log.best < 1e-15
     assert log.skipped == 0
