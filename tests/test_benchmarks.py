@@ -195,6 +195,7 @@ def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
     assert json.loads(out.read_text())["parts"] == json.loads(json.dumps(found))
 
 
+@pytest.mark.slow
 def test_the_cost_of_one_constraint_is_measured():
     scaling = benchmark("scaling")
     row = scaling.constraints(1, scaling.SMOKE)

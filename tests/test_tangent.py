@@ -329,6 +329,8 @@ def test_the_units_of_a_constraint_do_not_count(dtype):
         return field(0.0, radius * jnp.array([0.6, 0.8], dtype), None) / radius
 
     one = jnp.ones((), dtype)
-    found = jax.vmap(along)(*jnp.array([[one, far], [one, 1 / far], [far, one], [1 / far, one]]).T)
+    found = jax.jit(jax.vmap(along))(
+        *jnp.array([[one, far], [one, 1 / far], [far, one], [1 / far, one]]).T
+    )
     tolerance = 16 * float(jnp.finfo(dtype).eps)
     np.testing.assert_allclose(found, [[-0.32, 0.24]] * 4, rtol=tolerance)

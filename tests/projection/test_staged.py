@@ -93,17 +93,18 @@ def test_saved_times_and_dense_output_are_on_both():
         np.testing.assert_allclose(jnp.sum(q * v, axis=1), 0, atol=1e-14)
 
 
-def test_derivatives_in_both_modes_agree_with_finite_differences():
-    def run(adjoint):
+@pytest.mark.parametrize("forward", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_derivatives_in_both_modes_agree_with_finite_differences(forward):
+    adjoint = dfx.ForwardMode() if forward else dfx.RecursiveCheckpointAdjoint()
+
+    def run(args):
         fixed = {"dt0": 0.05, "stepsize_controller": dfx.ConstantStepSize(), "t1": 0.3}
         # The simplest of all solvers, as it is the projection whose derivative is in question.
         fixed["inner"] = dfx.Euler()
-        return lambda args: [x[-1] for x in solve(STAGED, Y0, args, adjoint=adjoint, **fixed).ys]
+        return [x[-1] for x in solve(STAGED, Y0, args, adjoint=adjoint, **fixed).ys]
 
     gravity = jnp.array(GRAVITY)
-    reverse, forward = run(dfx.RecursiveCheckpointAdjoint()), run(dfx.ForwardMode())
-    dct.assert_gradients(reverse, gravity, rtol=1e-6, forward=False)
-    dct.assert_gradients(forward, gravity, rtol=1e-6, reverse=False)
+    dct.assert_gradients(run, gravity, rtol=1e-6, forward=forward, reverse=not forward)
 
 
 def test_a_lane_of_a_batch_is_that_lane_alone():

@@ -61,13 +61,14 @@ def test_relaxation_with_the_time_kept_loses_at_most_one_order():
     dct.assert_order(RELAXED, TERM, Y0, t1=2.0, dt0=0.2, args=ONE, order=3)
 
 
-def test_the_derivative_of_relaxation_is_that_of_its_solve():
-    def run(adjoint):
-        return lambda y0, args: solve(RELAXED, y0, args, adjoint=adjoint).ys[-1]
+@pytest.mark.parametrize("forward", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_the_derivative_of_relaxation_is_that_of_its_solve(forward):
+    adjoint = dfx.ForwardMode() if forward else dfx.RecursiveCheckpointAdjoint()
 
-    reverse, forward = run(dfx.RecursiveCheckpointAdjoint()), run(dfx.ForwardMode())
-    dct.assert_gradients(reverse, Y0, ONE, rtol=1e-6, forward=False)
-    dct.assert_gradients(forward, Y0, ONE, rtol=1e-6, reverse=False)
+    def run(y0, args):
+        return solve(RELAXED, y0, args, adjoint=adjoint).ys[-1]
+
+    dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=forward, reverse=not forward)
 
 
 def test_a_lane_of_a_batch_is_that_lane_alone():
