@@ -88,7 +88,10 @@ def test_what_an_earlier_stage_reached_is_held():
 
 
 def test_saved_times_and_dense_output_are_on_both():
-    sol = solve(STAGED, t1=2.0, saveat=dfx.SaveAt(ts=jnp.linspace(0, 2, 41), dense=True))
+    # The simplest of all solvers, as it is the projection that is in question.
+    fixed = {"inner": dfx.Euler(), "dt0": 0.02, "stepsize_controller": dfx.ConstantStepSize()}
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 41), dense=True)
+    sol = solve(STAGED, t1=2.0, saveat=saveat, **fixed)
     between = evaluated(sol, jnp.linspace(0, 2, 33))
     for q, v in (sol.ys, between):
         np.testing.assert_allclose(jnp.sum(q**2, axis=1), 1, atol=4e-15)
