@@ -66,8 +66,8 @@ def integrated_rates(
     dtype = jnp.result_type(half)
     found = jax.vmap(at)(jnp.asarray(_NODES, dtype))
     weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
-    return jtu.tree_map(lambda x: _weighted_sum(weights.astype(x.dtype), x), found)
 
+    def total(x: Array) -> Array:
+        return jnp.sum(weights.astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x, axis=0)
 
-def _weighted_sum(weights: Array, x: Array) -> Array:
-    return jnp.sum(weights.reshape(-1, *[1] * (x.ndim - 1)) * x, axis=0)
+    return jtu.tree_map(total, found)

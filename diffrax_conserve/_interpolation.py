@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection import SimplifiedNewton, Target
+from ._projection.simplified_newton import SimplifiedNewton
+from ._projection.target import Target
 from ._tree import tree_sub
 
 
@@ -93,14 +94,7 @@ class MakeManifoldInterpolation:
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 
     def __call__(
-        self,
-        *,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        inner: DenseInfo,
-        ends: tuple[Y, Y],
-        error: Y | None,
-        target: PackedTarget,
+        self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, **fields: Any
     ) -> ManifoldInterpolation:
-        interpolation = self.inner_cls(t0=t0, t1=t1, **inner)
-        return ManifoldInterpolation(t0, t1, interpolation, ends, error, target)
+        path = self.inner_cls(t0=t0, t1=t1, **inner)
+        return ManifoldInterpolation(t0=t0, t1=t1, inner=path, **fields)

@@ -90,7 +90,7 @@ def _call_jvp(primals, tangents):
     t_others, t_y = tangents
     fn, jacobian, t, args = others
     value = _call(others, y)
-    total = None
+    total = jtu.tree_map(jnp.zeros_like, value)
     if any(x is not None for x in jtu.tree_leaves(t_y)):
         t_y = tree_tangents(y, t_y)
         rows = jacobian(t, y, args)
@@ -99,10 +99,7 @@ def _call_jvp(primals, tangents):
     if jtu.tree_leaves((t_fn, t_t, t_args)):
         given = (fn, t, args), (t_fn, t_t, t_args)
         _, rest = eqx.filter_jvp(lambda f, t, args: f(t, y, args), *given)
-        rest = tree_tangents(value, rest)
-        total = rest if total is None else jtu.tree_map(jnp.add, total, rest)
-    if total is None:
-        total = jtu.tree_map(jnp.zeros_like, value)
+        total = tree_add(total, tree_tangents(value, rest))
     return value, total
 
 

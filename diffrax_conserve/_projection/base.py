@@ -9,63 +9,16 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._options import check_count, check_number, check_numbers
-from .._printing import is_traced, printed
-from .._tree import from_view, tree_all_finite, tree_norm, tree_stop_gradient, tree_sub
+from .._tree import from_view, tree_stop_gradient
 from .elimination import Vector
+from .equations import Equations, ProjectionInfo
 from .linearise import Joined, linearise
-from .residual import Tolerance, largest, relative, within
+from .residual import Tolerance
 from .step import Step
-
-
-class ProjectionInfo(eqx.Module):
-    """The report on a projection.
-
-    **Attributes:**
-
-    - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
-        residual is within its tolerance at the state that is returned.
-    - `num_steps`: the number of iterations (of `Newton`: of both phases).
-    - `residual_before`, `residual_after`: the largest residual of the candidate and of the
-        projected state, each relative to the scale of its own constraint at the projected state,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$.
-    - `correction`: the Euclidean norm of the projected state minus the candidate.
-    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate (for
-        `Newton`: at the result). With more than 128 constraints the matrix is not formed, and this
-        is their number.
-    - `worst`: if the projection failed, the position of the scalar constraint with the largest
-        relative residual (the smaller of its residuals before and after), in the order in which the
-        manifold is flattened; otherwise 0.
-    """
-
-    result: optx.RESULTS
-    num_steps: Int[Array, ""]
-    residual_before: Float[Array, ""]
-    residual_after: Float[Array, ""]
-    correction: Float[Array, ""]
-    rank: Int[Array, ""]
-    worst: Int[Array, ""]
-
-    @property
-    def ok(self) -> Bool[Array, "..."]:
-        """Whether the projection succeeded."""
-        return self.result == optx.RESULTS.successful
-
-    def __str__(self) -> str:
-        if is_traced(self):
-            return repr(self)
-        ok = np.asarray(self.ok)
-        if ok.ndim > 0:
-            title = f"{ok.sum()} of {ok.size} projections succeeded"
-        else:
-            title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
-        names = ("num_steps", "residual_before", "residual_after", "correction", "rank")
-        rows = {name: getattr(self, name) for name in names}
-        return printed(title, rows if ok.all() else rows | {"worst": self.worst})
 
 
 class Problem(eqx.Module):
@@ -132,15 +85,15 @@ class Problem(eqx.Module):
         A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
         """
         # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
-        given = self.residual, self.magnitude, candidate, y
-        residual, magnitude, candidate, y = tree_stop_gradient(given)
-        before, jacobian = linearise(residual, candidate)
-        after, at_y = linearise(residual, y)
-        scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
-        outcome = Outcome.of(before, after, scale, Tolerance(rtol, atol))
-        rank = jacobian.gram_solver(self.weights).rank
-        count = jnp.asarray(num_steps)
-        return report(outcome, count, candidate, y, before, after, scale, rank)
+        equations = self.equations(candidate, Tolerance(rtol, atol))
+        equations, y = tree_stop_gradient((equations, y))
+        before, jacobian = linearise(equations.residual, equations.candidate)
+        rank = equations.gram_solver(jacobian).rank
+        return equations.report(y, before, jnp.asarray(num_steps), rank)
+
+    def equations(self, candidate: Y, tolerance: Tolerance, linear_solver: Any = None) -> Equations:
+        weights, magnitude = self.weights, self.magnitude
+        return Equations(self.residual, candidate, weights, magnitude, tolerance, linear_solver)
 
 
 def option(default: Any, **kwargs: Any) -> Any:
@@ -257,76 +210,3 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
         return weight
 
     return jtu.tree_map(check, metric)
-
-
-class Outcome(eqx.Module):
-    """The verdict on the state that a projection returns: the result and the worst constraint.
-
-    It consists of two integers, to keep the state that a solve carries small.
-    """
-
-    result: optx.RESULTS
-    worst: Int[Array, ""]
-
-    @classmethod
-    def success(cls) -> "Outcome":
-        return cls(_member(optx.RESULTS.successful), jnp.asarray(0, jnp.int32))
-
-    @classmethod
-    def of(cls, before: Vector, after: Vector, scale: Vector, tolerance: Tolerance) -> "Outcome":
-        """The verdict on a state with residuals `after` and their scales `scale`, from a candidate
-        with residuals `before`: `nonfinite` if `before` is not finite, divergence if only `after`
-        is not."""
-        kinds = optx.RESULTS
-        success = within(after, tolerance(scale))
-        result = kinds.where(
-            tree_all_finite((after, scale)),
-            kinds.nonlinear_max_steps_reached,
-            kinds.nonlinear_divergence,
-        )
-        result = kinds.where(tree_all_finite(before), result, kinds.nonfinite)
-        result = kinds.where(success, kinds.successful, result)
-        ratios = jnp.concatenate(
-            [jnp.atleast_1d(x) for x in jtu.tree_leaves(relative(_smaller(before, after), scale))]
-        )
-        worst = jnp.argmax(jnp.where(jnp.isnan(ratios), jnp.inf, ratios)).astype(jnp.int32)
-        return cls(result, jnp.where(success, 0, worst))
-
-
-def _smaller(before: Vector, after: Vector) -> Vector:
-    """The smaller of both residuals, so that a constraint is not blamed for an iteration that
-    diverged."""
-
-    def smaller(a: Array, b: Array) -> Array:
-        a, b = (jnp.where(jnp.isnan(x), jnp.inf, jnp.abs(x)) for x in (a, b))
-        return jnp.minimum(a, b)
-
-    return jtu.tree_map(smaller, before, after)
-
-
-def _member(result: optx.RESULTS) -> optx.RESULTS:
-    """The same result with an array as its value, as `RESULTS.where` returns it."""
-    return optx.RESULTS.where(jnp.asarray(True), result, result)
-
-
-def report(
-    outcome: Outcome,
-    num_steps: Int[Array, ""],
-    candidate: Y,
-    y: Y,
-    before: Vector,
-    after: Vector,
-    scale: Vector,
-    rank: Int[Array, ""],
-) -> ProjectionInfo:
-    """The `ProjectionInfo` of a projection from `candidate` to `y`."""
-    correction = tree_sub(y, candidate)
-    return ProjectionInfo(
-        result=outcome.result,
-        num_steps=num_steps,
-        residual_before=largest(relative(before, scale)),
-        residual_after=largest(relative(after, scale)),
-        correction=tree_norm(correction),
-        rank=rank,
-        worst=outcome.worst,
-    )

@@ -7,10 +7,9 @@ Sun, "A nonsmooth version of Newton's method", 1993). For nonlinear constraints 
 programs is solved, each with the constraints linearised about the last state.
 """
 
-import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,14 +28,12 @@ from .._tree import (
     tree_mul,
     tree_scale,
     tree_sub,
-    tree_tangents,
     working_dtype,
 )
-from .base import Outcome, ProjectionInfo, check_like, report
-from .certainty import certain
+from .base import check_like
 from .elimination import Vector
-from .implicit import solve_linearised, units
-from .iteration import Equations
+from .equations import Equations, ProjectionInfo
+from .implicit import differentiated
 from .jacobian import AbstractJacobian
 from .linearise import linearise
 from .residual import largest, relative
@@ -154,11 +151,8 @@ def project_into(
         return jtu.tree_map(lambda a, b: jnp.where(settled, a, b), a, b)
 
     y, count = choose((free, free_info.num_steps), (end.y, end.num_steps))
-    after, at_y = linearise(equations.residual, y)
-    scale = equations.scale(at_y, y)
-    outcome = Outcome.of(before, after, scale, equations.tolerance)
     rank = at_candidate.gram_solver(equations.weights).rank
-    info = report(outcome, count, candidate, y, before, after, scale, rank)
+    info = equations.report(y, before, count, rank)
     # Only the nearest point has a derivative.
     moving = jnp.asarray(False) if frozen else end.last > eps**0.5
     multiplier = jtu.tree_map(lambda x: jnp.where(moving, jnp.nan, x), end.multiplier)
@@ -181,12 +175,6 @@ def _polished(
     return y, multiplier
 
 
-class _Inner(NamedTuple):
-    unfinished: Bool[Array, ""]
-    multiplier: Vector
-    num_steps: Int[Array, ""]
-
-
 def _quadratic_program(
     equations: Equations, box: Box, base: AbstractJacobian, g: Vector, y: Y, multiplier: Vector
 ) -> Vector:
@@ -199,7 +187,7 @@ def _quadratic_program(
     dtype = working_dtype(candidate)
     scale = equations.scale(base, y)
 
-    def body(carry: _Inner) -> _Inner:
+    def body(carry: tuple[Array, Vector, Array]) -> tuple[Array, Vector, Array]:
         _, multiplier, count = carry
         z = tree_add(candidate, equations.correction(base, multiplier))
         x = box.clip(z)
@@ -223,10 +211,10 @@ def _quadratic_program(
         length = _least(slope_at, dtype)
         multiplier = tree_add(multiplier, tree_scale(length, change))
         unfinished = (merit > float(jnp.finfo(dtype).eps)) & (slope < 0) & (merit < jnp.inf)
-        return _Inner(unfinished & (count + 1 < _INNER_STEPS), multiplier, count + 1)
+        return unfinished & (count + 1 < _INNER_STEPS), multiplier, count + 1
 
-    start = _Inner(jnp.asarray(True), multiplier, jnp.asarray(0))
-    return lax.while_loop(lambda carry: carry.unfinished, body, start).multiplier
+    start = jnp.asarray(True), multiplier, jnp.asarray(0)
+    return lax.while_loop(lambda carry: carry[0], body, start)[1]
 
 
 def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
@@ -247,53 +235,5 @@ def _least(slope_at: Callable[[Array], Array], dtype: jnp.dtype) -> Array:
 
 @project_into.def_jvp
 def _project_into_jvp(primals, tangents, *, unbounded, frozen, max_steps):
-    """The implicit function theorem, with the components at their bounds held constant."""
-    (equations, box), (t_equations, t_box) = primals, tangents
-    y, multiplier, info = project_into(
-        equations, box, unbounded=unbounded, frozen=frozen, max_steps=max_steps
-    )
-    _, at_y = linearise(equations.residual, y)
-
-    def pulled(base: Y, parameters: Any) -> tuple[Y, Y]:
-        """The state before and after clipping."""
-        residual, candidate, weights, box = parameters
-        _, vjp = eqx.filter_vjp(residual, base)
-        z = tree_add(candidate, tree_mul(vjp(multiplier)[0], weights))
-        return z, box.clip(z)
-
-    def parameters(x: Any, box: Any) -> tuple[Any, Any, Any, Any]:
-        return x.residual, x.candidate, x.weights, box
-
-    given, t_given = parameters(equations, box), parameters(t_equations, t_box)
-    z, _ = pulled(equations.candidate if frozen else y, given)
-    active = tree_mul(equations.weights, box.inside(z))
-    if frozen:
-
-        def displaced(parameters: Any) -> tuple[Y, Vector]:
-            _, x = pulled(parameters[1], parameters)
-            return x, parameters[0](x)
-
-        _, at_candidate = linearise(equations.residual, equations.candidate)
-        t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, (given,), (t_given,)))
-        gram_solver = at_y.derivative_solver(active, at_candidate)
-        t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
-        t_y = tree_add(t_y, tree_mul(at_candidate.pullback(t_multiplier), active))
-    else:
-
-        def optimality(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
-            x, multiplier = unknowns
-            residual, candidate, weights, box = parameters
-            g, vjp = eqx.filter_vjp(residual, x)
-            z = tree_add(candidate, tree_mul(vjp(multiplier)[0], weights))
-            return tree_sub(x, box.clip(z)), g
-
-        unknowns = y, multiplier
-        _, right = eqx.filter_jvp(lambda p: optimality(unknowns, p), (given,), (t_given,))
-        right = jtu.tree_map(jnp.negative, tree_tangents(unknowns, right))
-        t_y, t_multiplier = solve_linearised(
-            lambda x: optimality(x, given), unknowns, right, units(at_y, equations.weights)
-        )
-    inside = dataclasses.replace(equations, weights=active)
-    factor = jnp.where(info.ok, certain(inside, y, at_y), 1)
-    t_y = tree_scale(lax.stop_gradient(factor), t_y)
-    return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))
+    solution = project_into(*primals, unbounded=unbounded, frozen=frozen, max_steps=max_steps)
+    return differentiated(solution, primals, tangents, frozen=frozen)

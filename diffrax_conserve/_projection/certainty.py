@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Y
 from .._tree import tree_add, tree_max, tree_norm, tree_scale, tree_sub, working_dtype
-from .iteration import Equations
+from .equations import Equations
 from .jacobian import AbstractJacobian
 from .linearise import linearise
 

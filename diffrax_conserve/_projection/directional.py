@@ -1,17 +1,17 @@
 """Projection along the embedded error estimate, which conserves every linear integral."""
 
-from typing import ClassVar, NamedTuple, final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Real
+from jaxtyping import Array, Int, Real
 
 from .._custom_types import Y
 from .._tree import tree_add, tree_dot, tree_max, tree_norm, tree_scale, tree_tangents
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
-from .iteration import SAFELY
+from .equations import SAFELY
 from .linearise import Joined, linearise
 from .residual import Tolerance, within
 
@@ -118,13 +118,6 @@ def _direction(problem: Problem) -> Y:
     return tree_scale(1 / jnp.where(size > 0, size, 1), problem.step.error)
 
 
-class _Carry(NamedTuple):
-    unfinished: Bool[Array, ""]
-    last: Real[Array, ""]
-    length: Real[Array, ""]
-    num_steps: Int[Array, ""]
-
-
 @eqx.filter_custom_jvp
 def _length(
     residual: Joined,
@@ -142,19 +135,19 @@ def _length(
     def along(length: Array) -> Array:
         return residual(tree_add(candidate, tree_scale(length, direction)))[0]
 
-    def body(carry: _Carry) -> _Carry:
+    def body(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         _, last, length, num_steps = carry
         g, slope = jax.jvp(along, (length,), (jnp.ones_like(length),))
         size = jnp.abs(g)
         # Ends when the residual stops decreasing; `Problem.judge` decides on success.
         unfinished = (size > enough) & (size < 0.9 * last) & (num_steps < max_steps) & (slope != 0)
         step = jnp.where(unfinished, g / jnp.where(slope == 0, 1, slope), 0)
-        return _Carry(unfinished, size, length - step, num_steps + unfinished.astype(int))
+        return unfinished, size, length - step, num_steps + unfinished.astype(int)
 
     zero = jnp.zeros((), magnitude.dtype)
-    start = _Carry(jnp.asarray(True), jnp.full_like(zero, jnp.inf), zero, jnp.asarray(0))
-    end = lax.while_loop(lambda carry: carry.unfinished, body, start)
-    return end.length, end.num_steps
+    start = jnp.asarray(True), jnp.full_like(zero, jnp.inf), zero, jnp.asarray(0)
+    _, _, length, count = lax.while_loop(lambda carry: carry[0], body, start)
+    return length, count
 
 
 @_length.def_jvp

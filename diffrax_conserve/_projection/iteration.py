@@ -1,96 +1,24 @@
 """Newton's iteration for the multipliers, the loop that `Newton` and `SimplifiedNewton` share."""
 
-import functools as ft
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_cancel, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
-from .base import Problem
-from .elimination import GramSolver, Vector
-from .jacobian import AbstractJacobian, lineax_solver
-from .linearise import Elements, Joined, linearise
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, relative, within
+from .._tree import tree_cancel, tree_max, tree_sub
+from .elimination import Vector
+from .equations import Equations
+from .jacobian import AbstractJacobian
+from .linearise import linearise
+from .residual import within
 
-# An iteration ends at this fraction of the tolerance, or where it no longer halves the residual.
-SAFELY = 0.25
 # The iteration ends if a step with this much damping does not reduce the residual.
 _MOST_DAMPING = 1e8
 # A `Start` is used if its squared residual is at most this fraction of the candidate's.
 _WELL_STARTED = 1e-4
-
-
-class Equations(eqx.Module):
-    """`g(y) = 0` for `y = ŷ + M⁻¹ Gᵀ λ`, from the candidate `ŷ`."""
-
-    residual: Joined | Elements
-    candidate: Y
-    weights: Y
-    magnitude: Vector
-    tolerance: Tolerance
-    linear_solver: lx.AbstractLinearSolver | None = eqx.field(static=True)
-
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        candidate: Y,
-        rtol: float | Array | None,
-        atol: float | Array | None,
-        linear_solver: lx.AbstractLinearSolver | None,
-    ) -> "Equations":
-        return cls(
-            problem.residual,
-            candidate,
-            problem.weights,
-            problem.magnitude,
-            Tolerance(rtol, atol),
-            linear_solver,
-        )
-
-    def gram_solver(
-        self,
-        jacobian: AbstractJacobian,
-        other: AbstractJacobian | None = None,
-        damping: Array | float = 0.0,
-        weights: Y | None = None,
-    ) -> GramSolver:
-        """Solves with `G M⁻¹ Hᵀ`; see `AbstractJacobian.gram_solver`. With a `linear_solver` these
-        are approximate, which the next iteration corrects."""
-        weights = self.weights if weights is None else weights
-        if self.linear_solver is None:
-            return jacobian.gram_solver(weights, other, damping)
-        return lineax_solver(self.linear_solver, jacobian, weights, other, damping)
-
-    def correction(self, jacobian: AbstractJacobian, multiplier: Vector) -> Y:
-        """`M⁻¹ Gᵀ λ`."""
-        return tree_mul(jacobian.pullback(multiplier), self.weights)
-
-    def scale(self, jacobian: AbstractJacobian, y: Y) -> Vector:
-        """The scale of the residual at `y`, to which its roundoff is proportional; `jacobian` is
-        that at `y`."""
-        return jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
-
-    def merit(self, g: Vector, scale: Vector) -> Array:
-        """The sum of squares of the residuals, relative to their scales, which are enlarged to
-        allow for `atol`."""
-        atol = 0.0 if self.tolerance.atol is None else self.tolerance.atol
-
-        def square(g: Array, scale: Array) -> Array:
-            roundoff = ROUNDOFF_MULTIPLE * jnp.finfo(scale.dtype).eps
-            size = scale + jnp.asarray(atol, scale.dtype) / roundoff
-            return jnp.sum(jnp.square(relative(g, size)))
-
-        return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(square, g, scale)))
-
-    def safely_satisfied(self, g: Vector, scale: Vector) -> Bool[Array, ""]:
-        return within(g, tree_scale(SAFELY, self.tolerance(scale)))
 
 
 class Iterate(NamedTuple):
@@ -142,7 +70,7 @@ def iterate(
     `start` is more than a hundredth of the candidate's, the iteration begins at the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
-    first = _first_scale(equations, at_candidate)
+    first = _most_scale(equations, at_candidate, equations.candidate)
 
     # In a batch, a loop evaluates its condition in two places. If these round differently, the loop
     # may never end, so the condition is evaluated once and carried.
@@ -163,8 +91,9 @@ def iterate(
 
         base = at_candidate if frozen else jacobian
         # Near a state where all terms vanish, the residual never becomes small relative to their
-        # size there, so the scale of the candidate bounds it from below.
-        vanishing = jnp.minimum(1e-2, equations.merit(g, jtu.tree_map(jnp.maximum, scale, first)))
+        # size there.
+        most = jtu.tree_map(jnp.maximum, first, _most_scale(equations, jacobian, y))
+        vanishing = jnp.minimum(1e-2, equations.merit(g, most))
         change = equations.gram_solver(jacobian, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
 
@@ -181,16 +110,12 @@ def iterate(
     return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
 
 
-def _first_scale(equations: Equations, at_candidate: AbstractJacobian) -> Vector:
-    """The scale at the candidate. Because a term may vanish there but not at the next state, it is
-    at least one unit of roundoff times the scale that equal components, all as large as the
-    largest, would have."""
-    candidate = equations.candidate
-    eps = float(jnp.finfo(working_dtype(candidate)).eps)
-    roundoff = eps * tree_max(candidate)
-    uniform = jtu.tree_map(lambda x: jnp.full_like(x, roundoff.astype(x.dtype)), candidate)
-    scale = equations.scale(at_candidate, candidate)
-    return jtu.tree_map(jnp.maximum, scale, at_candidate.scale(uniform))
+def _most_scale(equations: Equations, jacobian: AbstractJacobian, y: Y) -> Vector:
+    """The scale that the residual would have if all components of `y` were as large as the
+    largest. A term may vanish at one state and not at the next; this one does not."""
+    largest = tree_max(y)
+    uniform = jtu.tree_map(lambda x: jnp.full_like(x, largest.astype(x.dtype)), y)
+    return equations.scale(jacobian, uniform)
 
 
 def _begin(

@@ -15,7 +15,7 @@ import lineax as lx
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import Y
-from .._tree import tree_dot, tree_max, tree_mul, tree_scale, tree_sub, working_dtype
+from .._tree import tree_dot, tree_max, tree_mul, working_dtype
 from .elimination import GramSolver, Vector, dense_solver, unrolled_solver
 
 # Up to this many constraints are unrolled, enough for the ten integrals of the N-body problem.
@@ -63,10 +63,10 @@ class AbstractJacobian(eqx.Module):
         """The Jacobian with each row divided by its largest element, and these divisors; unchanged
         where rows are not formed."""
 
-    @abc.abstractmethod
     def sines(self, weights: Y) -> Real[Array, " m"] | None:
         """The sine of the angle between each row and the span of those before it, in the norm of
-        `W`; `None` where rows are never formed."""
+        `W`; `None` where no matrix is formed."""
+        del weights
 
 
 @final
@@ -85,9 +85,8 @@ class Unrolled(AbstractJacobian):
         return tuple(tree_dot(row, y, dtype) for row in self.rows)
 
     def scale(self, y: Y) -> Vector:
-        magnitude = jtu.tree_map(jnp.abs, y)
-        dtype = working_dtype(y)
-        return tuple(tree_dot(jtu.tree_map(jnp.abs, r), magnitude, dtype) for r in self.rows)
+        rows, y = jtu.tree_map(jnp.abs, (self.rows, y))
+        return Unrolled(rows).pushforward(y)
 
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
@@ -106,24 +105,6 @@ class Unrolled(AbstractJacobian):
                 ]
             )
         return unrolled_solver(gram, damping).scaled(row_sizes, column_sizes)
-
-    def sines(self, weights: Y) -> Real[Array, " m"]:
-        # Gram-Schmidt, not the pivots of the Gram matrix: those are squares of sines, with half the
-        # digits.
-        dtype = working_dtype(weights)
-        roots = jtu.tree_map(jnp.sqrt, weights)
-        basis: list[Y] = []
-        sines = []
-        for row in self._normalised()[0]:
-            rest = row = tree_mul(row, roots)
-            for unit in basis:
-                rest = tree_sub(rest, tree_scale(tree_dot(unit, rest, dtype), unit))
-            norms = [jnp.sqrt(tree_dot(x, x, dtype)) for x in (rest, row)]
-            length, whole = (jnp.where(x > 0, x, 1) for x in norms)
-            basis.append(tree_scale(1 / length, rest))
-            # A zero gradient counts as parallel to none.
-            sines.append(jnp.where(norms[1] > 0, norms[0] / whole, 1))
-        return jnp.stack(sines)
 
     def unit_rows(self) -> tuple["Unrolled", Vector]:
         rows, sizes = self._normalised(always=True)
@@ -154,11 +135,8 @@ class Dense(AbstractJacobian):
         return jax.vmap(lambda row: tree_dot(row, y, dtype))(self.rows)
 
     def scale(self, y: Y) -> Vector:
-        magnitude = jtu.tree_map(jnp.abs, y)
-        dtype = working_dtype(y)
-        return jax.vmap(lambda row: tree_dot(jtu.tree_map(jnp.abs, row), magnitude, dtype))(
-            self.rows
-        )
+        rows, y = jtu.tree_map(jnp.abs, (self.rows, y))
+        return Dense(rows).pushforward(y)
 
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
@@ -234,9 +212,6 @@ def _contract(a: Array, b: Array) -> Array:
 _SMALL = 4096
 
 
-# The relative tolerance of one iterative solve. The outer iteration corrects the remaining error,
-# so the total number of inner iterations hardly depends on it.
-_SOLVE_RTOL = 1e-4
 # With two different Jacobians, the number of corrections of the solve with one of them, which reach
 # roundoff.
 _CORRECTIONS = 7
@@ -267,9 +242,6 @@ class MatrixFree(AbstractJacobian):
     def unit_rows(self) -> tuple["MatrixFree", Vector]:
         return self, jnp.ones(())
 
-    def sines(self, weights: Y) -> None:
-        del weights
-
     def _product(self, x: Vector, weights: Y, other: "MatrixFree") -> Vector:
         return self.forward(tree_mul(other.backward(x), weights))
 
@@ -292,26 +264,10 @@ class MatrixFree(AbstractJacobian):
     def gram_solver(
         self, weights: Y, other: Any = None, damping: Real[Array, ""] | float = 0.0
     ) -> GramSolver:
-        squares = jnp.square(estimated_norms(self.forward, jtu.tree_map(jnp.sqrt, weights)))
-        diagonal = jnp.where(squares > 0, squares, 1)
-        struct = jax.eval_shape(lambda: diagonal)
-
-        def symmetric(x: Vector) -> Vector:
-            return self.forward(tree_mul(self.backward(x), weights)) + damping * diagonal * x
-
-        tag = lx.positive_semidefinite_tag
-        operator = lx.FunctionLinearOperator(symmetric, struct, tag)
-        preconditioner = lx.TaggedLinearOperator(lx.DiagonalLinearOperator(1 / diagonal), tag)
-        solver = lx.CG(rtol=_SOLVE_RTOL, atol=float(jnp.finfo(diagonal.dtype).tiny))
-
-        def solve(b: Vector) -> Vector:
-            options = dict(preconditioner=preconditioner)
-            return lx.linear_solve(operator, b, solver, options=options, throw=False).value
-
-        def corrected(b: Vector) -> Vector:
-            return _corrected(solve, lambda x: self._product(x, weights, other), b)
-
-        return GramSolver(solve if other is None else corrected, jnp.asarray(diagonal.size))
+        # The outer iteration corrects the remaining error, so the total number of inner iterations
+        # hardly depends on the tolerance.
+        solver = lx.CG(rtol=1e-4, atol=1e-4)
+        return lineax_solver(solver, self, weights, other, damping)
 
 
 def lineax_solver(
@@ -334,21 +290,26 @@ def lineax_solver(
         g = rows.pushforward(tree_mul(columns.pullback(x), weights))
         return jtu.tree_map(lambda g, d, x: g + damping * d * x, g, diagonal, x)
 
-    struct = jax.eval_shape(lambda: diagonal)
-    operator = lx.FunctionLinearOperator(product, struct, lx.positive_semidefinite_tag)
+    struct, tag = jax.eval_shape(lambda: diagonal), lx.positive_semidefinite_tag
+    operator, options = lx.FunctionLinearOperator(product, struct, tag), {}
+    if isinstance(jacobian, MatrixFree):
+        inverse = lx.DiagonalLinearOperator(1 / jnp.where(diagonal > 0, diagonal, 1))
+        options = dict(preconditioner=lx.TaggedLinearOperator(inverse, tag))
+        rank = jnp.asarray(diagonal.size)
+    else:
+        rank = jacobian.gram_solver(weights).rank
 
     def solve(b: Vector) -> Vector:
         # An absolute tolerance is relative to `b`, and zero is solved by zero.
         size = tree_max(b)
         found = jnp.where((size > 0) & (size < jnp.inf), size, 1)
         unit = jtu.tree_map(lambda b: jnp.where(size == 0, 1, b / found), b)
-        x = lx.linear_solve(operator, unit, linear_solver, throw=False).value
+        x = lx.linear_solve(operator, unit, linear_solver, options=options, throw=False).value
         return jtu.tree_map(lambda x: jnp.where(size == 0, 0, x * found), x)
 
     def corrected(b: Vector) -> Vector:
         return _corrected(solve, lambda x: product(x, columns), b)
 
-    rank = jacobian.gram_solver(weights).rank
     return GramSolver(solve if other is None else corrected, rank).scaled(row_sizes, column_sizes)
 
 

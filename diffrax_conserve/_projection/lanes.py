@@ -22,6 +22,10 @@ _BLOCKS = 32
 # lanes: for fewer lanes, starting the computation costs more than the arithmetic.
 _SHARES = 32
 _LEAST_WIDTH = 64
+# The reciprocal of the share of lanes from which they iterate together, and the largest number of
+# such iterations.
+_CROWD = 64
+_MOST_ROUNDS = 8
 
 
 def continue_if_any(
@@ -29,17 +33,27 @@ def continue_if_any(
     flag: Bool[Array, ""],
     state: _State,
     operands: Any,
+    *,
+    crowd: Callable[[_State, Any], tuple[Bool[Array, ""], _State]],
+    rounds: int,
 ) -> _State:
     """`fn(flag, state, operands)` if `flag` is set, otherwise `state`.
 
     In a batch, the lanes whose flag is set are gathered, some at a time, passed to `fn`, and
     scattered back. (A `lax.cond` in a batch runs both branches for every lane.) The value of `fn`
     for a lane whose flag is not set is not used. `fn` must not close over arrays.
+
+    Gathering many lanes is dear. While many lanes are flagged, at most `rounds` times, all lanes
+    compute `crowd(state, operands)`, which returns whether the lane remains flagged and its next
+    state.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
     def lane(flag: Array, state: _State, arrays: Any) -> _State:
         return fn(flag, state, eqx.combine(arrays, static))
+
+    def together(state: _State, arrays: Any) -> tuple[Array, _State]:
+        return crowd(state, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
     def alone(flag, state, arrays):
@@ -53,16 +67,22 @@ def continue_if_any(
         out = _lanes(flags, states, batch, shared)
         return out, jtu.tree_map(lambda _: True, out)
 
+    def finish(flags, states, batch, shared):
+        if rounds > 0:
+            most = min(rounds, _MOST_ROUNDS)
+            flags, states = _together(together, most, flags, states, batch, shared)
+        return if_any(ft.partial(_finish, lane), flags, states, batch, shared)
+
+    def if_any(fn, flags, states, *operands):
+        return lax.cond(jnp.any(flags), fn, lambda _, states, *__: states, flags, states, *operands)
+
     # The loop of a solve is traced more than once, but a jitted function only once.
-    finish = jax.jit(ft.partial(_finish, lane), inline=True)
+    finish = jax.jit(finish, inline=True)
 
     # A nested `vmap` is flattened to one batch.
     @jax.custom_batching.custom_vmap
     def _lanes(flags, states, batch, shared):
-        def not_taken(flags, states, batch, shared):
-            return states
-
-        return lax.cond(jnp.any(flags), finish, not_taken, flags, states, batch, shared)
+        return if_any(finish, flags, states, batch, shared)
 
     @_lanes.def_vmap
     def batch_of_batches(size, axes, flags, states, batch, shared):
@@ -121,6 +141,31 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
 
     _, states = lax.while_loop(lambda carry: carry[0] < most, body, (jnp.zeros_like(most), states))
     return jtu.tree_map(lambda x: x.reshape(lanes, *x.shape[2:]), states)
+
+
+def _together(
+    crowd: Callable,
+    rounds: int,
+    flags: Bool[Array, " lanes"],
+    states: Any,
+    batch: Any,
+    shared: Any,
+) -> tuple[Bool[Array, " lanes"], Any]:
+    def body(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
+        index, flags, states = carry
+        remain, new = jax.vmap(lambda s, b: crowd(s, eqx.combine(b, shared)))(states, batch)
+
+        def choose(a: Array, b: Array) -> Array:
+            return jnp.where(flags.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+        return index + 1, flags & remain, jtu.tree_map(choose, new, states)
+
+    def crowded(carry: tuple[Array, Array, Any]) -> Array:
+        index, flags, _ = carry
+        return (index < rounds) & (jnp.sum(flags) * _CROWD > flags.size)
+
+    _, flags, states = lax.while_loop(crowded, body, (jnp.asarray(0), flags, states))
+    return flags, states
 
 
 def _positions(flags: Bool[Array, " length"], size: int) -> Int[Array, " size"]:

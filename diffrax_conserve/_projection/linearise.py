@@ -76,23 +76,25 @@ class Elements(eqx.Module):
         return tuple(fn(y) for fn in self.fns)
 
 
-def written_out(
-    residual: Joined, magnitude: Real[Array, " m"], y: Y
-) -> tuple[Joined | Elements, Vector, Callable[[Y], Y], Callable[[Y], Y]]:
-    """The same residual and magnitude as scalars if there are few constraints, with states as
-    scalars too if these are small; and the maps to the new form of the state and back."""
-    if magnitude.size > UNROLLED_MAX:
-        return residual, magnitude, _same, _same
+# A residual in another form, and the maps to the new form of the state and back.
+Converted = tuple[Joined | Elements, Callable[[Y], Y], Callable[[Y], Y]]
+
+
+def written_out(residual: Joined, y: Y) -> Converted:
+    """The same residual as scalars if there are few constraints, with states as scalars too if
+    these are small."""
+    if eqx.filter_eval_shape(residual, y).size > UNROLLED_MAX:
+        return residual, _same, _same
     converted = elements_in_scalars(residual, y)
     if converted is None:
-        return Elements.of(residual, y), tuple(magnitude), _same, _same
+        return Elements.of(residual, y), _same, _same
     fns, split, join = converted
-    return Elements(fns), tuple(magnitude), split, join
+    return Elements(fns), split, join
 
 
-def flattened(residual: Joined, y: Y) -> tuple[Joined, Callable[[Y], Y], Callable[[Y], Y]]:
-    """The same residual as a function of the state in one vector, if all leaves have one dtype, and
-    the maps to it and back. This gives fewer operations, each on more numbers."""
+def flattened(residual: Joined, y: Y) -> Converted:
+    """The same residual as a function of the state in one vector, if all leaves have one dtype.
+    This gives fewer operations, each on more numbers."""
     if len({x.dtype for x in jtu.tree_leaves(y)}) > 1:
         return residual, _same, _same
     _, join = jfu.ravel_pytree(jtu.tree_map(jnp.zeros_like, y))

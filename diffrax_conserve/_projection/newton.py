@@ -5,7 +5,6 @@ from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -14,32 +13,26 @@ from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from .._custom_types import Y
 from .._tree import (
-    tree_add,
     tree_mul,
-    tree_scale,
     tree_size,
     tree_sub,
-    tree_tangents,
     working_dtype,
 )
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
-    Outcome,
     Problem,
-    ProjectionInfo,
     check_options,
     option,
     positive_weights,
-    report,
 )
 from .bounded import box_of, check_bounds, project_into
-from .certainty import certain
 from .elimination import Vector
-from .implicit import SYSTEM_DENSE_MAX, solve_linearised, units
-from .iteration import Equations, iterate
-from .linearise import Residual, linearise
-from .residual import ROUNDOFF_MULTIPLE, within
+from .equations import Equations, ProjectionInfo
+from .implicit import SYSTEM_DENSE_MAX, differentiated, finite_or_nan, optimality, units
+from .iteration import iterate
+from .linearise import linearise
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
 @final
@@ -105,7 +98,8 @@ class Newton(AbstractProjection):
                 "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
                 "pass `projection=SimplifiedNewton()`."
             )
-        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
+        tolerance = Tolerance(self.rtol, self.atol)
+        equations = problem.equations(candidate, tolerance, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         unbounded = ft.partial(_project, max_steps=steps)
@@ -126,40 +120,18 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     before, reached = iterate(equations, frozen=False, max_steps=max_steps)
     nearest, multiplier, num_steps, arrived = _nearest(equations, reached.y, max_steps)
 
-    def residuals(y: Y) -> tuple[Vector, Vector]:
-        g, jacobian = linearise(equations.residual, y)
-        return g, equations.scale(jacobian, y)
-
-    g, scale = residuals(nearest)
-    found = within(g, equations.tolerance(scale)) & arrived
+    g, jacobian = linearise(equations.residual, nearest)
+    found = within(g, equations.tolerance(equations.scale(jacobian, nearest))) & arrived
     y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
-    after, scale = residuals(y)
-    outcome = Outcome.of(before, after, scale, equations.tolerance)
-    # Only the multipliers of the nearest point have a derivative.
-    reached_only = (outcome.result == optx.RESULTS.successful) & ~found
-    multiplier = jnp.where(reached_only, jnp.nan, multiplier)
     rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
-    count = reached.num_steps + num_steps
-    return y, multiplier, report(outcome, count, equations.candidate, y, before, after, scale, rank)
+    info = equations.report(y, before, reached.num_steps + num_steps, rank)
+    # Only the multipliers of the nearest point have a derivative.
+    return y, jnp.where(info.ok & ~found, jnp.nan, multiplier), info
 
 
 class _SVD(lx.SVD):
-    """Singular values of a matrix, NaN if it is not finite. LAPACK never returns from a matrix with
-    an infinite element."""
-
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        matrix = operator.as_matrix()
-        finite_or_nan = jnp.where(jnp.isfinite(matrix), matrix, jnp.nan)
-        return super().init(lx.MatrixLinearOperator(finite_or_nan), options)
-
-
-def _optimality(unknowns: tuple[Y, Vector], parameters: tuple[Residual, Y, Y]) -> tuple[Y, Vector]:
-    """`y - ŷ - M⁻¹ G(y)ᵀ λ` and `g(y)`."""
-    y, multiplier = unknowns
-    residual, candidate, weights = parameters
-    g, vjp = eqx.filter_vjp(residual, y)
-    (direction,) = vjp(multiplier)
-    return tree_sub(y, tree_add(candidate, tree_mul(direction, weights))), g
+        return super().init(lx.MatrixLinearOperator(finite_or_nan(operator.as_matrix())), options)
 
 
 def _nearest(
@@ -177,8 +149,8 @@ def _nearest(
 
     def scaled(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
         (y, multiplier), (residual, candidate, weights, roots, norms) = unknowns, parameters
-        given = (lambda y: residual(y) / norms), candidate, weights
-        off, g = _optimality((tree_mul(y, roots), multiplier), given)
+        given = (lambda y: residual(y) / norms), candidate, weights, None
+        off, g = optimality((tree_mul(y, roots), multiplier), given)
         return jtu.tree_map(jnp.divide, off, roots), g
 
     def tolerance(y: Y, multiplier: Vector) -> Array:
@@ -221,26 +193,5 @@ def _nearest(
 
 @_project.def_jvp
 def _project_jvp(primals, tangents, *, max_steps):
-    """The implicit function theorem for the optimality system, in the unknowns `y` and `λ`."""
-    (equations,), (t_equations,) = primals, tangents
-    y, multiplier, info = _project(equations, max_steps=max_steps)
-
-    def parameters(x: Any) -> tuple[Any, Any, Any]:
-        return x.residual, x.candidate, x.weights
-
-    unknowns = y, multiplier
-    _, right = eqx.filter_jvp(
-        lambda p: _optimality(unknowns, p), (parameters(equations),), (parameters(t_equations),)
-    )
-    right = tree_tangents(unknowns, right)
-    given = parameters(equations)
-    _, jacobian = linearise(given[0], y)
-    measured_in = units(jacobian, given[2])
-    t_y, t_multiplier = solve_linearised(
-        lambda x: _optimality(x, given), unknowns, right, measured_in
-    )
-    factor = jnp.where(info.ok, certain(equations, y, jacobian), 1)
-    t_y = tree_scale(lax.stop_gradient(factor), t_y)
-    minus = lambda x: jtu.tree_map(jnp.negative, x)  # noqa: E731
-    t_info = jtu.tree_map(lambda _: None, info)
-    return (y, multiplier, info), (minus(t_y), minus(t_multiplier), t_info)
+    solution = _project(*primals, max_steps=max_steps)
+    return differentiated(solution, (*primals, None), (*tangents, None), frozen=False)

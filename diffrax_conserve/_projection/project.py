@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, PyTree, Real
+from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
@@ -19,11 +19,11 @@ from .._manifold import (
     is_entry,
 )
 from .._options import dtype_of
-from .._tree import from_view, real_view, tree_mul, tree_stop_gradient, tree_sub
+from .._tree import from_view, real_view, tree_mul, tree_sub
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
 from .linearise import linearise
 from .newton import Newton
-from .residual import largest, measure, relative, residual_of
+from .residual import residual_of
 from .step import Step
 
 
@@ -111,7 +111,10 @@ def apply(
     step: Step | None = None,
 ) -> tuple[Y, ProjectionInfo]:
     """`project` without its checks."""
-    problem = _problem(projection, manifold, values, t, candidate, args, anchor, step)
+    residual, magnitude = residual_of(manifold, values, t, candidate, args)
+    weights = inverse_metric(projection.metric, real_view(candidate))
+    like = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), candidate)
+    problem = Problem(residual, magnitude, weights, t, args, values, like, real_view(anchor), step)
     y, info = projection.solve(problem, real_view(candidate))
     return from_view(y, candidate), info
 
@@ -126,36 +129,12 @@ def tangential(
     vector: Y,
 ) -> Y:
     """The part of `vector` that is tangent to the manifold at `y`, `v - M⁻¹Gᵀ(GM⁻¹Gᵀ)⁻¹G v`."""
-    problem = _problem(projection, manifold, values, t, y, args)
-    _, jacobian = linearise(problem.residual, real_view(y))
-    gram_solver = jacobian.gram_solver(problem.weights)
+    residual, _ = residual_of(manifold, values, t, y, args)
+    weights = inverse_metric(projection.metric, real_view(y))
+    _, jacobian = linearise(residual, real_view(y))
+    gram_solver = jacobian.gram_solver(weights)
     normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(real_view(vector))))
-    return tree_sub(vector, from_view(tree_mul(normal, problem.weights), vector))
-
-
-def relative_residual(
-    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
-) -> Real[Array, ""]:
-    """The largest residual at `y`, relative to its scale there."""
-    given = tree_stop_gradient((manifold, values, t, y, args))
-    return largest(relative(*measure(*given)))
-
-
-def _problem(
-    projection: AbstractProjection,
-    manifold: Manifold,
-    values: Values,
-    t: RealScalarLike,
-    candidate: Y,
-    args: Args,
-    anchor: Y | None = None,
-    step: Step | None = None,
-) -> Problem:
-    residual, magnitude = residual_of(manifold, values, t, candidate, args)
-    weights = inverse_metric(projection.metric, real_view(candidate))
-    anchor, step = real_view(anchor), None if step is None else step.view()
-    like = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), candidate)
-    return Problem(residual, magnitude, weights, t, args, values, like, anchor, step)
+    return tree_sub(vector, from_view(tree_mul(normal, weights), vector))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:

@@ -96,6 +96,15 @@ def _components(leaves: list[Array]) -> Scalars:
 _Places = np.ndarray  # of integers
 
 
+def _broadcast(
+    places: _Places, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...]
+) -> _Places:
+    expanded = [1] * len(shape)
+    for axis, size in zip(broadcast_dimensions, places.shape, strict=True):
+        expanded[axis] = size
+    return np.broadcast_to(places.reshape(expanded), shape)
+
+
 class _NotWrittenOut(Exception):
     """The function has an unsupported primitive or parameter, or too many operations."""
 
@@ -114,9 +123,7 @@ _REDUCTIONS = {
     "reduce_min": lax.min,
 }
 _STRUCTURAL: dict[str, Callable[..., _Places]] = {
-    "broadcast_in_dim": lambda x, shape, broadcast_dimensions: _broadcast(
-        x, shape, broadcast_dimensions
-    ),
+    "broadcast_in_dim": _broadcast,
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
     "reshape": lambda x, new_sizes: x.reshape(new_sizes),
     "rev": lambda x, dimensions: np.flip(x, dimensions),
@@ -298,10 +305,3 @@ class _WriteOut:
 
 def _dtype(var: Any) -> np.dtype:
     return var.aval.dtype
-
-
-def _broadcast(places: _Places, shape: tuple[int, ...], dimensions: tuple[int, ...]) -> _Places:
-    expanded = [1] * len(shape)
-    for axis, size in zip(dimensions, places.shape, strict=True):
-        expanded[axis] = size
-    return np.broadcast_to(places.reshape(expanded), shape)

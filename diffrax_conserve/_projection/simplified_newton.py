@@ -4,7 +4,7 @@ frozen at the candidate, for candidates as close as an integrator's local error.
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import equinox as eqx
 import jax.lax as lax
@@ -18,31 +18,28 @@ from .._custom_types import Y
 from .._tree import (
     tree_add,
     tree_cancel,
-    tree_mul,
     tree_scale,
     tree_size,
     tree_sub,
-    tree_tangents,
     working_dtype,
 )
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
-    Outcome,
     Problem,
-    ProjectionInfo,
     check_options,
     option,
     positive_weights,
-    report,
 )
 from .bounded import box_of, check_bounds, project_into
-from .certainty import certain
 from .elimination import Vector
-from .iteration import Equations, Start, iterate
+from .equations import Equations, Outcome, ProjectionInfo
+from .implicit import differentiated
+from .iteration import Start, iterate
+from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
-from .linearise import Elements, Joined, Residual, as_array, flattened, linearise, written_out
-from .residual import ROUNDOFF_MULTIPLE, within
+from .linearise import Converted, Elements, Joined, as_array, flattened, linearise, written_out
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
 
 
 @final
@@ -98,7 +95,8 @@ class SimplifiedNewton(AbstractProjection):
         check_bounds(self.lower, self.upper)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        equations = Equations.of(problem, candidate, self.rtol, self.atol, self.linear_solver)
+        tolerance = Tolerance(self.rtol, self.atol)
+        equations = problem.equations(candidate, tolerance, self.linear_solver)
         box = box_of(self.lower, self.upper, candidate)
         steps = self.max_steps
         if box is None:
@@ -132,69 +130,82 @@ _STARTS = 8
 def _project(
     equations: Equations, anchor: Y | None, *, max_steps: int
 ) -> tuple[Y, Vector, ProjectionInfo]:
-    inline, _, join = _in_scalars(equations)
-    before, jacobian = linearise(inline.residual, inline.candidate)
-    gram_solver = inline.gram_solver(jacobian)
-    y, g, multiplier = inline.candidate, before, jtu.tree_map(jnp.zeros_like, before)
-    last, at_y, count = before, jacobian, min(jacobian.inline_steps, max_steps)
-    for step in range(count):
-        change = gram_solver.solve(g)
-        subtract = tree_cancel if step == count - 1 else tree_sub
-        y = subtract(y, inline.correction(jacobian, change))
-        multiplier = tree_sub(multiplier, change)
-        last = g
-        g, at_y = linearise(inline.residual, y)
-    scale = inline.scale(at_y, y)
-    # XLA may compute `y` twice, for `g` and for the result, with different rounding. After a large
-    # correction whose terms cancel, these would be different states.
-    roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
-    small = inline.tolerance(
-        jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
-    )
-    close = within(last, tree_scale(roundoff ** (-2 / 3), small))
-    done = close & inline.safely_satisfied(g, scale)
+    inline, _, join = _converted(equations)
+    before, jacobian = at_candidate = linearise(inline.residual, inline.candidate)
+    count = min(jacobian.inline_steps, max_steps)
+    start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
+    y, multiplier, done = _iterations(inline, at_candidate, start, at_candidate, count)
     # The few steps that need more iterations linearise again: sharing the values known here would
     # write them to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
     finish = ft.partial(_finish, max_steps)
-    y, multiplier, count, outcome = continue_if_any(finish, ~done, state, (equations, anchor))
+    rounds = max_steps - count if count > 0 else 0
+    y, multiplier, count, outcome = continue_if_any(
+        finish, ~done, state, (equations, anchor), crowd=_once_more, rounds=rounds
+    )
     # The rest is computed only if the report is used.
-    after, at_y = linearise(equations.residual, y)
-    scale, rank = equations.scale(at_y, y), gram_solver.rank
-    info = report(outcome, count, equations.candidate, y, as_array(before), after, scale, rank)
-    return y, multiplier, info
+    rank = inline.gram_solver(jacobian).rank
+    return y, multiplier, equations.report(y, as_array(before), count, rank, outcome)
 
 
-# The same equations in another form, and the maps to the new form of the state and back.
-_Converted = tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]
+_Linearised = tuple[Vector, AbstractJacobian]
 
 
-def _in_scalars(equations: Equations) -> _Converted:
-    """The equations in scalars, if they are few and small."""
-    assert isinstance(equations.residual, Joined)
-    residual, magnitude, split, join = written_out(
-        equations.residual, equations.magnitude, equations.candidate
+def _iterations(
+    equations: Equations,
+    at_candidate: _Linearised,
+    start: tuple[Y, Vector],
+    at_start: _Linearised,
+    count: int,
+) -> tuple[Y, Vector, Bool[Array, ""]]:
+    """`count` iterations with the Gram matrix at the start, and whether they are enough."""
+    (before, base), (g, jacobian) = at_candidate, at_start
+    gram_solver = equations.gram_solver(jacobian, None if jacobian is base else base)
+    y, multiplier = start
+    last = g
+    for step in range(count):
+        change = gram_solver.solve(g)
+        subtract = tree_cancel if step == count - 1 else tree_sub
+        y = subtract(y, equations.correction(base, change))
+        multiplier = tree_sub(multiplier, change)
+        last = g
+        g, jacobian = linearise(equations.residual, y)
+    scale = equations.scale(jacobian, y)
+    # XLA may compute `y` twice, for `g` and for the result, with different rounding. After a large
+    # correction whose terms cancel, these would be different states.
+    roundoff = ROUNDOFF_MULTIPLE * float(jnp.finfo(working_dtype(y)).eps)
+    small = equations.tolerance(
+        jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
     )
-    return _of_states(equations, residual, split, magnitude=magnitude), split, join
+    close = within(last, tree_scale(roundoff ** (-2 / 3), small))
+    return y, multiplier, close & equations.safely_satisfied(g, scale)
 
 
-def _in_vectors(equations: Equations) -> _Converted:
-    """The equations with the state in one vector."""
+def _once_more(
+    state: _State, operands: tuple[Equations, Y | None]
+) -> tuple[Bool[Array, ""], _State]:
+    """One more iteration from `state`, and whether that is not enough."""
+    y, multiplier, count, outcome = state
+    equations, split, join = _converted(operands[0])
+    if isinstance(equations.magnitude, tuple):
+        multiplier = tuple(multiplier)
+    start = split(y), multiplier
+    candidate, here = (linearise(equations.residual, x) for x in (equations.candidate, start[0]))
+    y, multiplier, done = _iterations(equations, candidate, start, here, 1)
+    return ~done, (join(y), as_array(multiplier), count + 1, outcome)
+
+
+def _converted(
+    equations: Equations, convert: Callable[[Joined, Y], Converted] = written_out
+) -> tuple[Equations, Callable[[Y], Y], Callable[[Y], Y]]:
+    """The same equations in another form, and the maps to the new form of the state and back."""
     assert isinstance(equations.residual, Joined)
-    residual, split, join = flattened(equations.residual, equations.candidate)
-    return _of_states(equations, residual, split), split, join
-
-
-def _of_states(
-    equations: Equations, residual: Joined | Elements, split: Callable[[Y], Y], **changes: Vector
-) -> Equations:
-    return dataclasses.replace(
-        equations,
-        residual=residual,
-        candidate=split(equations.candidate),
-        weights=split(equations.weights),
-        **changes,
-    )
+    residual, split, join = convert(equations.residual, equations.candidate)
+    candidate, weights = split(equations.candidate), split(equations.weights)
+    magnitude = equations.magnitude
+    magnitude = tuple(magnitude) if isinstance(residual, Elements) else magnitude
+    changes = dict(residual=residual, candidate=candidate, weights=weights, magnitude=magnitude)
+    return dataclasses.replace(equations, **changes), split, join
 
 
 def _finish(
@@ -212,8 +223,8 @@ def _finish(
 
     def attempt(equations: Equations, start: Start, enabled: Bool[Array, ""]) -> _State:
         products = equations.magnitude.size**2 * tree_size(equations.candidate)
-        convert = _in_scalars if products <= _RARE_SCALARS_MAX else _in_vectors
-        equations, split, join = convert(equations)
+        convert = written_out if products <= _RARE_SCALARS_MAX else flattened
+        equations, split, join = _converted(equations, convert)
         y, multiplier, count = start
         if isinstance(equations.magnitude, tuple):
             multiplier = tuple(multiplier)
@@ -272,32 +283,6 @@ def _from_between(
 
 @_project.def_jvp
 def _project_jvp(primals, tangents, *, max_steps):
-    """The implicit function theorem for `λ` in `g(ŷ + M⁻¹ G(ŷ)ᵀ λ) = 0`.
-
-    Let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at constant `λ`. Then
-    `λ̇ = -(G(y) M⁻¹ G(ŷ)ᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + M⁻¹ G(ŷ)ᵀ λ̇`.
-    """
-    y, multiplier, info = _project(*primals, max_steps=max_steps)
-    equations, _ = primals
-    t_equations, _ = tangents
-
-    def displaced(residual: Residual, candidate: Y, weights: Y) -> tuple[Y, Vector]:
-        # `Gᵀ λ` by one reverse pass, not row by row.
-        _, vjp = eqx.filter_vjp(residual, candidate)
-        (direction,) = vjp(multiplier)
-        y = tree_add(candidate, tree_mul(direction, weights))
-        return y, residual(y)
-
-    def moving(x: Any) -> tuple[Any, Any, Any]:
-        return x.residual, x.candidate, x.weights
-
-    t_y, t_g = tree_tangents(*eqx.filter_jvp(displaced, moving(equations), moving(t_equations)))
-    _, at_candidate = linearise(equations.residual, equations.candidate)
-    _, at_y = linearise(equations.residual, y)
-    gram_solver = at_y.derivative_solver(equations.weights, at_candidate)
-    t_multiplier = gram_solver.solve(jtu.tree_map(jnp.negative, t_g))
-    t_y = tree_add(t_y, equations.correction(at_candidate, t_multiplier))
-    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
-    factor = jnp.where(info.ok, certain(equations, y, at_y), 1)
-    t_y = tree_scale(lax.stop_gradient(factor), t_y)
-    return (y, multiplier, info), (t_y, t_multiplier, jtu.tree_map(lambda _: None, info))
+    solution = _project(*primals, max_steps=max_steps)
+    (equations, _), (t_equations, _) = primals, tangents
+    return differentiated(solution, (equations, None), (t_equations, None), frozen=True)

@@ -1,6 +1,5 @@
 """The step whose candidate is projected, as far as a projection may use it."""
 
-import dataclasses
 from typing import Any, final
 
 import diffrax as dfx
@@ -32,11 +31,6 @@ class Step(eqx.Module):
     error: Y | None
     path: dfx.AbstractLocalInterpolation
     direction: RealScalarLike
-
-    def view(self) -> "Step":
-        """The step in the form in which a projection gets it, with `real_view` applied to its
-        states."""
-        return dataclasses.replace(self, y0=real_view(self.y0), error=real_view(self.error))
 
     def evaluate(self, t: RealScalarLike) -> Any:
         """The dense output of the wrapped solver, before any projection.

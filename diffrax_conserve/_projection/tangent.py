@@ -161,9 +161,9 @@ class TangentField(eqx.Module):
         values = conserved_values(self.manifold, t, y, args)
         check_values(self.manifold, values, t, y, args)
         wrong = self._wrong_rates(t, y, args, slope, values)
-        residual, magnitude = residual_of(self.manifold, values, t, y, args)
+        residual, _ = residual_of(self.manifold, values, t, y, args)
         view = real_view(y)
-        inline, _, split, join = written_out(residual, magnitude, view)
+        inline, split, join = written_out(residual, view)
         g, jacobian = linearise(inline, split(view))
         weights = split(inverse_metric(self.metric, view))
         wrong = tuple(wrong) if isinstance(g, tuple) else wrong

@@ -11,9 +11,11 @@ from jaxtyping import Array, Bool, Real
 
 from .._balance import integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._tree import tree_add, tree_all_finite, working_dtype
-from .base import AbstractProjection, Outcome, ProjectionInfo
-from .project import apply, relative_residual
+from .._tree import real_view, tree_add, tree_all_finite, tree_stop_gradient, working_dtype
+from .base import AbstractProjection
+from .equations import Outcome, ProjectionInfo
+from .project import apply
+from .residual import largest, measure, relative
 from .step import Step
 
 # diffrax traces a step three times; a jitted function is traced only once.
@@ -69,7 +71,7 @@ class Target(eqx.Module):
         if not self.projection.sees_step:
             return None
         start, end = start * self.direction, end * self.direction
-        return Step(start, end, y0, error, path(), self.direction)
+        return Step(start, end, real_view(y0), real_view(error), path(), self.direction)
 
     def project(
         self,
@@ -78,25 +80,22 @@ class Target(eqx.Module):
         anchor: Y | None = None,
         step: Step | None = None,
     ) -> tuple[Y, ProjectionInfo]:
-        t = t * self.direction
+        t, now = t * self.direction, self.now
+
+        def projected() -> tuple[Y, ProjectionInfo]:
+            return _apply(
+                self.projection, self.manifold, now, t, candidate, self.args, anchor, step
+            )
+
         if self.threshold is None and self.due is None:
-            return self._project(t, candidate, anchor, step)
-        residual = relative_residual(self.manifold, self.now, t, candidate, self.args)
+            return projected()
+        given = tree_stop_gradient((self.manifold, now, t, candidate, self.args))
+        residual = largest(relative(*measure(*given)))
         needed = jnp.asarray(True) if self.due is None else self.due
         if self.threshold is not None:
             needed = needed & ~(residual <= self.threshold)
         needed = needed | ~tree_all_finite(candidate)
-        return lax.cond(
-            needed,
-            lambda: self._project(t, candidate, anchor, step),
-            lambda: (candidate, _untouched(candidate, residual)),
-        )
-
-    def _project(
-        self, t: RealScalarLike, candidate: Y, anchor: Y | None, step: Step | None
-    ) -> tuple[Y, ProjectionInfo]:
-        now, args = self.now, self.args
-        return _apply(self.projection, self.manifold, now, t, candidate, args, anchor, step)
+        return lax.cond(needed, projected, lambda: (candidate, _untouched(candidate, residual)))
 
     def too_far(self, info: ProjectionInfo) -> Bool[Array, ""]:
         """Whether a successful projection moved the state by more than `limit`."""

@@ -3,7 +3,8 @@
 import diffrax as dfx
 import equinox as eqx
 
-from .._projection import AbstractProjection, Directional
+from .._projection.base import AbstractProjection
+from .._projection.directional import Directional
 
 
 def check_nested(solver: dfx.AbstractSolver) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._custom_types import Manifold, Values
 from .._manifold import is_entry
-from .._projection import ProjectionInfo
+from .._projection.base import ProjectionInfo
 from .diffrax_private import member, register
 from .initial import FINE, Initial
 

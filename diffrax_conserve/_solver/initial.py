@@ -7,9 +7,11 @@ from jaxtyping import Array, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, FirstIntegral, is_entry
-from .._projection import AbstractProjection, SimplifiedNewton, measure, relative
+from .._projection.base import AbstractProjection
 from .._projection.project import apply
-from .._tree import tree_stop_gradient, working_dtype
+from .._projection.residual import largest, measure, relative
+from .._projection.simplified_newton import SimplifiedNewton
+from .._tree import tree_all_finite, tree_stop_gradient, working_dtype
 from .._with_jacobian import WithJacobian
 
 FINE, NOT_FINITE, VIOLATED, UNREACHABLE, WRONG_JACOBIAN = range(5)
@@ -49,14 +51,11 @@ def judge(
     for i, (entry, ratio, scale) in reversed(
         [*enumerate(zip(entries, ratios, treedef.flatten_up_to(scales), strict=True))]
     ):
-        violated = _any(ratio, lambda x: ~(jnp.abs(x) <= limit)) & isinstance(entry, Constraint)
-        nonfinite = _any(ratio, lambda x: ~jnp.isfinite(x)) | _any(
-            scale, lambda x: ~jnp.isfinite(x)
-        )
+        violated = isinstance(entry, Constraint) & ~(largest(ratio) <= limit)
         wrong = jnp.where(violated, VIOLATED, FINE)
         if isinstance(entry.fn, WithJacobian):
             wrong = jnp.where(entry.fn.is_wrong(t, y, args), WRONG_JACOBIAN, wrong)
-        wrong = jnp.where(nonfinite, NOT_FINITE, wrong)
+        wrong = jnp.where(tree_all_finite((ratio, scale)), wrong, NOT_FINITE)
         position = jnp.where(wrong != FINE, i, position).astype(jnp.int32)
         cause = jnp.where(wrong != FINE, wrong, cause).astype(jnp.int32)
     offset = jnp.zeros((), dtype)
@@ -69,7 +68,3 @@ def judge(
         position = jnp.where(unreachable, given.index(True), position).astype(jnp.int32)
         offset = jnp.where(info.ok, info.correction, 0).astype(dtype)
     return Initial(cause, position, offset)
-
-
-def _any(tree: Values, test) -> Array:
-    return jnp.any(jnp.stack([jnp.any(test(x)) for x in jtu.tree_leaves(tree)]))

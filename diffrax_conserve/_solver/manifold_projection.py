@@ -21,16 +21,10 @@ from .._custom_types import (
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import check_manifold, check_outputs, check_values, conserved_values
 from .._options import check_count, check_number
-from .._projection import (
-    AbstractProjection,
-    SimplifiedNewton,
-    Target,
-    check_metric,
-    check_projection,
-    check_state,
-    option,
-    tangential,
-)
+from .._projection.base import AbstractProjection, check_projection, option
+from .._projection.project import check_metric, check_state, tangential
+from .._projection.simplified_newton import SimplifiedNewton
+from .._projection.target import Target
 from .._tree import tree_norm, tree_sub, working_dtype
 from .checks import check_direction, check_nested, innermost
 from .count_rejections import FAILED_PROJECTION
@@ -198,7 +192,6 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
-        values = jtu.tree_map(jnp.asarray, values)
         num_constraints = sum(jnp.size(value) for value in jtu.tree_leaves(values))
         return State(
             self.solver.init(terms, t0, t1, y0, args),

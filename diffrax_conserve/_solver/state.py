@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._custom_types import Values
-from .._projection import ProjectionInfo
+from .._projection.base import ProjectionInfo
 from .initial import Initial
 from .statistics import ProjectionStatistics
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._options import check_solution
 from .._printing import is_traced, printed
-from .._projection import ProjectionInfo
+from .._projection.base import ProjectionInfo
 from .count_rejections import RejectionCount
 
 

@@ -8,7 +8,8 @@ import diffrax as dfx
 import jax.tree_util as jtu
 
 from .._replace_file import replace_file
-from .._solver import RK4, ManifoldProjection
+from .._solver.manifold_projection import ManifoldProjection
+from .._solver.rk4 import RK4
 from ..learned import save
 from ..systems import AbstractSystem
 from ._compare import compare

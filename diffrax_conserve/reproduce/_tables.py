@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from .. import __version__
+from .._tree import tree_scale
 from ..systems import AbstractSystem
 from ._compare import Comparison, take, thinned
 from ._solve import Run
@@ -173,7 +173,17 @@ _POINTS = 8
 
 def _line(system: AbstractSystem, ts: np.ndarray, ys: Any) -> dict[str, np.ndarray]:
     """The path between the steps too, by cubic Hermite interpolation."""
-    slopes = jax.vmap(lambda t, y: system.vector_field(t, y, system.args))(jnp.asarray(ts), ys)
-    fine = np.linspace(ts[0], ts[-1], _POINTS * (len(ts) - 1) + 1)
-    states = jtu.tree_map(lambda y, f: CubicHermiteSpline(ts, y, f)(fine), ys, slopes)
-    return _paths(system, states)
+    ts, ys = jtu.tree_map(jnp.asarray, (ts, ys))
+
+    @jax.vmap
+    def state(t: jax.Array) -> Any:
+        k = jnp.clip(jnp.searchsorted(ts, t, side="right"), 1, ts.size - 1)
+        (t0, y0), (t1, y1) = take((ts, ys), k - 1), take((ts, ys), k)
+        k0 = tree_scale(t1 - t0, system.vector_field(t0, y0, system.args))
+        k1 = tree_scale(t1 - t0, system.vector_field(t1, y1, system.args))
+        path = dfx.ThirdOrderHermitePolynomialInterpolation(
+            t0=t0, t1=t1, y0=y0, y1=y1, k0=k0, k1=k1
+        )
+        return path.evaluate(t)
+
+    return _paths(system, state(jnp.linspace(ts[0], ts[-1], _POINTS * (ts.size - 1) + 1)))

@@ -10,8 +10,8 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from .._projection import Newton
-from .._solver import ManifoldProjection
+from .._projection.newton import Newton
+from .._solver.manifold_projection import ManifoldProjection
 from ..learned import (
     PINN,
     ConservativeLayer,

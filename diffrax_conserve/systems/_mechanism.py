@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
-from .._projection import ClosedForm
+from .._projection.closed_form import ClosedForm
 from .._projection.elimination import unrolled_solver
 from ._base import real
 

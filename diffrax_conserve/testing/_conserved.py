@@ -23,7 +23,7 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
-from .._projection import measure as residuals
+from .._projection.residual import measure as residuals
 from ._report import Sample, report_constraints, unsuccessful
 
 # Twice the default tolerance of a projection, because the residual is evaluated again here.

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
-from diffrax_conserve._projection import measure
+from diffrax_conserve._projection.residual import measure
 
 from .common import (
     SYSTEMS,

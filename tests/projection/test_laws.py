@@ -128,6 +128,12 @@ def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
     b=np.zeros(2),
     weights=np.zeros(4),
 )
+@example(  # the first constraint vanishes where it is met, with every term
+    y=np.zeros(4),
+    matrix=np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]]),
+    b=np.array([0.0, 1.0]),
+    weights=np.log([3.3, 7.3, 0.53, 0.16]),
+)
 @example(
     y=np.zeros(4),
     matrix=np.array([[1, 0, 2**-9, 0], [1, 0, 0, 2**-9]]),
@@ -198,6 +204,27 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
         alone, alone_info = project(RIGID_BODY, y, projection)
         np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
         assert abs(int(info.num_steps[i]) - int(alone_info.num_steps)) <= 1
+
+
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]))
+def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
+    """From none to all of a batch: few are gathered, many iterate together, and some then fail."""
+    rng = np.random.default_rng(seed)
+    lanes = 260
+    size = np.where(rng.random(lanes) < share, 10 ** rng.uniform(-3, 0.7, lanes), 1e-5)
+    ys = 1 + size[:, None] * rng.uniform(-1, 1, (lanes, 3))
+    ys[rng.integers(lanes)] = np.nan if share == 0.5 else 1
+    batched, info = batch(ys, dfc.SimplifiedNewton())
+    succeeds = np.asarray(info.result == optx.RESULTS.successful)
+    for name, entry in RIGID_BODY.items():
+        values = np.asarray(jax.vmap(entry.fn, (None, 0, None))(0, batched, None))
+        error = np.abs(values - VALUES[name])[succeeds]
+        assert np.all(error <= 64 * EPS * np.maximum(VALUES[name], values[succeeds]))
+    for i in rng.permutation(lanes)[:40]:
+        alone, alone_info = project(RIGID_BODY, ys[i], dfc.SimplifiedNewton())
+        assert succeeds[i] == successful(alone_info)
+        if succeeds[i] and size[i] < 0.05:
+            np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
 
 
 @one_projection

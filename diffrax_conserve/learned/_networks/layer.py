@@ -13,7 +13,7 @@ from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._projection.elimination import Vector
-from ..._projection.linearise import Residual, linearise, written_out
+from ..._projection.linearise import Elements, Residual, linearise, written_out
 from ..._projection.residual import residual_of
 from ..._tree import (
     tree_add,
@@ -98,7 +98,8 @@ class ConservativeLayer(eqx.Module):
         dtype = working_dtype(candidate)
 
         residual, magnitude = residual_of(self.manifold, values, t, candidate, self.args)
-        function, magnitude, split, join = written_out(residual, magnitude, candidate)
+        function, split, join = written_out(residual, candidate)
+        magnitude = tuple(magnitude) if isinstance(function, Elements) else magnitude
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule

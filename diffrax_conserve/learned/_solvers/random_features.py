@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection import check_state
+from ..._projection.project import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import check_ode
 from .chebyshev import ChebyshevInterpolation

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Y
 from ..._manifold import check_manifold, conserved_values
-from ..._projection import project
+from ..._projection.project import project
 from ..._tree import tree_all_finite
 from .._networks import AbstractDomain, AbstractFlowMap, Points, Sampler
 

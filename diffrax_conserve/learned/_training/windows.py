@@ -14,7 +14,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
 from ..._manifold import conserved_values
-from ..._projection import project
+from ..._projection.project import project
 from .._networks import PINN, Window, fresh, initial_slope
 from .._networks.flat import flatten
 from .._networks.mlp import MLP
