@@ -49,6 +49,9 @@ DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 BENCH := $(VENV)/.installed-bench
 
+# What the tests compile with: see `tests/conftest.py`.
+QUICKLY_COMPILED := $(shell cat tests/xla_flags.txt)
+
 # ---- What a newcomer runs ----
 
 demo: $(PLOTS) ## reproduce two of the paper's examples into out/
@@ -92,7 +95,7 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 	$(BIN)/python docs/browser.py site
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
-examples: export XLA_FLAGS ?= --xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters
+examples: export XLA_FLAGS ?= $(filter-out --xla_backend_optimization_level=0,$(QUICKLY_COMPILED))
 examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
@@ -115,12 +118,13 @@ bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and j
 bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
-# At toy sizes nearly all of it is compilation, so it is compiled as in the tests. `make test` runs and
-# judges the smoke runs of TESTED.
-TESTED := balance learned_solvers sweeps
-bench-smoke: export XLA_FLAGS := --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536,xla_cpu_disable_new_fusion_emitters --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops
-bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the tests run those of learned/
-	printf '%s\n' $(patsubst %,cost/%,$(filter-out $(TESTED),$(COSTS))) cost/many_constraints $(STUDIES:%=studies/%) \
+# At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
+# of `fast_cpu`. The slow tests judge what most of these runs find.
+SMALL_LOOPS := xla_cpu_small_while_loop_byte_threshold=65536
+comma := ,
+bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
+bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
+	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
 	  learned/chemistry learned/equal_cost \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py

@@ -16,15 +16,10 @@ from jaxtyping import install_import_hook
 
 # Most of the time goes into compilation, which takes a fifth as long with XLA's older emitters and
 # without LLVM's optimisations. A third of the rest goes into what XLA does to the loops of a solve,
-# and into pieces for several threads. `make examples` has all that but the newer emitters, and
+# and into pieces for several threads. `make examples` has all that but the unoptimised code, and
 # `make slow` compiles as users do.
-QUICKLY_COMPILED = (
-    "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters "
-    "--xla_backend_optimization_level=0 "
-    "--xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
-)
-os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)
+QUICKLY_COMPILED = (Path(__file__).parent / "xla_flags.txt").read_text(encoding="utf-8").split()
+os.environ.setdefault("XLA_FLAGS", " ".join(QUICKLY_COMPILED))
 jax.config.update("jax_enable_x64", True)
 
 # What one run compiled the next one reads, and one worker what the other compiled.
@@ -79,6 +74,12 @@ with contextlib.suppress(ImportError, AttributeError):
 
 # Tracing makes many small objects, of which few are garbage: a tenth of its time.
 gc.set_threshold(50_000, 20, 100)
+
+
+def pytest_sessionfinish():
+    """What is left ends with the process: pytest would look through it five times, in 5 to 10 s."""
+    gc.freeze()
+
 
 settings.register_profile(
     "dev", deadline=None, max_examples=25, suppress_health_check=[HealthCheck.too_slow]

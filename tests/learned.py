@@ -20,8 +20,14 @@ CORES = {
 SWEEPS = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
 
 
+@eqx.filter_jit
+def samples(system, keys):
+    """Compiled once for each system and number."""
+    return jax.vmap(system.sample)(keys)
+
+
 def states(count=50, system=LORENZ, seed=7):
-    return jax.jit(jax.vmap(system.sample))(jr.split(jr.key(seed), count))
+    return samples(system, jr.split(jr.key(seed), count))
 
 
 def flow_map(max_step=0.25, layer=None, seed=0, **options):

@@ -105,6 +105,12 @@ def drift_of(sol, manifold, args=None):
     return dfc.drift(sol, manifold, args)
 
 
+@eqx.filter_jit
+def evaluated(sol, ts):
+    """The dense output at several times, in one program."""
+    return jax.vmap(sol.evaluate)(ts)
+
+
 def largest(tree):
     """The largest absolute value in a PyTree."""
     return max(float(np.max(np.abs(x))) for x in jax.tree.leaves(tree))

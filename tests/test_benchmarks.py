@@ -195,6 +195,7 @@ def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
     assert json.loads(out.read_text())["parts"] == json.loads(json.dumps(found))
 
 
+@pytest.mark.slow
 def test_the_cost_of_one_constraint_is_measured():
     scaling = benchmark("scaling")
     row = scaling.constraints(1, scaling.SMOKE)
@@ -259,6 +260,7 @@ def test_the_figures_show_every_curve(tmp_path):
 # ---- Learned solvers ----
 
 
+@pytest.mark.slow
 def test_a_smoke_run_of_the_cost_of_learning(capsys):
     found = benchmark("learned_solvers").main(["--smoke"])
     assert found["epochs"]["rigid-body"]["ratio"] > 0
@@ -266,6 +268,7 @@ def test_a_smoke_run_of_the_cost_of_learning(capsys):
     assert "| `rigid-body` |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_smoke_run_of_the_sweeps(capsys):
     found = benchmark("sweeps").main(["--smoke"])
     none, two = found["sweeps"]["conservative-lorenz-standard"]["rows"]
@@ -368,6 +371,7 @@ def test_the_results_of_learning_from_data_are_what_the_documentation_shows():
     assert [line for line in lines if line not in page] == []
 
 
+@pytest.mark.slow
 def test_a_smoke_run_of_the_balances():
     found = benchmark("balance").main(["--smoke"])
     rows = found["pendulum"]["weak friction"]
@@ -378,11 +382,12 @@ def test_a_smoke_run_of_the_balances():
 # ---- A hundred million steps ----
 
 
-def test_the_drift_is_flat():
+@pytest.mark.parametrize("which", ["recorded", pytest.param("short", marks=pytest.mark.slow)])
+def test_the_drift_is_flat(which):
     """Of a short run, and of the recorded one, whose table is in the documentation."""
     run = benchmark("long_run")
     recorded = json.loads(run.RESULTS.read_text())
-    for row in run.measure(10**3) + recorded:
+    for row in recorded if which == "recorded" else run.measure(10**3):
         eps = float(np.finfo(row["dtype"]).eps)
         if row["solver"] == "projected":
             assert max(row["drift"].values()) < 4 * eps

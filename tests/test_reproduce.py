@@ -240,9 +240,19 @@ PROJECT = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").rea
 MODULE, FUNCTION = PROJECT["project"]["scripts"]["diffrax-conserve"].split(":")
 
 
-@pytest.mark.parametrize("redirection", ["| head -1", "> /dev/full"])
+STARTS = "-m diffrax_conserve", f"-c 'import sys, {MODULE} as m; sys.exit(m.{FUNCTION}())'"
+
+
+# Each start with each redirection; two of the four by default.
 @pytest.mark.parametrize(
-    "start", ["-m diffrax_conserve", f"-c 'import sys, {MODULE} as m; sys.exit(m.{FUNCTION}())'"]
+    ("start", "redirection"),
+    [
+        (STARTS[0], "> /dev/full"),
+        (STARTS[1], "| head -1"),
+        pytest.param(STARTS[0], "| head -1", marks=pytest.mark.slow),
+        pytest.param(STARTS[1], "> /dev/full", marks=pytest.mark.slow),
+    ],
+    ids=["module-full", "command-head", "module-head", "command-full"],
 )
 def test_an_output_that_ends_early(start, redirection):
     command = f"set -o pipefail; {sys.executable} {start} list {redirection}"
@@ -266,14 +276,16 @@ def test_list_names_every_system(capsys):
     assert [line.split()[0] for line in lines] == list(dfc.systems.names())
 
 
-# The others are slow by their number, and for the learned solvers that are compiled.
+# The others are slow by their number, and for the learned solvers that they compile. They draw.
 QUICK = ("kepler",)
 
 
-@pytest.mark.draws
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in dfc.systems.names()],
+    [
+        pytest.param(n, marks=[] if n in QUICK else [pytest.mark.slow, pytest.mark.draws])
+        for n in dfc.systems.names()
+    ],
 )
 def test_every_system(name, tmp_path):
     system = dfc.systems.get(name)

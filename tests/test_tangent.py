@@ -130,7 +130,9 @@ def test_rk4_is_of_order_four(which, double_end):
     assert fine < 1e-6
 
 
-@pytest.mark.parametrize("which", ["pendulum", "double pendulum"])
+@pytest.mark.parametrize(
+    "which", [pytest.param("pendulum", marks=pytest.mark.slow), "double pendulum"]
+)
 def test_mechanisms_agree_with_angles(which, double_end):
     if which == "pendulum":
         field, manifold, y0, end = ROD, ROD_MANIFOLD, PENDULUM.y0, pendulum_end()
@@ -327,6 +329,8 @@ def test_the_units_of_a_constraint_do_not_count(dtype):
         return field(0.0, radius * jnp.array([0.6, 0.8], dtype), None) / radius
 
     one = jnp.ones((), dtype)
-    found = jax.vmap(along)(*jnp.array([[one, far], [one, 1 / far], [far, one], [1 / far, one]]).T)
+    found = jax.jit(jax.vmap(along))(
+        *jnp.array([[one, far], [one, 1 / far], [far, one], [1 / far, one]]).T
+    )
     tolerance = 16 * float(jnp.finfo(dtype).eps)
     np.testing.assert_allclose(found, [[-0.32, 0.24]] * 4, rtol=tolerance)

@@ -235,12 +235,7 @@ def test_random_quadratic_integrals_are_conserved(dimension, integrals, data):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        n
-        if n in ("conservative-lorenz", "lotka-volterra")
-        else pytest.param(n, marks=pytest.mark.slow)
-        for n in SYSTEMS
-    ],
+    [n if n == "conservative-lorenz" else pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS],
 )
 def test_the_order_survives_the_projection(name):
     system = SYSTEMS[name]

@@ -17,6 +17,11 @@ EPS = np.finfo(np.float64).eps
 BOTH = pytest.mark.parametrize(
     "kind", [dfc.SimplifiedNewton, dfc.Newton], ids=["simplified", "newton"]
 )
+SIMPLIFIED_BY_DEFAULT = pytest.mark.parametrize(
+    "kind",
+    [dfc.SimplifiedNewton, pytest.param(dfc.Newton, marks=pytest.mark.slow)],
+    ids=["simplified", "newton"],
+)
 BALANCES = dfc.FirstIntegral(lambda t, y, args: args @ y)
 
 
@@ -64,15 +69,19 @@ def quadratic_program(atoms, value, candidate, metric):
     return found.x / root
 
 
+MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
+
+
 @BOTH
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
 def test_it_solves_the_quadratic_program(kind, count):
     rng = np.random.default_rng(1)
     atoms, values, candidates = chemistry(rng, count)
     metric = 10 ** rng.uniform(-1, 1, size=8)
-    y, ok, _ = project(kind, atoms, values, candidates, jnp.asarray(metric))
+    repeated = (jnp.resize(x, (MANY, *x.shape[1:])) for x in (atoms, values, candidates))
+    y, ok, _ = project(kind, *repeated, jnp.asarray(metric))
     assert jnp.all(ok)
-    for a, v, c, got in zip(*map(np.asarray, (atoms, values, candidates, y)), strict=True):
+    for a, v, c, got in zip(*map(np.asarray, (atoms, values, candidates, y[:count])), strict=True):
         expected = quadratic_program(a, v, c, metric)
         # Not nearer by more than what SLSQP errs.
         near, best = (np.sum(metric * (x - c) ** 2) for x in (got, expected))
@@ -82,7 +91,7 @@ def test_it_solves_the_quadratic_program(kind, count):
 
 
 @BOTH
-@pytest.mark.parametrize("count", [2_000, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [MANY, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     atoms, values, candidates = chemistry(np.random.default_rng(2), count)
     y, ok, _ = project(kind, atoms, values, candidates, jnp.ones(8))
@@ -97,7 +106,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind, count):
 
 def test_a_candidate_within_the_bounds_is_projected_as_without():
     rng = np.random.default_rng(3)
-    atoms, values, candidates = chemistry(rng, 50)
+    atoms, values, candidates = chemistry(rng, MANY)
     inside = jnp.abs(candidates) + 1
     moved = values + jnp.einsum("ijk,ik->ij", atoms, inside - candidates) * 0.999
     y, *_ = project(dfc.SimplifiedNewton, atoms, moved, inside + 1, jnp.ones(8))
@@ -113,7 +122,7 @@ def test_a_candidate_within_the_bounds_is_projected_as_without():
     assert largest((y - expected)[untouched]) < 1e-13
 
 
-@BOTH
+@SIMPLIFIED_BY_DEFAULT
 def test_bounds_that_are_far_away_change_nothing(kind):
     """Also for candidates from which a bounded iteration alone would not arrive."""
 
@@ -172,11 +181,7 @@ def test_the_nearest_point_of_a_sphere_within_an_orthant():
     assert largest((y - expected)[near]) < 1e-12
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [dfc.SimplifiedNewton, pytest.param(dfc.Newton, marks=pytest.mark.slow)],
-    ids=["simplified", "newton"],
-)
+@SIMPLIFIED_BY_DEFAULT
 def test_derivatives_are_those_of_differences(kind):
     """With a component at each bound, in a metric, and through both."""
     projection = kind(lower=(0.0, jnp.array([0.0, -9.0])), upper=(1.0, jnp.array([9.0, 0.25])))

@@ -121,11 +121,13 @@ PROJECTIONS = {
     "newton": (dfc.Newton(), dfc.Newton()),
     "metric": (
         dfc.SimplifiedNewton(metric={"z": TWO, "x": 3.0}),
-        dfc.SimplifiedNewton(
-            metric={"re": jnp.array([2.0, 5.0]), "im": jnp.array([2.0, 5.0]), "x": 3.0}
-        ),
+        dfc.SimplifiedNewton(metric={"re": TWO, "im": TWO, "x": 3.0}),
     ),
     "bounded": (dfc.SimplifiedNewton(upper=0.98), dfc.SimplifiedNewton(upper=0.98)),
+    "bounded-metric": (
+        dfc.SimplifiedNewton(upper=0.98, metric={"z": TWO, "x": 3.0}),
+        dfc.SimplifiedNewton(upper=0.98, metric={"re": TWO, "im": TWO, "x": 3.0}),
+    ),
     "staged": (dfc.Staged(("q", SIMPLIFIED)), dfc.Staged(("q", SIMPLIFIED))),
 }
 
@@ -156,7 +158,12 @@ def in_parts_and_whole(complex_one, real_one):
     return got, (join(expected[0]), expected[1])
 
 
-@pytest.mark.parametrize("name", [name for name in PROJECTIONS if name != "simplified"])
+def projections(*default):
+    """By default those that join several options, one at a time in the slow run."""
+    return [n if n in default else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS]
+
+
+@pytest.mark.parametrize("name", projections("bounded-metric", "staged"))
 def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     (got, info), (expected, real_info) = in_parts_and_whole(*PROJECTIONS[name])
     assert info.ok
@@ -166,14 +173,18 @@ def test_it_is_the_projection_in_real_and_imaginary_parts(name):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [n if n == "simplified" else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS],
+    "inner",
+    [dfx.Euler(), pytest.param(dfx.Bosh3(), marks=pytest.mark.slow)],
+    ids=["euler", "bosh3"],
 )
-def test_it_is_the_solve_in_real_and_imaginary_parts(name):
+@pytest.mark.parametrize("name", projections("simplified"))
+def test_it_is_the_solve_in_real_and_imaginary_parts(name, inner):
     complex_one, real_one = PROJECTIONS[name]
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9), dense=True)
-    got = solve(complex_one, saveat=saveat)
-    expected = solve(real_one, split(Z0), vf=real_field, manifold=REAL_QUANTA, saveat=saveat)
+    got = solve(complex_one, inner=inner, saveat=saveat)
+    expected = solve(
+        real_one, split(Z0), vf=real_field, manifold=REAL_QUANTA, inner=inner, saveat=saveat
+    )
     assert got.ys["z"].dtype == jnp.complex128
     for a, b in [
         (got.ys, join(expected.ys)),

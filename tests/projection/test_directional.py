@@ -51,7 +51,7 @@ ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 @pytest.mark.parametrize(
     ("inner", "options"),
     [
-        pytest.param(dfx.Tsit5(), {}, id="tsit5-fixed"),
+        pytest.param(dfx.Tsit5(), {}, id="tsit5-fixed", marks=pytest.mark.slow),
         pytest.param(dfx.Dopri5(), {"stepsize_controller": ADAPTIVE}, id="dopri5-adaptive"),
         pytest.param(
             dfx.Tsit5(),
@@ -92,7 +92,10 @@ def test_it_lies_on_the_line_along_the_embedded_difference():
 
 @pytest.mark.parametrize(
     ("inner", "order"),
-    [pytest.param(dfx.Bosh3(), 3, id="bosh3"), pytest.param(dfx.Dopri5(), 5, id="dopri5")],
+    [
+        pytest.param(dfx.Bosh3(), 3, id="bosh3", marks=pytest.mark.slow),
+        pytest.param(dfx.Dopri5(), 5, id="dopri5"),
+    ],
 )
 def test_the_order_survives(inner, order):
     solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())

@@ -1,6 +1,7 @@
 """States of half precision work with every projection, or are refused with a remedy."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ WORK = {
 DTYPES = [jnp.float16, jnp.bfloat16]
 
 
+@eqx.filter_jit
 def solve(projection, dtype):
     return dfx.diffeqsolve(
         dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])),

@@ -12,6 +12,8 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from ..problems import drift_of, evaluated
+
 
 def pendulum(t, y, args):
     return jnp.stack([y[1], -args * jnp.sin(y[0])])
@@ -51,8 +53,8 @@ def solve(solver, y0=Y0, args=ONE, t1=2.0, dt0=0.1, **options):
 def test_relaxation_keeps_the_energy_at_every_saved_time():
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 57), dense=True)
     sol = solve(RELAXED, saveat=saveat)
-    assert jnp.max(jnp.abs(dfc.drift(sol, ENERGY, ONE))) < 4e-15
-    ys = jax.vmap(sol.evaluate)(jnp.linspace(0, 2, 91))
+    assert jnp.max(jnp.abs(drift_of(sol, ENERGY, ONE))) < 4e-15
+    ys = evaluated(sol, jnp.linspace(0, 2, 91))
     energies = jax.vmap(energy, (None, 0, None))(0, ys, ONE)
     np.testing.assert_allclose(energies, energy(0, Y0, ONE), atol=4e-15)
 
@@ -61,13 +63,14 @@ def test_relaxation_with_the_time_kept_loses_at_most_one_order():
     dct.assert_order(RELAXED, TERM, Y0, t1=2.0, dt0=0.2, args=ONE, order=3)
 
 
-def test_the_derivative_of_relaxation_is_that_of_its_solve():
-    def run(adjoint):
-        return lambda y0, args: solve(RELAXED, y0, args, adjoint=adjoint).ys[-1]
+@pytest.mark.parametrize("forward", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_the_derivative_of_relaxation_is_that_of_its_solve(forward):
+    adjoint = dfx.ForwardMode() if forward else dfx.RecursiveCheckpointAdjoint()
 
-    reverse, forward = run(dfx.RecursiveCheckpointAdjoint()), run(dfx.ForwardMode())
-    dct.assert_gradients(reverse, Y0, ONE, rtol=1e-6, forward=False)
-    dct.assert_gradients(forward, Y0, ONE, rtol=1e-6, reverse=False)
+    def run(y0, args):
+        return solve(RELAXED, y0, args, adjoint=adjoint).ys[-1]
+
+    dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=forward, reverse=not forward)
 
 
 def test_a_lane_of_a_batch_is_that_lane_alone():
@@ -104,11 +107,13 @@ class Seen(dfc.AbstractProjection):
 def test_a_projection_sees_the_step_of_every_candidate(t1):
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())
     saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 23), dense=True)
-    sol = solve(solver, t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
-    plain = solve(dfx.Bosh3(), t1=t1, dt0=0.1 * np.sign(t1), saveat=saveat)
+    # Arrays: for other times nothing is compiled anew.
+    times = {"t1": jnp.array(t1), "dt0": jnp.array(0.1 * np.sign(t1)), "saveat": saveat}
+    sol, plain = solve(solver, **times), solve(dfx.Bosh3(), **times)
     assert sol.result == dfx.RESULTS.successful
     np.testing.assert_allclose(sol.ys, plain.ys, atol=1e-14)
-    np.testing.assert_allclose(sol.evaluate(0.33 * t1), plain.evaluate(0.33 * t1), atol=1e-14)
+    between = jnp.array([0.33 * t1])
+    np.testing.assert_allclose(evaluated(sol, between), evaluated(plain, between), atol=1e-14)
 
 
 class Unseeing(Seen):
@@ -119,7 +124,13 @@ class Unseeing(Seen):
         return candidate, problem.judge(candidate, candidate, atol=1.0)
 
 
-@pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton(), Unseeing()])
+@pytest.mark.parametrize(
+    "projection",
+    [
+        Unseeing(),
+        *(pytest.param(p, marks=pytest.mark.slow) for p in (dfc.SimplifiedNewton(), dfc.Newton())),
+    ],
+)
 def test_what_asks_for_no_step_gets_none_and_saves_none(projection):
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=projection)
     sol = solve(solver, saveat=dfx.SaveAt(dense=True))

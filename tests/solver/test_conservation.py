@@ -43,7 +43,7 @@ CASES = combinations(
 )
 
 
-@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=9)
+@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=14)
 def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
     system = dfc.systems.get(name)
     step = jnp.asarray(STEP.get(name, 0.05), dtype)
@@ -82,8 +82,8 @@ def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
 
 def test_dense_output_agrees_with_the_vector_field():
     """The time derivative of the interpolant, which an event's root finder uses."""
-    projected = dfc.ManifoldProjection(dfx.Dopri8(), RIGID_BODY)
-    sol = solve(rigid_body, projected, OMEGA0, saveat=dfx.SaveAt(dense=True), dt0=0.01)
+    projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+    sol = solve(rigid_body, projected, OMEGA0, saveat=dfx.SaveAt(dense=True), dt0=0.005)
 
     @eqx.filter_jit
     @eqx.filter_vmap(in_axes=(None, 0))
@@ -195,14 +195,18 @@ def test_a_manifold_with_parallel_gradients_everywhere(solver, projection):
     np.testing.assert_allclose(sol.ys[0], exact, rtol=0, atol=1e-4)
 
 
-def test_at_and_near_a_steady_rotation():
+@pytest.mark.parametrize(
+    "projection",
+    [dfc.Newton(), pytest.param(dfc.SimplifiedNewton(), marks=pytest.mark.slow)],
+    ids=["newton", "simplified"],
+)
+def test_at_and_near_a_steady_rotation(projection):
     """About the middle axis, which is unstable: there all gradients are parallel."""
     for y0 in ([0.0, 1.5, 0.0], [1e-6, 1.5, 1e-5], [1e-3, 1.5, 0.0]):
-        for projection in (dfc.SimplifiedNewton(), dfc.Newton()):
-            solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY, projection=projection)
-            saveat = dfx.SaveAt(t0=True, steps=True)
-            sol = solve(rigid_body, solver, jnp.array(y0), t1=10.0, dt0=0.01, saveat=saveat)
-            assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
+        solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY, projection=projection)
+        saveat = dfx.SaveAt(t0=True, steps=True)
+        sol = solve(rigid_body, solver, jnp.array(y0), t1=10.0, dt0=0.01, saveat=saveat)
+        assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
 
 
 def test_lanes_at_the_edge_of_roundoff_end():

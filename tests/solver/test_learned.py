@@ -56,7 +56,9 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@SOLVERS
+@pytest.mark.parametrize(
+    "solver", [FLOW, pytest.param(FOLLOW, marks=pytest.mark.slow)], ids=["deeponet", "pinn"]
+)
 def test_more_nodes_follow_it_more_closely(solver):
     def error(nodes):
         follows = solver is FOLLOW
@@ -113,7 +115,8 @@ def test_any_flow_map_of_the_user():
     solver = unchecked(Rotation(jnp.array(1.0)))
     term = dfx.ODETerm(lambda t, y, args: (y[1], -y[0]))
     y0 = (jnp.array(1.0), jnp.array(0.0))
-    sol = dfx.diffeqsolve(term, solver, 0.0, 3.0, 0.5, y0, saveat=dfx.SaveAt(ts=[0.7, 3.0]))
+    saveat = dfx.SaveAt(ts=jnp.array([0.7, 3.0]))
+    sol = eqx.filter_jit(dfx.diffeqsolve)(term, solver, 0.0, 3.0, 0.5, y0, saveat=saveat)
     np.testing.assert_allclose(sol.ys[0], np.cos([0.7, 3.0]), atol=1e-12)
 
 
@@ -200,18 +203,24 @@ def test_gradients_of_a_rollout(layer, projection):
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
 
 
-def test_adjoints_agree():
+@pytest.mark.parametrize(
+    "reverse",
+    [
+        dfx.RecursiveCheckpointAdjoint(),
+        pytest.param(dfx.DirectAdjoint(), marks=pytest.mark.slow),
+    ],
+    ids=["checkpoints", "direct"],
+)
+def test_adjoints_agree(reverse):
     def f(y0, adjoint):
         return loss(DEEPONET, y0, 1.0, adjoint)
 
     direction = jnp.array([0.3, -1.0, 0.5])
-    reverse = eqx.filter_jit(jax.grad(f))
-    expected = reverse(LORENZ.y0, dfx.RecursiveCheckpointAdjoint()) @ direction
-    direct = reverse(LORENZ.y0, dfx.DirectAdjoint()) @ direction
+    backward = jax.jit(jax.grad(lambda y: f(y, reverse)))(LORENZ.y0) @ direction
     forward = jax.jit(lambda y: jax.jvp(lambda y: f(y, dfx.ForwardMode()), (y,), (direction,))[1])(
         LORENZ.y0
     )
-    np.testing.assert_allclose([direct, forward], expected, rtol=1e-12)
+    np.testing.assert_allclose(backward, forward, rtol=1e-12)
 
 
 def test_gradient_with_respect_to_the_weights_of_a_pinn():
@@ -240,7 +249,7 @@ def test_backsolve_adjoint_explains(solver):
 
 @pytest.mark.parametrize(
     "layer",
-    [pytest.param(None, marks=pytest.mark.slow), dfc.learned.ConservativeLayer(LORENZ.manifold)],
+    [None, pytest.param(dfc.learned.ConservativeLayer(LORENZ.manifold), marks=pytest.mark.slow)],
 )
 def test_random_networks_are_on_the_manifold_or_fail(layer):
     """Whatever the quality of the network: at steps and between them."""
@@ -289,7 +298,14 @@ TRANSFORMS = {
 }
 
 
-@pytest.mark.parametrize("transform", TRANSFORMS.values(), ids=TRANSFORMS)
+@pytest.mark.parametrize(
+    "transform",
+    [
+        pytest.param(t, marks=pytest.mark.slow) if n == "filter_jit" else t
+        for n, t in TRANSFORMS.items()
+    ],
+    ids=TRANSFORMS,
+)
 def test_a_step_that_is_too_long(transform):
     """Whether the length is known to the compiler or not."""
 

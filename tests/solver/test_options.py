@@ -206,14 +206,17 @@ def test_rejections_because_of_projection_are_counted(t1):
             saveat=dfx.SaveAt(t1=True, solver_state=True, controller_state=True),
         )
 
-    careless = dfx.PIDController(rtol=1e9, atol=1e9)  # accepts any error estimate
+    def controller(tolerance):  # an array, for which nothing is compiled anew
+        return dfx.PIDController(rtol=jnp.array(tolerance), atol=jnp.array(tolerance))
+
+    careless = controller(1e9)  # accepts any error estimate
     plain, counted = adaptive(careless), adaptive(dfc.CountRejections(careless))
     # Two programs, which may be rounded differently.
     np.testing.assert_allclose(plain.ys, counted.ys, rtol=1e-13)
     assert dfc.statistics(plain).num_rejected is None
     assert dfc.statistics(counted).num_rejected == counted.stats["num_rejected_steps"] > 0
     # And not those because of the error.
-    careful = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    careful = controller(1e-6)
     sol = adaptive(dfc.CountRejections(careful))
     assert dfc.statistics(sol).num_rejected < sol.stats["num_rejected_steps"]
 

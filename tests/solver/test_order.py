@@ -74,7 +74,7 @@ def toda():
     return system, jax.tree.map(lambda y: y[-1], ys)
 
 
-@some_of("solver,order,num_steps", ORDERS, ids=[type(s).__name__ for s, *_ in ORDERS], period=2)
+@some_of("solver,order,num_steps", ORDERS, ids=[type(s).__name__ for s, *_ in ORDERS], period=3)
 def test_slope(toda, solver, order, num_steps):
     """On a log-log scale, by least squares over four step sizes. (The leading error coefficients of
     Tsit5 and Dopri5 are so small that a higher order shows at these steps.)"""

@@ -51,7 +51,7 @@ def test_subs_and_functions_of_the_state():
 @pytest.mark.parametrize(
     "controller",
     [
-        dfx.ConstantStepSize(),
+        pytest.param(dfx.ConstantStepSize(), marks=pytest.mark.slow),
         dfx.StepTo(ts=jnp.array([0.0, 0.13, 0.5, 1.0])),
         dfx.ClipStepSizeController(
             dfx.PIDController(rtol=1e-6, atol=1e-6),
@@ -61,7 +61,10 @@ def test_subs_and_functions_of_the_state():
         dfx.ClipStepSizeController(
             dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=jnp.array([0.51])
         ),
-        dfx.PIDController(rtol=1e-6, atol=1e-6, pcoeff=0.3, icoeff=0.4, dcoeff=0.1, dtmax=0.2),
+        pytest.param(
+            dfx.PIDController(rtol=1e-6, atol=1e-6, pcoeff=0.3, icoeff=0.4, dcoeff=0.1, dtmax=0.2),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["constant", "step-to", "clip", "jump", "pid"],
 )
@@ -82,7 +85,9 @@ def test_every_controller_hits_its_times_on_the_manifold(controller):
         assert np.min(np.abs(times - t)) <= 1e-6
 
 
-@pytest.mark.parametrize("meter", [dfx.TextProgressMeter(), dfx.NoProgressMeter()])
+@pytest.mark.parametrize(
+    "meter", [dfx.TextProgressMeter(), pytest.param(dfx.NoProgressMeter(), marks=pytest.mark.slow)]
+)
 def test_progress_meters_and_unlimited_steps(meter, capsys):
     sol = run(dfx.SaveAt(t1=True), progress_meter=meter, max_steps=None)
     np.testing.assert_allclose(energies(sol.ys), ENERGY, rtol=4e-16)

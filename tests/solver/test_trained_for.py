@@ -55,16 +55,18 @@ def test_one_lane_of_a_batch_is_enough():
         jax.block_until_ready(batch(y0s, jnp.array([1.0, 1.0, 1.5, 1.0])))
 
 
-def test_it_is_not_differentiated():
+@pytest.mark.parametrize("batched", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_it_is_not_differentiated(batched):
     off = dfc.DeepONetSolver(TAYLOR, check_field=False)
 
     def total(solver, y0):
         return jnp.sum(end(solver, LORENZ, y0))
 
-    for transform in (jax.grad, lambda f, argnums: jax.vmap(jax.grad(f, argnums), (None, 0))):
-        y0 = states(3) if transform is not jax.grad else LORENZ.y0
-        on = eqx.filter_jit(transform(total, 1))(SOLVER, y0)
-        np.testing.assert_allclose(on, eqx.filter_jit(transform(total, 1))(off, y0), rtol=1e-12)
+    slope, y0 = jax.grad(total, 1), LORENZ.y0
+    if batched:
+        slope, y0 = jax.vmap(slope, (None, 0)), states(3)
+    on, without = (eqx.filter_jit(slope)(solver, y0) for solver in (SOLVER, off))
+    np.testing.assert_allclose(on, without, rtol=1e-12)
 
 
 def test_a_state_at_rest_is_not_refused():
@@ -73,7 +75,13 @@ def test_a_state_at_rest_is_not_refused():
     end(SOLVER, OTHER, rest)
 
 
-@pytest.mark.parametrize("name", ["conservative-lorenz", "double-pendulum", "point-vortices"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "conservative-lorenz",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("double-pendulum", "point-vortices")),
+    ],
+)
 def test_the_zoo_is_for_its_own_systems(name):
     """Also the networks of the paper, whose slope is learned; one in hundreds is too far off."""
     system = dfc.systems.get(name)

@@ -49,7 +49,9 @@ def test_same_steps_and_dense_output(solver):
                 dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=[0.4, 1.1]
             )
         ),
-        dict(stepsize_controller=dfx.ConstantStepSize(), dt0=0.05),
+        pytest.param(
+            dict(stepsize_controller=dfx.ConstantStepSize(), dt0=0.05), marks=pytest.mark.slow
+        ),
     ],
     ids=["backwards", "jumps", "fixed steps"],
 )

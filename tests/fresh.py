@@ -1,0 +1,30 @@
+"""What a new interpreter, without the settings of the tests, says of the package.
+
+One answers all questions, as each takes seconds to start.
+"""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+
+CODE = """
+import json, sys
+import diffrax, diffrax_conserve as dfc
+modules, messages = list(sys.modules), len(diffrax.RESULTS._index_to_message)
+dfc.fast_cpu()
+import jax
+total = float(jax.numpy.ones(3).sum())
+print(json.dumps({"modules": modules, "messages": messages, "computed with fast_cpu": total}))
+"""
+
+
+@functools.cache
+def interpreter() -> dict:
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
