@@ -43,9 +43,10 @@ def continue_if_any(
     scattered back. (A `lax.cond` in a batch runs both branches for every lane.) The value of `fn`
     for a lane whose flag is not set is not used. `fn` must not close over arrays.
 
-    Gathering many lanes is dear. While many lanes are flagged, at most `rounds` times, all lanes
-    compute `crowd(state, operands)`, which returns whether the lane remains flagged and its next
-    state.
+    Many lanes are not gathered, which would cost more than it saves. Instead, while many are
+    flagged, and at most `rounds` times, all lanes compute `crowd(state, operands)`, which returns
+    whether a lane remains flagged, and its next state. That of a lane which is not flagged is not
+    used.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
@@ -70,11 +71,8 @@ def continue_if_any(
     def finish(flags, states, batch, shared):
         if rounds > 0:
             most = min(rounds, _MOST_ROUNDS)
-            flags, states = _together(together, most, flags, states, batch, shared)
-        return if_any(ft.partial(_finish, lane), flags, states, batch, shared)
-
-    def if_any(fn, flags, states, *operands):
-        return lax.cond(jnp.any(flags), fn, lambda _, states, *__: states, flags, states, *operands)
+            flags, states = _iterate_together(together, most, flags, states, batch, shared)
+        return _if_any(ft.partial(_gather, lane), flags, states, batch, shared)
 
     # The loop of a solve is traced more than once, but a jitted function only once.
     finish = jax.jit(finish, inline=True)
@@ -82,7 +80,7 @@ def continue_if_any(
     # A nested `vmap` is flattened to one batch.
     @jax.custom_batching.custom_vmap
     def _lanes(flags, states, batch, shared):
-        return if_any(finish, flags, states, batch, shared)
+        return _if_any(finish, flags, states, batch, shared)
 
     @_lanes.def_vmap
     def batch_of_batches(size, axes, flags, states, batch, shared):
@@ -101,7 +99,11 @@ def continue_if_any(
     return alone(flag, state, arrays)
 
 
-def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: Any, shared: Any):
+def _if_any(fn: Callable, flags: Bool[Array, " lanes"], states: Any, *operands: Any) -> Any:
+    return lax.cond(jnp.any(flags), fn, lambda _, states, *__: states, flags, states, *operands)
+
+
+def _gather(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: Any, shared: Any):
     lanes = flags.shape[0]
     blocks = math.gcd(lanes, _BLOCKS)
     length = lanes // blocks
@@ -143,7 +145,7 @@ def _finish(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
     return jtu.tree_map(lambda x: x.reshape(lanes, *x.shape[2:]), states)
 
 
-def _together(
+def _iterate_together(
     crowd: Callable,
     rounds: int,
     flags: Bool[Array, " lanes"],
