@@ -220,11 +220,12 @@ def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
         values = np.asarray(jax.vmap(entry.fn, (None, 0, None))(0, batched, None))
         error = np.abs(values - VALUES[name])[succeeds]
         assert np.all(error <= 64 * EPS * np.maximum(VALUES[name], values[succeeds]))
-    for i in rng.permutation(lanes)[:40]:
+    # From far away, an iteration with damping may arrive where one without does not.
+    near = np.flatnonzero(size < 0.05)
+    for i in rng.permutation(near)[:40]:
         alone, alone_info = project(RIGID_BODY, ys[i], dfc.SimplifiedNewton())
-        assert succeeds[i] == successful(alone_info)
-        if succeeds[i] and size[i] < 0.05:
-            np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
+        assert succeeds[i] == successful(alone_info) == bool(np.all(np.isfinite(ys[i])))
+        np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
 
 
 @one_projection
