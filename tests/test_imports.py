@@ -5,6 +5,9 @@ The imports are read from the source, so those inside functions and under `TYPE_
 
 import ast
 import graphlib
+import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -132,6 +135,13 @@ def test_optional_packages_are_imported_in_one_part_only(package, owner):
         if any(name.split(".")[0] == package for name in imports(file))
     }
     assert users <= {owner}
+
+
+def test_what_is_imported_is_declared():
+    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
+    used = {name.split(".")[0] for file in MODULES.values() for name in imports(file)}
+    assert used - sys.stdlib_module_names - CONFINED.keys() - {PACKAGE} == declared
 
 
 def test_importing_the_package_needs_no_optional_package():
