@@ -79,7 +79,8 @@ class Network(eqx.Module):
 
 
 def projected(solver, manifold):
-    return dfc.ManifoldProjection(solver, manifold, projection=dfc.Newton(rtol=1e-9))
+    options = dict(projection=dfc.Newton(rtol=1e-9), max_correction=jnp.inf)
+    return dfc.ManifoldProjection(solver, manifold, **options)
 
 
 def solve(field, solver, y0, times, step=SPACING):

@@ -42,6 +42,9 @@ _CAUSES = (
     "value, or find a state that has it by `diffrax_conserve.project`.",
     _START + "the `jacobian` of {name} is not the derivative of its `fn` at the initial state. "
     "Compare it with difference quotients, by `jax.test_util.check_grads` for example.",
+    _START + "{name} is not a first integral: it changes along the vector field, as "
+    "`check_invariance` tells. If it has sources, give their `rate`. To keep it all the same, for "
+    "example of a network that is not trained, pass `max_correction=jax.numpy.inf`.",
 )
 _NONFINITE, _TOO_FAR, _DIVERGED, _UNSATISFIED = range(4)
 # The index of the first cause from `initial.py` other than `FINE`.

@@ -1,6 +1,7 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, final
 
 import diffrax as dfx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
+from .._along import slope_like
 from .._balance import has_rates
 from .._custom_types import (
     VF,
@@ -25,7 +27,7 @@ from .._projection.base import AbstractProjection, check_projection, option
 from .._projection.project import check_metric, check_state, tangential
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
-from .._tree import tree_norm, tree_sub, working_dtype
+from .._tree import tree_add, tree_norm, tree_sub, working_dtype
 from .checks import check_direction, check_nested, innermost
 from .count_rejections import FAILED_PROJECTION
 from .failure import failure
@@ -199,7 +201,16 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             jtu.tree_map(jnp.zeros_like, values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
             ProjectionStatistics.zero(working_dtype(y0), num_constraints),
-            judge(self.projection, self.manifold, values, t, y0, args),
+            judge(
+                self.projection,
+                self.manifold,
+                values,
+                t,
+                y0,
+                args,
+                self._vector_field(terms, t0, y0, args),
+                t1 - t0,
+            ),
         )
 
     def step(
@@ -263,6 +274,23 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         allowed = jnp.asarray(self.max_correction, dtype) * self.every
         return jnp.where(jnp.isinf(allowed), jnp.inf, allowed * moved + harmless + 2 * offset)
 
+    def _vector_field(
+        self, terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args
+    ) -> Callable[[Y], Y] | None:
+        """The vector field at the initial time, along which first integrals must not change."""
+        # A learned solver does not evaluate the vector field, which may be expensive.
+        evaluated = getattr(innermost(self.solver), "evaluates_vector_field", True)
+        exact = jnp.finfo(working_dtype(y0)).bits >= 32
+        if self.max_correction is not None or not (is_ode(terms) and evaluated and exact):
+            return None
+
+        def vector_field(y: Y) -> Y:
+            slope = self.solver.func(terms, t0, y, args)
+            slope = ft.reduce(tree_add, slope) if isinstance(terms, dfx.MultiTerm) else slope
+            return slope_like(y, slope)
+
+        return vector_field
+
     def _error(self, error: Y | None, target: Target, t1: RealScalarLike, y1: Y) -> Y | None:
         if error is None or not self.project_error:
             return error
@@ -297,7 +325,10 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     distance covered by the step, $\|\hat y - y_n\|$ (plus $\sqrt\varepsilon \|\hat y\|$), in the
     Euclidean norm. It protects against a jump to another component of the manifold, and against
     quantities that are not conserved. 0.5 is a sensible value, because corrections are of the size
-    of the local error of the wrapped solver. Default: no limit. The first projection may also move
+    of the local error of the wrapped solver. Default: no limit, but a solve does not start if a
+    first integral changes along the vector field by more than a hundredth of the terms that should
+    cancel. `jax.numpy.inf` allows that, for a vector field that conserves nothing, for example a
+    network before its training. The first projection may also move
     the state to a `value` that is not that of the initial state. With `every`, the limit is
     multiplied by it. Stochastic equations have no limit, because noise may move the state off the
     manifold as fast as it moves the state.

@@ -71,7 +71,7 @@ def test_a_state_that_is_not_finite_is_called_that():
     with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is not finite"):
         run(
             dfc.FirstIntegral(square),
-            vector_field=lambda t, y, args: jnp.sqrt(0.5 - t) * y,
+            vector_field=lambda t, y, args: jnp.sqrt(0.5 - t) * rotation(t, y, args),
         )
 
 
@@ -131,6 +131,10 @@ def test_diffrax_has_the_list_that_messages_are_added_to():
             "not finite at the in",
         ),
         (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), "initial state violates"),
+        # At rest neither changes yet.
+        (dfc.FirstIntegral(lambda t, y, args: y[0] ** 2), "`manifold` is not a first integral"),
+        (dfc.FirstIntegral(lambda t, y, args: y[0]), "`manifold` is not a first integral"),
+        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) + t), "is not a first integral"),
     ],
 )
 def test_what_cannot_start_ends_at_once(manifold, message):
@@ -138,6 +142,29 @@ def test_what_cannot_start_ends_at_once(manifold, message):
     sol = run(manifold, dfx.Tsit5(), stepsize_controller=adaptive, max_steps=None, throw=False)
     assert message in dfx.RESULTS[sol.result]
     assert sol.stats["num_steps"] == 1
+
+
+def test_what_a_vector_field_does_not_conserve_is_kept_on_demand():
+    sol = run(dfc.FirstIntegral(lambda t, y, args: y[1]), max_correction=jnp.inf)
+    assert np.all(sol.ys[:, 1] == 0)
+
+
+TIMES = {"t0": 2.0, "t1": 1.0, "dt0": -0.1}
+
+
+@pytest.mark.parametrize(
+    ("fn", "rate", "options"),
+    [
+        (square, None, TIMES),
+        (lambda t, y, args: square(t, y, args) + t**2, lambda t, y, args: 2 * t, TIMES),
+        (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, {}),
+        (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, TIMES),
+    ],
+    ids=["backwards", "balance-backwards", "in-time", "in-time-backwards"],
+)
+def test_what_changes_with_time_and_is_conserved_may_start(fn, rate, options):
+    sol = run(dfc.FirstIntegral(fn, rate=rate), throw=False, **options)
+    assert sol.result == dfx.RESULTS.successful
 
 
 def test_one_lane_that_cannot_start_leaves_the_others_alone():

@@ -109,6 +109,7 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
 
+    evaluates_vector_field: ClassVar[bool] = False
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 

@@ -62,6 +62,7 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
     pinn: PINN
     nodes: int = option(12, static=True)
 
+    evaluates_vector_field: ClassVar[bool] = False
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
