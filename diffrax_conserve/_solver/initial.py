@@ -73,7 +73,8 @@ def judge(
     changes: dict[int, Values] = {}
     if vector_field is not None:
         seen = {i: x for i, x in enumerate(entries) if _is_seen(x)}
-        kept = [treedef.flatten_up_to(values)[i] for i in seen]
+        parts = treedef.flatten_up_to(values)
+        kept = [parts[i] for i in seen]
         found = _changes([*seen.values()], kept, t, y, args, vector_field, step)
         changes = dict(zip(seen, found, strict=True))
     cause, position = jnp.asarray(FINE, jnp.int32), jnp.asarray(0, jnp.int32)
