@@ -67,6 +67,7 @@ test: $(TEST) ## run the tests, without the slow ones
 # ---- What a developer runs ----
 
 slow: export XLA_FLAGS ?=
+slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest $(SHARED) -m slow
 
@@ -96,6 +97,7 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
 examples: export XLA_FLAGS ?= $(filter-out --xla_backend_optimization_level=0,$(QUICKLY_COMPILED))
+examples: export EQX_ON_ERROR ?= raise
 examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."

@@ -34,10 +34,11 @@ class WithJacobian(eqx.Module):
     def is_wrong(self, t: RealScalarLike, y: Y, args: Args) -> Bool[Array, ""]:
         """Whether derivatives at `y`, along two directions, differ from central difference
         quotients by more than these can be wrong."""
-        eps = float(jnp.finfo(working_dtype(y)).eps)
+        info = jnp.finfo(working_dtype(y))
+        eps = float(info.eps)
         step, tolerance = eps ** (1 / 3), eps ** (1 / 8)
-        # A state of zeros has no size.
-        largest = jnp.where(tree_max(y) > 0, tree_max(y), 1)
+        # A state of zeros has no size, and steps from one that is nearly zero underflow.
+        largest = jnp.where(tree_max(y) > float(info.tiny) / eps, tree_max(y), 1)
         rng = np.random.default_rng(0)
         value, rows = self.fn(t, y, args), self.jacobian(t, y, args)
 

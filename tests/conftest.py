@@ -1,15 +1,19 @@
 """Double precision, run-time shape checks, and hypothesis profiles for the whole suite."""
 
 import contextlib
+import functools as ft
 import gc
 import importlib
 import itertools
 import os
 import shutil
+import types
 from pathlib import Path
-from typing import Any
 
 import jax
+import jaxtyping
+import pytest
+from beartype import BeartypeConf, beartype
 from beartype.door import is_bearable
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
@@ -32,6 +36,42 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
+# A failure makes the outputs NaN, which no test accepts. To raise it takes a callback, and jax does
+# not keep programs with callbacks in its cache.
+_equinox_errors = importlib.import_module("equinox._errors")
+_equinox_errors.EQX_ON_ERROR = os.environ.get("EQX_ON_ERROR", "nan")
+
+
+@pytest.fixture
+def errors_raise(monkeypatch):
+    """Failures raise, as they do for users."""
+    monkeypatch.setattr(_equinox_errors, "EQX_ON_ERROR", "raise")
+    # A setting without an effect on a CPU, so that a function is compiled again.
+    with jax.default_matmul_precision("highest"):
+        yield
+
+
+_jaxtyped = jaxtyping.jaxtyped
+_CHECKED = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
+
+
+def _once(fn=None, *, typechecker):
+    """In place of jaxtyping's decorator, which checks the arguments of a function twice."""
+    if fn is None:
+        return ft.partial(_once, typechecker=typechecker)
+    if not isinstance(fn, types.FunctionType):
+        return _jaxtyped(fn, typechecker=typechecker)
+    checked = _jaxtyped(_CHECKED(fn), typechecker=None)
+
+    @ft.wraps(fn)
+    def called(*args, **kwargs):
+        unchecked = jaxtyping.config.jaxtyping_disable
+        return fn(*args, **kwargs) if unchecked else checked(*args, **kwargs)
+
+    return called
+
+
+jaxtyping.jaxtyped = _once
 # Before the first import of the package: its annotations are then checked at every call.
 install_import_hook("diffrax_conserve", "beartype.beartype")
 
@@ -51,26 +91,6 @@ def _checked_by_beartype(accepts):
 # time of tracing. `test_typeguards.py` holds that leaves are checked as before.
 with contextlib.suppress(ImportError):
     importlib.import_module("jaxtyping._typeguard").typechecked = _checked_by_beartype
-
-
-def _only_what_is_returned(make):
-    """In place of jaxtyping's `_make_fn_with_signature`, for what checks a call after its return.
-
-    It checks the arguments once more, though their shapes are still known from the check before.
-    """
-
-    def made(name, qualname, module, signature, output):
-        if output:
-            unchecked = [p.replace(annotation=Any) for p in signature.parameters.values()]
-            signature = signature.replace(parameters=unchecked)
-        return make(name, qualname, module, signature, output)
-
-    return made
-
-
-with contextlib.suppress(ImportError, AttributeError):
-    decorator = importlib.import_module("jaxtyping._decorator")
-    decorator._make_fn_with_signature = _only_what_is_returned(decorator._make_fn_with_signature)
 
 # Tracing makes many small objects, of which few are garbage: a tenth of its time.
 gc.set_threshold(50_000, 20, 100)

@@ -90,7 +90,7 @@ def main() -> None:
     measuring.print_machine(about)
     rows = []
     for lanes in options.lanes or sizes["lanes"]:
-        steps = sizes["steps"] if options.smoke else max(4, sizes["steps"] // lanes)
+        steps = sizes["steps"] if options.smoke else max(40, sizes["steps"] // lanes)
         for name, family in FAMILIES.items():
             system, cases = family(lanes)
             runs = {

@@ -12,9 +12,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Real
 
-from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import AbstractConserved, Constraint, check_manifold, rate_of
-from .._tree import from_view, real_view
+from .._balance import rates
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values
+from .._projection.linearise import linearise
+from .._projection.residual import largest, measure, relative, residual_of
+from .._tree import real_view, tree_all_finite, tree_max, unflatten, working_dtype
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,43 +219,42 @@ def _measure(
     return jax.vmap(at_one_state)(ts, ys)
 
 
-def _relative_sizes(
-    entry: AbstractConserved, t: Float[Array, ""], state: Any, f: Any, args: Args
-) -> tuple[Array, Array]:
-    def fn(t: Float[Array, ""], view: Any) -> list[Array]:
-        return [jnp.ravel(x) for x in jtu.tree_leaves(entry.fn(t, from_view(view, state), args))]
+def _change_along(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args, slope: Y
+) -> Values:
+    """The derivative of each residual by time along `slope`, less its rate, relative to the sum of
+    the moduli of its terms. What may be roundoff of a slope in which larger terms cancel counts as
+    zero."""
+    t, view, slope = jnp.asarray(t, working_dtype(y)), real_view(y), real_view(slope)
+    fn, _ = residual_of(manifold, values, t, y, args)
+    _, jacobian = linearise(fn, view)
 
-    f = real_view(jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, state))
-    y = real_view(state)
-    value, along_flow = jax.jvp(fn, (t, y), (jnp.ones_like(t), f))
-    jacobian = jax.jacrev(fn, argnums=(0, 1))(t, y)
-    # The sizes of the terms that cancel: those of the derivative, and those of the value to first
-    # order.
-    speeds = [_term_sizes(rows, (jnp.ones_like(t), f)) for rows in jacobian]
-    sizes = [_term_sizes(rows, (t, y)) for rows in jacobian]
-    rate = rate_of(entry)
-    if rate is not None:
-        rates = [jnp.ravel(x) for x in jtu.tree_leaves(rate(t, state, args))]
-        along_flow = [a - b for a, b in zip(along_flow, rates, strict=True)]
-        speeds = [a + jnp.abs(b) for a, b in zip(speeds, rates, strict=True)]
-    residual = value if isinstance(entry, Constraint) else [jnp.zeros_like(x) for x in value]
+    def at_time(t: Array) -> tuple[Array, Values]:
+        fn, _ = residual_of(manifold, values, t, y, args)
+        return fn(view), rates(manifold, t, y, args)
+
+    (_, rate), (in_time, _) = jax.jvp(at_time, (t,), (jnp.ones_like(t),))
+    rate = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(rate)])
+    change = jacobian.pushforward(slope) + in_time - rate
+    fastest = jtu.tree_map(lambda x: jnp.full_like(x, tree_max(slope)), slope)
+    roundoff = 100 * jnp.finfo(change.dtype).eps * jacobian.scale(fastest)
+    change = jnp.where(jnp.abs(change) <= roundoff, 0, change)
+    terms = jacobian.scale(slope) + jnp.abs(in_time) + jnp.abs(rate)
+    return unflatten(relative(change, terms), values)
+
+
+def _relative_sizes(
+    entry: AbstractConserved, t: Float[Array, ""], y: Any, f: Any, args: Args
+) -> tuple[Array, Array]:
+    f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, y)
+    values = conserved_values(entry, t, y, args)
+    defect = largest(_change_along(entry, values, t, y, args, f))
+    residual, scale = measure(entry, values, t, y, args)
     # An integral that is not finite at `y` counts as not conserved, although its derivative may
     # vanish.
-    along_flow = [
-        jnp.where(jnp.isfinite(x), dx, jnp.nan) for x, dx in zip(value, along_flow, strict=True)
-    ]
-    return _largest_ratio(along_flow, speeds), _largest_ratio(residual, sizes)
-
-
-def _term_sizes(rows: Any, x: Any) -> Float[Array, " elements"]:
-    """`Σ_j |rows_ij x_j|`, for each element i."""
-    terms = jtu.tree_map(lambda a, b: jnp.abs(a * b).reshape(a.shape[0], -1).sum(1), rows, x)
-    return sum(jtu.tree_leaves(terms))  # pyright: ignore[reportReturnType]
-
-
-def _largest_ratio(numerators: list[Array], denominators: list[Array]) -> Float[Array, ""]:
-    a, b = jnp.abs(jnp.concatenate(numerators)), jnp.concatenate(denominators)
-    return jnp.max(a / jnp.where(b == 0, 1, b))  # 0 / 0 counts as 0; NaN stays NaN
+    defect = jnp.where(tree_all_finite(residual), defect, jnp.nan)
+    violation = largest(relative(residual, scale))
+    return defect, violation if isinstance(entry, Constraint) else jnp.zeros_like(violation)
 
 
 def _verdict(

@@ -136,6 +136,10 @@ class Equations(eqx.Module):
         """`M⁻¹ Gᵀ λ`."""
         return tree_mul(jacobian.pullback(multiplier), self.weights)
 
+    def as_vector(self, x: Array) -> Vector:
+        """`x` in the form of the residual, one array or a tuple of scalars."""
+        return tuple(x) if isinstance(self.residual, Elements) else x
+
     def scale(self, jacobian: AbstractJacobian, y: Y) -> Vector:
         """The scale of the residual at `y`, to which its roundoff is proportional; `jacobian` is
         that at `y`."""

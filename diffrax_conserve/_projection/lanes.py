@@ -34,7 +34,7 @@ def continue_if_any(
     state: _State,
     operands: Any,
     *,
-    crowd: Callable[[_State, Any], tuple[Bool[Array, ""], _State]],
+    crowd: Callable[[_State, Any], tuple[Bool[Array, ""], Bool[Array, ""], _State]],
     rounds: int,
 ) -> _State:
     """`fn(flag, state, operands)` if `flag` is set, otherwise `state`.
@@ -44,16 +44,16 @@ def continue_if_any(
     for a lane whose flag is not set is not used. `fn` must not close over arrays.
 
     Many lanes are not gathered, which would cost more than it saves. Instead, while many are
-    flagged, and at most `rounds` times, all lanes compute `crowd(state, operands)`, which returns
-    whether a lane remains flagged, and its next state. That of a lane which is not flagged is not
-    used.
+    flagged, and at most `rounds` times, all lanes compute `crowd(state, operands)`: whether a lane
+    is done, whether it should try no more, and its next state. Lanes that are not done in the end
+    are gathered, with their first state, so that they do not depend on the others.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
     def lane(flag: Array, state: _State, arrays: Any) -> _State:
         return fn(flag, state, eqx.combine(arrays, static))
 
-    def together(state: _State, arrays: Any) -> tuple[Array, _State]:
+    def together(state: _State, arrays: Any) -> tuple[Array, Array, _State]:
         return crowd(state, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
@@ -153,21 +153,26 @@ def _iterate_together(
     batch: Any,
     shared: Any,
 ) -> tuple[Bool[Array, " lanes"], Any]:
-    def body(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
-        index, flags, states = carry
-        remain, new = jax.vmap(lambda s, b: crowd(s, eqx.combine(b, shared)))(states, batch)
+    def body(carry: tuple[Array, Array, Array, Any]) -> tuple[Array, Array, Array, Any]:
+        index, trying, done, last = carry
+        finished, lost, new = jax.vmap(lambda s, b: crowd(s, eqx.combine(b, shared)))(last, batch)
+        done = done | (trying & finished)
+        return index + 1, trying & ~finished & ~lost, done, _choose(trying, new, last)
 
-        def choose(a: Array, b: Array) -> Array:
-            return jnp.where(flags.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    def crowded(carry: tuple[Array, Array, Array, Any]) -> Array:
+        index, trying, _, _ = carry
+        return (index < rounds) & (jnp.sum(trying) * _CROWD > trying.size)
 
-        return index + 1, flags & remain, jtu.tree_map(choose, new, states)
+    carry = jnp.asarray(0), flags, jnp.zeros_like(flags), states
+    _, _, done, last = lax.while_loop(crowded, body, carry)
+    return flags & ~done, _choose(done, last, states)
 
-    def crowded(carry: tuple[Array, Array, Any]) -> Array:
-        index, flags, _ = carry
-        return (index < rounds) & (jnp.sum(flags) * _CROWD > flags.size)
 
-    _, flags, states = lax.while_loop(crowded, body, (jnp.asarray(0), flags, states))
-    return flags, states
+def _choose(flags: Bool[Array, " lanes"], a: Any, b: Any) -> Any:
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(flags.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jtu.tree_map(choose, a, b)
 
 
 def _positions(flags: Bool[Array, " length"], size: int) -> Int[Array, " size"]:

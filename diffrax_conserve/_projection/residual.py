@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Real
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate
-from .._tree import from_view, real_view, tree_max, unflatten, working_dtype
+from .._tree import from_view, real_view, unflatten, working_dtype
 from .elimination import Vector
 from .linearise import Joined, linearise
 
@@ -47,26 +47,14 @@ def residual_of(
 
 
 def measure(
-    manifold: Manifold,
-    values: Values,
-    t: RealScalarLike,
-    y: Y,
-    args: Args,
-    *,
-    uniform: bool = False,
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Values, Values]:
-    """The residuals at `y` and their scales there, both shaped like `values`.
-
-    With `uniform`, the scales are those of a state whose components are all as large as the largest
-    of `y`, so that a constraint on a component that is zero up to roundoff has a meaningful scale.
-    """
+    """The residuals at `y` and their scales there, both shaped like `values`."""
     residual, magnitude = residual_of(manifold, values, t, y, args)
     view = real_view(y)
     g, jacobian = linearise(residual, view)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-    largest = tree_max(y)
-    sizes = jtu.tree_map(lambda x: jnp.full_like(x, largest), view) if uniform else view
-    return unflatten(g, like), unflatten(magnitude + jacobian.scale(sizes), like)
+    return unflatten(g, like), unflatten(magnitude + jacobian.scale(view), like)
 
 
 def relative(residual: PyTree[Array], scale: PyTree[Array]) -> PyTree[Array]:

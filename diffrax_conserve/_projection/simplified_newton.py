@@ -38,8 +38,8 @@ from .implicit import differentiated
 from .iteration import Start, iterate
 from .jacobian import AbstractJacobian
 from .lanes import continue_if_any
-from .linearise import Converted, Elements, Joined, as_array, flattened, linearise, written_out
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
+from .linearise import Converted, Joined, as_array, flattened, linearise, written_out
+from .residual import ROUNDOFF_MULTIPLE, Tolerance, largest, relative, within
 
 
 @final
@@ -122,6 +122,8 @@ _State = tuple[Y, Vector, Int[Array, ""], Outcome]
 # are then 1.6 to 7 times as fast (rigid bodies, a busy machine), but compile time grows with this
 # number.
 _RARE_SCALARS_MAX = 64
+# Iterations converge if each reduces the largest relative residual to this fraction.
+_NEAR = 0.05
 # The number of starts between the candidate and the anchor that are tried.
 _STARTS = 8
 
@@ -134,7 +136,7 @@ def _project(
     before, jacobian = at_candidate = linearise(inline.residual, inline.candidate)
     count = min(jacobian.inline_steps, max_steps)
     start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
-    y, multiplier, done = _iterations(inline, at_candidate, start, at_candidate, count)
+    y, multiplier, _, done = _iterations(inline, at_candidate, start, at_candidate, count)
     # The few steps that need more iterations linearise again: sharing the values known here would
     # write them to memory at every step of the solve.
     state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
@@ -157,8 +159,9 @@ def _iterations(
     start: tuple[Y, Vector],
     at_start: _Linearised,
     count: int,
-) -> tuple[Y, Vector, Bool[Array, ""]]:
-    """`count` iterations with the Gram matrix at the start, and whether they are enough."""
+) -> tuple[Y, Vector, tuple[Vector, Vector], Bool[Array, ""]]:
+    """`count` iterations with the Gram matrix at the start, with the residual that they end with
+    and its scale, and whether they are enough."""
     (before, base), (g, jacobian) = at_candidate, at_start
     gram_solver = equations.gram_solver(jacobian, None if jacobian is base else base)
     y, multiplier = start
@@ -178,21 +181,23 @@ def _iterations(
         jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
     )
     close = within(last, tree_scale(roundoff ** (-2 / 3), small))
-    return y, multiplier, close & equations.safely_satisfied(g, scale)
+    return y, multiplier, (g, scale), close & equations.safely_satisfied(g, scale)
 
 
 def _once_more(
     state: _State, operands: tuple[Equations, Y | None]
-) -> tuple[Bool[Array, ""], _State]:
-    """One more iteration from `state`, and whether that is not enough."""
+) -> tuple[Bool[Array, ""], Bool[Array, ""], _State]:
+    """One more iteration from `state`, whether that is enough, and whether the iterations may not
+    converge to the same point as those of `iterate`, which are damped."""
     y, multiplier, count, outcome = state
     equations, split, join = _converted(operands[0])
-    if isinstance(equations.magnitude, tuple):
-        multiplier = tuple(multiplier)
-    start = split(y), multiplier
+    start = split(y), equations.as_vector(multiplier)
     candidate, here = (linearise(equations.residual, x) for x in (equations.candidate, start[0]))
-    y, multiplier, done = _iterations(equations, candidate, start, here, 1)
-    return ~done, (join(y), as_array(multiplier), count + 1, outcome)
+    y, multiplier, (g, scale), done = _iterations(equations, candidate, start, here, 1)
+    before, last, now = (largest(relative(x, scale)) for x in (candidate[0], here[0], g))
+    converges = (last <= _NEAR * before) & (done | (now <= _NEAR * last))
+    state = join(y), as_array(multiplier), count + 1, outcome
+    return done & converges, ~converges, state
 
 
 def _converted(
@@ -202,10 +207,10 @@ def _converted(
     assert isinstance(equations.residual, Joined)
     residual, split, join = convert(equations.residual, equations.candidate)
     candidate, weights = split(equations.candidate), split(equations.weights)
-    magnitude = equations.magnitude
-    magnitude = tuple(magnitude) if isinstance(residual, Elements) else magnitude
-    changes = dict(residual=residual, candidate=candidate, weights=weights, magnitude=magnitude)
-    return dataclasses.replace(equations, **changes), split, join
+    changes = dict(residual=residual, candidate=candidate, weights=weights)
+    converted = dataclasses.replace(equations, **changes)
+    magnitude = converted.as_vector(as_array(equations.magnitude))
+    return dataclasses.replace(converted, magnitude=magnitude), split, join
 
 
 def _finish(
@@ -226,13 +231,11 @@ def _finish(
         convert = written_out if products <= _RARE_SCALARS_MAX else flattened
         equations, split, join = _converted(equations, convert)
         y, multiplier, count = start
-        if isinstance(equations.magnitude, tuple):
-            multiplier = tuple(multiplier)
         before, last = iterate(
             equations,
             frozen=True,
             max_steps=max_steps,
-            start=Start(split(y), multiplier, count),
+            start=Start(split(y), equations.as_vector(multiplier), count),
             enabled=enabled,
         )
         outcome = Outcome.of(before, last.g, last.scale, equations.tolerance)

@@ -255,7 +255,7 @@ def test_args_may_differ_in_a_batch():
         np.testing.assert_allclose(batch[i], one, rtol=1e-12)
 
 
-def test_the_slope_is_compared_for_the_args_of_the_solve():
+def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
     solve(family(1), ARGS, check_field=True)
     other = dfx.ODETerm(lambda t, y, args: 1.2 * spring(t, y, args))
     solver = dfc.DeepONetSolver(family(1))

@@ -45,7 +45,7 @@ def test_dense_output_is_projected_by_it():
     np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 25.0, rtol=4e-16)
 
 
-def test_a_wrong_formula_fails():
+def test_a_wrong_formula_fails(errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is still not satisfied"):
         run(dfc.ClosedForm(lambda t, y, args, values: 1.01 * y), jnp.array([3.0, 4.0]), 1.0)
 

@@ -166,6 +166,7 @@ def is_wrong(y, factor, offset):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @given(y=STATES, offset=st.floats(-1e10, 1e10))
 @example(y=np.zeros(3), offset=0.0)
+@example(y=np.full(3, np.finfo(np.float32).tiny), offset=0.0)
 def test_a_right_jacobian_is_never_refused(dtype, y, offset):
     """Roundoff of a large constant is no difference."""
     assert not is_wrong(*(jnp.asarray(x, dtype) for x in (y, 1.0, offset)))

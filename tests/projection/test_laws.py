@@ -140,13 +140,22 @@ def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
     b=np.array([0.0, 2.0]),
     weights=np.array([0.0, 0.0, 1.0, 1.0]),
 )
+@example(
+    y=np.array([0.0, 1.0, 0.0, 0.0]),
+    matrix=np.array([[1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.0, 0.0]]),
+    b=np.zeros(2),
+    weights=np.array([0.0, 1.0, 0.0, 0.0]),
+)
 def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weights):
     assume(np.linalg.cond(matrix) < 1e3 and np.linalg.norm(matrix) > 0.1)
     metric = np.exp(weights)
     root = np.sqrt(metric)
     expected = y + np.linalg.lstsq(matrix / root, b - matrix @ y, rcond=None)[0] / root
     for kind in (dfc.SimplifiedNewton, dfc.Newton):
-        projected, info = project(PLANE, y, kind(metric=metric, rtol=1e-14), None, args=(matrix, b))
+        # Where all components of the solution are zero, each step gains sixteen digits, and it
+        # takes some twenty until they are zero.
+        projection = kind(metric=metric, rtol=1e-14, max_steps=50)
+        projected, info = project(PLANE, y, projection, None, args=(matrix, b))
         assert successful(info)
         np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
 
@@ -220,12 +229,13 @@ def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
         values = np.asarray(jax.vmap(entry.fn, (None, 0, None))(0, batched, None))
         error = np.abs(values - VALUES[name])[succeeds]
         assert np.all(error <= 64 * EPS * np.maximum(VALUES[name], values[succeeds]))
-    # From far away, an iteration with damping may arrive where one without does not.
-    near = np.flatnonzero(size < 0.05)
-    for i in rng.permutation(near)[:40]:
+    for i in rng.permutation(lanes)[:40]:
         alone, alone_info = project(RIGID_BODY, ys[i], dfc.SimplifiedNewton())
-        assert succeeds[i] == successful(alone_info) == bool(np.all(np.isfinite(ys[i])))
-        np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
+        assert succeeds[i] == successful(alone_info)
+        if size[i] < 0.05:
+            assert succeeds[i] == np.all(np.isfinite(ys[i]))
+        if succeeds[i]:
+            np.testing.assert_allclose(batched[i], alone, rtol=1e-14, atol=1e-14)
 
 
 @one_projection

@@ -81,7 +81,9 @@ def compiled(case: str, solver: str, newton: bool, endless: bool, beside: bool) 
     def both(y0: Any, args: Any, rtol: Any) -> Any:
         bad = solve(manifold, T1, y0, args, rtol)
         before = solve({"good": good}, args[0], y0, args, rtol)
-        return bad.result, bad.stats["num_steps"], before.stats["num_steps"], bad.ys[-1]
+        steps = bad.stats["num_steps"], before.stats["num_steps"]
+        # Without an end there is nothing to compare with.
+        return bad.result, *steps, dfx.is_okay(before.result), bad.ys[-1]
 
     return eqx.filter_jit(eqx.filter_vmap(both))
 
@@ -97,14 +99,14 @@ def run(seed: int, number: int, lanes: int) -> Tally:
     args = rng.uniform(0.5, 4, (lanes, 1))
     rtol = log_uniform(rng, 1e-8, 1e-3, lanes)
     solve = compiled(case, solver, bool(newton), bool(endless), beside)
-    result, steps, before, y = solve(*map(jnp.asarray, (y0, args, rtol)))
-    steps, before, y = map(np.asarray, (steps, before, y))
+    result, *rest = solve(*map(jnp.asarray, (y0, args, rtol)))
+    steps, before, ended, y = map(np.asarray, rest)
     okay = np.asarray(result == dfx.RESULTS.successful)
     messages = [dfx.RESULTS[jax.tree.map(lambda x, i=i: x[i], result)] for i in range(lanes)]
     unnamed = (
         np.array([not blames(m, manifold_of(case, beside), "alpha") for m in messages]) & ~okay
     )
-    allowed = np.where(case in AT_START, 0, before) + MORE
+    allowed = np.where(case in AT_START, 0, np.where(ended, before, np.inf)) + MORE
     if case == "runs away":
         # What is taken away reaches -1 at the latest 0.5 after; at the same pace of steps.
         allowed = allowed + np.ceil(before * 0.5 / args[:, 0])

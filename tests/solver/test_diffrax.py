@@ -211,7 +211,7 @@ def unreachable(t, y, args):
     return jnp.sum(y**2) + jnp.where(t > 0.5, 2.0, 0.0)
 
 
-def test_failure_with_fixed_steps_is_reported():
+def test_failure_with_fixed_steps_is_reported(errors_raise):
     solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(unreachable))
     with pytest.raises(eqx.EquinoxRuntimeError):
         solve(rotation, solver, jnp.array([1.0, 0.0]))

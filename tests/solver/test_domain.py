@@ -185,7 +185,7 @@ def test_rejected_steps_do_not_count():
     ("y0", "t0", "time"),
     [(EAST, -20.0, -18.0), pytest.param(-EAST, 0.0, 0.0, marks=pytest.mark.slow)],
 )
-def test_leaving_the_domain_fails_at_a_time(y0, t0, time):
+def test_leaving_the_domain_fails_at_a_time(y0, t0, time, errors_raise):
     solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
     sol = solve(solver, y0, t0=t0, t1=t0 + 5.0, throw=False, saveat=STATE)
     assert "a step starts outside the domain" in message(sol)

@@ -38,7 +38,7 @@ OUT_OF_REACH = {"square": dfc.FirstIntegral(square), "jump": dfc.FirstIntegral(o
 
 
 @pytest.mark.parametrize("solver", [dfc.RK4(), pytest.param(dfx.Tsit5(), marks=pytest.mark.slow)])
-def test_the_error_of_fixed_steps_names_the_constraint_and_a_remedy(solver):
+def test_the_error_of_fixed_steps_names_the_constraint_and_a_remedy(solver, errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match="entry 0 of the manifold") as e:
         run(OUT_OF_REACH, solver)
     assert dfc.entry_name(OUT_OF_REACH, 0) == "manifold['jump']"
@@ -67,7 +67,7 @@ def test_each_lane_of_a_batch_has_its_own_result():
     assert "not finite" in dfx.RESULTS[third]
 
 
-def test_a_state_that_is_not_finite_is_called_that():
+def test_a_state_that_is_not_finite_is_called_that(errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is not finite"):
         run(
             dfc.FirstIntegral(square),
@@ -75,7 +75,7 @@ def test_a_state_that_is_not_finite_is_called_that():
         )
 
 
-def test_an_inaccurate_function_is_told_about_the_tolerance():
+def test_an_inaccurate_function_is_told_about_the_tolerance(errors_raise):
     def noisy(t, y, args):
         return jnp.sum(y**2) + jax.lax.stop_gradient(1e-12 * jnp.sin(1e15 * y[0]))
 
@@ -89,7 +89,7 @@ def test_an_inaccurate_function_is_told_about_the_tolerance():
     assert sol.result == dfx.RESULTS.successful
 
 
-def test_contradicting_constraints_name_one_of_them():
+def test_contradicting_constraints_name_one_of_them(errors_raise):
     manifold = (
         dfc.FirstIntegral(square, value=1.0),
         dfc.FirstIntegral(square, value=1.1),
@@ -98,7 +98,7 @@ def test_contradicting_constraints_name_one_of_them():
         run(manifold)
 
 
-def test_many_entries_are_not_named_one_by_one():
+def test_many_entries_are_not_named_one_by_one(errors_raise):
     manifold = [
         dfc.FirstIntegral(lambda t, y, args, k=k: out_of_reach(t, y[k], args)) for k in range(18)
     ]
@@ -147,6 +147,55 @@ def test_what_cannot_start_ends_at_once(manifold, message):
 def test_what_a_vector_field_does_not_conserve_is_kept_on_demand():
     sol = run(dfc.FirstIntegral(lambda t, y, args: y[1]), max_correction=jnp.inf)
     assert np.all(sol.ys[:, 1] == 0)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        lambda q, p: -0.1 * p,
+        lambda q, p: -(p**3),
+        lambda q, p: (1 - q**2) * p,
+        lambda q, p: q - jnp.sin(q),
+    ],
+    ids=["friction", "cubic-friction", "van-der-pol", "pendulum"],
+)
+def test_an_energy_with_a_source_is_found_from_rest(source):
+    """Where the first derivatives of the energy vanish."""
+
+    def vector_field(t, y, args):
+        return rotation(t, y, args) + jnp.array([0.0, source(*y)])
+
+    sol = run(dfc.FirstIntegral(square), vector_field=vector_field, throw=False)
+    assert "is not a first integral" in dfx.RESULTS[sol.result]
+
+
+def cancelling(t, y, args):
+    """Two bodies in one dimension, whose forces cancel up to roundoff, and what they add up to."""
+    q, p = y[:2], y[2:4]
+    force = jnp.sin(3 * (q[0] - q[1])) * jnp.array([1.0, 0.1 + 0.2])
+    return jnp.array([p[0], p[1], force[0], -force[1], force[1] - 0.3 * force[0]])
+
+
+def attracted(t, y, args):
+    """A rotation about the third axis, with an attraction to the unit sphere."""
+    return jnp.cross(jnp.array([0.0, 0.0, 1.0]), y) - args * (jnp.sum(y**2) - 1) * y
+
+
+@pytest.mark.parametrize(
+    ("vector_field", "y0", "args", "component"),
+    [
+        (cancelling, [0.3, -0.4, 0.1, 0.2, 0.5], None, 4),
+        (attracted, [0.6, 0.0, 0.8], 1e-12, 2),
+        (attracted, [0.6, 0.0, 0.8], 10.0, 2),
+    ],
+    ids=["forces-cancel", "weak", "strong"],
+)
+def test_a_derivative_that_is_roundoff_or_vanishes_on_a_level_set_may_start(
+    vector_field, y0, args, component
+):
+    kept = dfc.FirstIntegral(lambda t, y, args: y[component])
+    sol = run(kept, y0=jnp.array(y0), vector_field=vector_field, args=args, throw=False)
+    assert sol.result == dfx.RESULTS.successful
 
 
 TIMES = {"t0": 2.0, "t1": 1.0, "dt0": -0.1}

@@ -251,7 +251,7 @@ def test_backsolve_adjoint_explains(solver):
     "layer",
     [None, pytest.param(dfc.learned.ConservativeLayer(LORENZ.manifold), marks=pytest.mark.slow)],
 )
-def test_random_networks_are_on_the_manifold_or_fail(layer):
+def test_random_networks_are_on_the_manifold_or_fail(layer, errors_raise):
     """Whatever the quality of the network: at steps and between them."""
 
     @eqx.filter_jit
@@ -306,7 +306,7 @@ TRANSFORMS = {
     ],
     ids=TRANSFORMS,
 )
-def test_a_step_that_is_too_long(transform):
+def test_a_step_that_is_too_long(transform, errors_raise):
     """Whether the length is known to the compiler or not."""
 
     def run(dt0):
@@ -317,13 +317,13 @@ def test_a_step_that_is_too_long(transform):
     assert "a step is longer than the flow map was trained for" in message
 
 
-def test_a_solve_backwards_in_time():
+def test_a_solve_backwards_in_time(errors_raise):
     message = refusal(lambda: solve(FLOW, t1=-1.0, dt0=-0.125).ys)
     assert "backwards in time" in message
     assert "from 0 to 0.25" in message
 
 
-def test_a_largest_step_that_is_an_array():
+def test_a_largest_step_that_is_an_array(errors_raise):
     class Still(eqx.Module):
         max_step: jax.Array
 
@@ -335,13 +335,13 @@ def test_a_largest_step_that_is_an_array():
     np.testing.assert_array_equal(solve(still).ys[0], LORENZ.y0)
 
 
-def test_a_pinn_from_another_initial_state():
+def test_a_pinn_from_another_initial_state(errors_raise):
     message = refusal(lambda: solve(FOLLOW, LORENZ.y0 + jnp.array([0, 0.125, 0])).ys)
     assert "`y0` is not the state that the PINN has" in message
 
 
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 3.0), (0.0, -1.0)])
-def test_a_pinn_outside_its_interval(t0, t1):
+def test_a_pinn_outside_its_interval(t0, t1, errors_raise):
     message = refusal(lambda: solve(FOLLOW, t0=t0, t1=t1, dt0=float(np.sign(t1))).ys)
     assert "from 0 to 2 " in message
 
@@ -365,7 +365,7 @@ def test_arguments_that_are_refused():
         dfx.diffeqsolve(term, FOLLOW, 0.0, 1.0, 0.25, (LORENZ.y0, LORENZ.y0))
 
 
-def test_a_pinn_has_no_error_estimate_for_adaptive_steps():
+def test_a_pinn_has_no_error_estimate_for_adaptive_steps(errors_raise):
     controller = dfx.PIDController(rtol=1e-3, atol=1e-3)
     with pytest.raises(RuntimeError, match="error"):
         solve(FOLLOW, stepsize_controller=controller)

@@ -194,7 +194,7 @@ def explode(t, y, args):
     return y**2
 
 
-def test_fixed_steps_that_are_too_long_fail_and_say_so():
+def test_fixed_steps_that_are_too_long_fail_and_say_so(errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match="Take smaller steps"):
         solve(explode, jnp.ones(1), 2.0, dt0=2.0)
     sol = solve(explode, jnp.ones(1), 2.0, dt0=2.0, throw=False)

@@ -39,7 +39,7 @@ OTHER = dfc.systems.ConservativeLorenz(sigma=1.01)
 SOLVER = dfc.DeepONetSolver(TAYLOR)
 
 
-def test_another_parameter_is_refused_with_both_numbers():
+def test_another_parameter_is_refused_with_both_numbers(errors_raise):
     end(SOLVER, LORENZ, LORENZ.y0)
     with pytest.raises(RuntimeError, match=numbers(OTHER, LORENZ.y0)):
         end(SOLVER, OTHER, LORENZ.y0)
@@ -47,7 +47,7 @@ def test_another_parameter_is_refused_with_both_numbers():
     np.testing.assert_array_equal(end(off, OTHER, LORENZ.y0), end(SOLVER, LORENZ, LORENZ.y0))
 
 
-def test_one_lane_of_a_batch_is_enough():
+def test_one_lane_of_a_batch_is_enough(errors_raise):
     y0s = states(4)
     batch = jax.vmap(lambda y0, sigma: end(SOLVER, dataclasses.replace(LORENZ, sigma=sigma), y0))
     batch(y0s, jnp.ones(4))
@@ -91,7 +91,7 @@ def test_the_zoo_is_for_its_own_systems(name):
         jax.block_until_ready(jax.vmap(lambda y0, s=solver: end(s, system, y0))(y0s))
 
 
-def test_a_learned_slope_is_refused_where_it_is_nothing_like_the_field():
+def test_a_learned_slope_is_refused_where_it_is_nothing_like_the_field(errors_raise):
     solver = dfc.DeepONetSolver(dfc.load_pretrained("double-pendulum-standard"))
     end(solver, dfc.systems.DoublePendulum(), dfc.systems.DoublePendulum().y0)
     with pytest.raises(RuntimeError, match="not trained for this vector field"):

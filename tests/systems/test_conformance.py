@@ -258,6 +258,6 @@ def test_reference_times_must_be_a_list_of_times(ts):
 
 
 @pytest.mark.parametrize("ts", [[-1.0, 0.0], [1.0, 0.5]])
-def test_reference_times_must_not_decrease(ts):
+def test_reference_times_must_not_decrease(ts, errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match="non-decreasing"):
         systems.HarmonicOscillator().reference(jnp.asarray(ts))

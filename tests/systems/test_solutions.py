@@ -109,7 +109,7 @@ def test_half_a_kepler_period_leads_from_perihelion_to_aphelion(e):
     np.testing.assert_allclose(p1[0], [0.0, -p * (1 - e) / (1 + e)], atol=1e-12)
 
 
-def test_an_unbound_kepler_orbit_is_refused():
+def test_an_unbound_kepler_orbit_is_refused(errors_raise):
     y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 3.0]))
     with pytest.raises(eqx.EquinoxRuntimeError, match="bound orbits"):
         systems.Kepler().reference([1.0], y0)
