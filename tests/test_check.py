@@ -228,3 +228,17 @@ def test_one_state_is_no_batch():
 def test_a_bare_function_is_refused():
     with pytest.raises(TypeError, match="FirstIntegral"):
         check_invariance(lambda t, y, a: y, lambda t, y, a: y, jnp.ones(4))
+
+
+def test_forces_that_cancel_up_to_roundoff_conserve():
+    """Their sum is all roundoff, which is of its own size."""
+
+    def vector_field(t, y, args):
+        force = jnp.sin(3 * (y[0] - y[1])) * jnp.array([1.0, 0.1 + 0.2])
+        return jnp.array([y[2], 0.0, force[1] - 0.3 * force[0]])
+
+    ys = jr.normal(jr.key(0), (100, 3))
+    assert np.any(jax.vmap(lambda y: vector_field(0.0, y, None)[2])(ys) != 0)
+    assert check_invariance(vector_field, dfc.FirstIntegral(lambda t, y, args: y[2]), ys).ok
+    moving = dfc.FirstIntegral(lambda t, y, args: y[1] + y[0])
+    assert not check_invariance(vector_field, moving, ys).ok

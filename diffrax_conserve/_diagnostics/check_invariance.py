@@ -223,8 +223,8 @@ def _change_along(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args, slope: Y
 ) -> Values:
     """The derivative of each residual by time along `slope`, less its rate, relative to the sum of
-    the moduli of its terms. What may be roundoff of a slope in which larger terms cancel counts as
-    zero."""
+    the moduli of its terms. What may be roundoff of a slope in which larger terms cancel is
+    relative to those of the largest component of the slope."""
     t, view, slope = jnp.asarray(t, working_dtype(y)), real_view(y), real_view(slope)
     fn, _ = residual_of(manifold, values, t, y, args)
     _, jacobian = linearise(fn, view)
@@ -236,10 +236,11 @@ def _change_along(
     (_, rate), (in_time, _) = jax.jvp(at_time, (t,), (jnp.ones_like(t),))
     rate = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(rate)])
     change = jacobian.pushforward(slope) + in_time - rate
-    fastest = jtu.tree_map(lambda x: jnp.full_like(x, tree_max(slope)), slope)
-    roundoff = 100 * jnp.finfo(change.dtype).eps * jacobian.scale(fastest)
-    change = jnp.where(jnp.abs(change) <= roundoff, 0, change)
     terms = jacobian.scale(slope) + jnp.abs(in_time) + jnp.abs(rate)
+    fastest = jtu.tree_map(lambda x: jnp.full_like(x, tree_max(slope)), slope)
+    most = jacobian.scale(fastest)
+    roundoff = 100 * jnp.finfo(change.dtype).eps * most
+    terms = jnp.where(jnp.abs(change) <= roundoff, jnp.maximum(terms, most), terms)
     return unflatten(relative(change, terms), values)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
@@ -35,7 +35,7 @@ def change_along(
     y: Y,
     args: Args,
     step: RealScalarLike,
-) -> tuple[Array, Array, Y]:
+) -> tuple[Array, Array, PyTree[Array]]:
     """The change of every residual along a short trajectory from `y`, less what its rate adds; the
     estimated error of this change; and how far each component of the `real_view` of `y` moves.
 
