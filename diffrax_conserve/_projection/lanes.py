@@ -11,7 +11,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, Int8
 
 _State = TypeVar("_State")
 
@@ -26,6 +26,9 @@ _LEAST_WIDTH = 64
 # such iterations.
 _CROWD = 64
 _MOST_ROUNDS = 8
+# The status of a lane that iterates with the others. One number, because XLA computes an iteration
+# again for each of its outputs.
+DONE, TRYING, LOST = range(3)
 
 
 def continue_if_any(
@@ -34,7 +37,7 @@ def continue_if_any(
     state: _State,
     operands: Any,
     *,
-    crowd: Callable[[_State, Any], tuple[Bool[Array, ""], Bool[Array, ""], _State]],
+    crowd: Callable[[_State, Any], tuple[Int8[Array, ""], _State]],
     rounds: int,
 ) -> _State:
     """`fn(flag, state, operands)` if `flag` is set, otherwise `state`.
@@ -45,15 +48,15 @@ def continue_if_any(
 
     Many lanes are not gathered, which would cost more than it saves. Instead, while many are
     flagged, and at most `rounds` times, all lanes compute `crowd(state, operands)`: whether a lane
-    is done, whether it should try no more, and its next state. Lanes that are not done in the end
-    are gathered, with their first state, so that they do not depend on the others.
+    is `DONE`, `TRYING` or `LOST`, and its next state. Lanes that are not done in the end are
+    gathered, with their first state, so that they do not depend on the others.
     """
     arrays, static = eqx.partition(operands, eqx.is_array)
 
     def lane(flag: Array, state: _State, arrays: Any) -> _State:
         return fn(flag, state, eqx.combine(arrays, static))
 
-    def together(state: _State, arrays: Any) -> tuple[Array, Array, _State]:
+    def together(state: _State, arrays: Any) -> tuple[Array, _State]:
         return crowd(state, eqx.combine(arrays, static))
 
     @jax.custom_batching.custom_vmap
@@ -153,19 +156,19 @@ def _iterate_together(
     batch: Any,
     shared: Any,
 ) -> tuple[Bool[Array, " lanes"], Any]:
-    def body(carry: tuple[Array, Array, Array, Any]) -> tuple[Array, Array, Array, Any]:
-        index, trying, done, last = carry
-        finished, lost, new = jax.vmap(lambda s, b: crowd(s, eqx.combine(b, shared)))(last, batch)
-        done = done | (trying & finished)
-        return index + 1, trying & ~finished & ~lost, done, _choose(trying, new, last)
+    def body(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
+        index, status, last = carry
+        new_status, new = jax.vmap(lambda s, b: crowd(s, eqx.combine(b, shared)))(last, batch)
+        trying = status == TRYING
+        return index + 1, jnp.where(trying, new_status, status), _choose(trying, new, last)
 
-    def crowded(carry: tuple[Array, Array, Array, Any]) -> Array:
-        index, trying, _, _ = carry
-        return (index < rounds) & (jnp.sum(trying) * _CROWD > trying.size)
+    def crowded(carry: tuple[Array, Array, Any]) -> Array:
+        index, status, _ = carry
+        return (index < rounds) & (jnp.sum(status == TRYING) * _CROWD > status.size)
 
-    carry = jnp.asarray(0), flags, jnp.zeros_like(flags), states
-    _, _, done, last = lax.while_loop(crowded, body, carry)
-    return flags & ~done, _choose(done, last, states)
+    status = jnp.where(flags, TRYING, DONE).astype(jnp.int8)
+    _, status, last = lax.while_loop(crowded, body, (jnp.asarray(0), status, states))
+    return status != DONE, _choose(status == DONE, last, states)
 
 
 def _choose(flags: Bool[Array, " lanes"], a: Any, b: Any) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Int, Int8, PyTree
 
 from .._custom_types import Y
 from .._tree import (
@@ -37,7 +37,7 @@ from .equations import Equations, Outcome, ProjectionInfo
 from .implicit import differentiated
 from .iteration import Start, iterate
 from .jacobian import AbstractJacobian
-from .lanes import continue_if_any
+from .lanes import DONE, LOST, TRYING, continue_if_any
 from .linearise import Converted, Joined, as_array, flattened, linearise, written_out
 from .residual import ROUNDOFF_MULTIPLE, Tolerance, largest, relative, within
 
@@ -186,9 +186,9 @@ def _iterations(
 
 def _once_more(
     state: _State, operands: tuple[Equations, Y | None]
-) -> tuple[Bool[Array, ""], Bool[Array, ""], _State]:
-    """One more iteration from `state`, whether that is enough, and whether the iterations may not
-    converge to the same point as those of `iterate`, which are damped."""
+) -> tuple[Int8[Array, ""], _State]:
+    """One more iteration from `state`, and its status. It is lost if it may not converge to the
+    same point as those of `iterate`, which are damped."""
     y, multiplier, count, outcome = state
     equations, split, join = _converted(operands[0])
     start = split(y), equations.as_vector(multiplier)
@@ -197,7 +197,8 @@ def _once_more(
     before, last, now = (largest(relative(x, scale)) for x in (candidate[0], here[0], g))
     converges = (last <= _NEAR * before) & (done | (now <= _NEAR * last))
     state = join(y), as_array(multiplier), count + 1, outcome
-    return done & converges, ~converges, state
+    status = jnp.where(converges, jnp.where(done, DONE, TRYING), LOST)
+    return status.astype(jnp.int8), state
 
 
 def _converted(
