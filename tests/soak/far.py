@@ -52,7 +52,10 @@ def compiled(name: str, mode: str) -> Any:
         zero, half = jnp.zeros((), start.dtype), jnp.full((), 0.5, start.dtype)
         sol = dfx.diffeqsolve(
             dfx.ODETerm(lambda t, y, args: args[1]),
-            dfc.ManifoldProjection(dfx.Euler(), manifold, projection=projection),
+            # The field leads to the candidate, and conserves nothing.
+            dfc.ManifoldProjection(
+                dfx.Euler(), manifold, projection=projection, max_correction=jnp.inf
+            ),
             zero,
             half,
             half,
