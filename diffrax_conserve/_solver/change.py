@@ -35,9 +35,11 @@ def change_along(
     y: Y,
     args: Args,
     step: RealScalarLike,
+    before: Array,
 ) -> tuple[Array, Array, PyTree[Array]]:
-    """The change of every residual along a short trajectory from `y`, less what its rate adds; the
-    estimated error of this change; and how far each component of the `real_view` of `y` moves.
+    """The change of every residual, which is `before` at `y`, along a short trajectory from there,
+    less what its rate adds; the estimated error of this change; and how far each component of the
+    `real_view` of `y` moves.
 
     The trajectory has the direction of `step`. It takes two steps of a Runge-Kutta method, and the
     error is estimated by the result of one step over the same time. It does not depend on the
@@ -83,7 +85,6 @@ def change_along(
         now = tree_add(values, gained)
         return residual_of(manifold, now, t + h, y, args)[0](real_view(y))
 
-    before = residual_of(manifold, values, t, y, args)[0](real_view(y))
     coarse, fine = change(0) - before, change(2) - before
     ends = jtu.tree_map(lambda x: x[2], reached)
     moved = jtu.tree_map(jnp.abs, tree_sub(real_view(ends[0]), real_view(y)))

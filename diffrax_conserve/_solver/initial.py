@@ -71,7 +71,8 @@ def judge(
     scale = magnitude + jacobian.scale(uniform)
     changed = jnp.zeros_like(g)
     if vector_field is not None and any(isinstance(x, FirstIntegral) for x in entries):
-        change, error, moved = change_along(vector_field, manifold, values, t, y, args, step)
+        along = vector_field, manifold, values, t, y, args, step, g
+        change, error, moved = change_along(*along)
         terms = magnitude + jacobian.scale(jtu.tree_map(lambda x, d: jnp.abs(x) + d, view, moved))
         least = jnp.maximum(_CHANGE * terms, jnp.maximum(_SURE * error, limit * scale))
         # NaN tells nothing: `fn` need not be defined beside the initial state.

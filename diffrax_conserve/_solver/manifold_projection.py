@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._along import slope_like
 from .._balance import has_rates
 from .._custom_types import (
     VF,
@@ -27,14 +26,14 @@ from .._projection.base import AbstractProjection, check_projection, option
 from .._projection.project import check_metric, check_state, tangential
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
-from .._tree import tree_add, tree_norm, tree_sub, working_dtype
+from .._tree import tree_norm, tree_sub, working_dtype
 from .checks import check_direction, check_nested, innermost
 from .count_rejections import FAILED_PROJECTION
 from .failure import failure
 from .initial import FINE, Initial, judge
 from .state import State
 from .statistics import ProjectionStatistics
-from .terms import is_backsolve, is_ode, time_direction
+from .terms import is_backsolve, is_ode, slope_of, time_direction
 
 
 @final
@@ -285,13 +284,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         if self.max_correction is not None or not (is_ode(terms) and evaluated and exact):
             return None
 
-        def vector_field(t: RealScalarLike, y: Y) -> Y:
-            # The direction of a solve is in the controls of its terms.
-            slope = self.solver.func(terms, t * direction, y, args)
-            slope = ft.reduce(tree_add, slope) if isinstance(terms, dfx.MultiTerm) else slope
-            return slope_like(y, slope)
-
-        return vector_field
+        return ft.partial(slope_of, self.solver, terms, args, direction)
 
     def _error(self, error: Y | None, target: Target, t1: RealScalarLike, y1: Y) -> Y | None:
         if error is None or not self.project_error:
