@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 
 from ._along import Along
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
-from ._options import check_numbers, check_vector_field, dtype_of, is_real
+from ._options import check_function, check_numbers, check_vector_field, dtype_of, is_real
 from ._tree import tree_shapes
 from ._with_jacobian import WithJacobian
 
@@ -74,13 +74,10 @@ class FirstIntegral(AbstractConserved):
         )
 
     def __check_init__(self):
-        _check_callable(self)
-        if self.rate is not None and not callable(self.rate):
-            raise TypeError(
-                f"`rate` of a `FirstIntegral` is {self.rate!r}, which is not callable. Pass a "
-                "function `rate(t, y, args)`, the derivative of `fn` along the solution, or `None` "
-                "where that is zero."
-            )
+        _check_fn(self)
+        if self.rate is not None:
+            what = "the derivative of `fn` along the solution"
+            check_function("rate", "FirstIntegral", self.rate, "t, y, args", what)
 
     def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return self.fn(t, y, args) if self.value is None else self.value
@@ -120,7 +117,7 @@ class Constraint(AbstractConserved):
         self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
 
     def __check_init__(self):
-        _check_callable(self)
+        _check_fn(self)
 
     def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
         r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
@@ -176,14 +173,9 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-def _check_callable(entry: AbstractConserved) -> None:
+def _check_fn(entry: AbstractConserved) -> None:
     fn = entry.fn.fn if isinstance(entry.fn, WithJacobian) else entry.fn
-    if not callable(fn):
-        name = type(entry).__name__
-        raise TypeError(
-            f"`{name}(fn)` takes a callable `fn(t, y, args)`, but `fn` is {fn!r}. "
-            f"Write for example `{name}(lambda t, y, args: ...)`."
-        )
+    check_function("fn", type(entry).__name__, fn, "t, y, args", "real arrays")
 
 
 def is_entry(x: Any) -> bool:

@@ -1,5 +1,6 @@
 """Checks of the numbers and functions that a user passes."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -61,6 +62,23 @@ def check_count(name: str, value: Any) -> None:
         raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
     if value < 1:
         raise ValueError(f"`{name}` is {value}, but it must be at least 1.")
+
+
+def check_function(name: str, owner: str, fn: Any, takes: str, returns: str) -> None:
+    """Raises unless `fn` can be called with the arguments `takes`, such as `"t, y, args"`."""
+    remedy = f"Pass a function `{name}({takes})` that returns {returns}."
+    if not callable(fn):
+        raise TypeError(f"`{name}` of a `{owner}` is {fn!r}, which is not callable. {remedy}")
+    try:
+        signature = inspect.signature(fn)
+    except ValueError:  # as for some builtins
+        return
+    try:
+        signature.bind(*takes.split(", "))
+    except TypeError as error:
+        raise TypeError(
+            f"`{name}` of a `{owner}` has the parameters `{signature}`. {remedy}"
+        ) from error
 
 
 def check_vector_field(vector_field: Callable, example: str) -> None:

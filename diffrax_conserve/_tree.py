@@ -100,6 +100,13 @@ def tree_max(a: Y) -> Real[Array, ""]:
     )
 
 
+def tree_uniform(y: Y) -> Y:
+    """`y` with every component as large as the largest, which gives a term a size where a component
+    is zero."""
+    largest = tree_max(y)
+    return jtu.tree_map(lambda x: jnp.full_like(x, largest.astype(x.dtype)), y)
+
+
 def tree_all_finite(a: PyTree[Array]) -> Array:
     """Whether there is no NaN and no infinity in `a`."""
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ._custom_types import Args, ConstraintFn, RealScalarLike, Values, Y
+from ._options import check_function
 from ._tree import tree_add, tree_max, tree_tangents, working_dtype
 
 
@@ -21,12 +22,8 @@ class WithJacobian(eqx.Module):
     jacobian: Any  # a function like `fn`; checked below, with a remedy
 
     def __check_init__(self):
-        if not callable(self.jacobian):
-            raise TypeError(
-                f"`jacobian` is {self.jacobian!r}, which is not callable. Pass a function "
-                "`jacobian(t, y, args)` that returns the derivative of `fn` by the state, or "
-                "`None`."
-            )
+        what = "the derivative of `fn` by the state"
+        check_function("jacobian", "manifold's entry", self.jacobian, "t, y, args", what)
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         return _call((self.fn, self.jacobian, t, args), y)

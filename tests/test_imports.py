@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "_tree": _TYPES,
     "_along": _TREE,
     "_fast_cpu": set(),
-    "_with_jacobian": _TREE,
+    "_with_jacobian": _TREE | {"_options"},
     "_manifold": _ENTRIES,
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,

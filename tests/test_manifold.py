@@ -44,10 +44,22 @@ def test_bare_function():
 
 
 def test_not_callable():
-    with pytest.raises(TypeError, match=r"`fn` is 3\."):
+    with pytest.raises(TypeError, match=r"`fn` of a `FirstIntegral` is 3, .*`fn\(t, y, args\)`"):
         dfc.FirstIntegral(3)
-    with pytest.raises(TypeError, match=r"Constraint\(lambda"):
+    with pytest.raises(TypeError, match=r"`fn` of a `Constraint` is 'sphere'"):
         dfc.Constraint("sphere")
+
+
+def test_functions_of_other_parameters():
+    with pytest.raises(TypeError, match=r"parameters `\(y\)`.*`fn\(t, y, args\)`"):
+        dfc.FirstIntegral(lambda y: y[0])
+    with pytest.raises(TypeError, match=r"parameters `\(t, y\)`.*`rate\(t, y, args\)`"):
+        dfc.FirstIntegral(rotational_energy, rate=lambda t, y: y[0])
+    with pytest.raises(TypeError, match=r"`fn\(t, y, args, values\)`"):
+        dfc.ClosedForm(lambda t, y, args: y)
+    dfc.FirstIntegral(max)  # has no signature
+    dfc.FirstIntegral(jax.jit(rotational_energy))
+    dfc.Constraint(lambda *args, scale=1.0: scale * args[1][0])
 
 
 @pytest.mark.parametrize("empty", [(), [], {}, None])

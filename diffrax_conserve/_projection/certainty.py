@@ -2,18 +2,34 @@
 
 Where gradients of constraints are nearly parallel, multipliers are large and cancel, so that
 roundoff dominates their derivatives. Gradients that are parallel everywhere do no harm: such a
-constraint is redundant.
+constraint is redundant. A gradient that is zero up to roundoff, for example at an equilibrium, has
+no direction either; one that is exactly zero takes no part.
 """
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-from .._custom_types import Y
-from .._tree import tree_add, tree_max, tree_norm, tree_scale, tree_sub, working_dtype
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._tree import (
+    real_view,
+    tree_add,
+    tree_max,
+    tree_norm,
+    tree_scale,
+    tree_stop_gradient,
+    tree_sub,
+    tree_tangents,
+    tree_uniform,
+    working_dtype,
+)
 from .equations import Equations
 from .jacobian import AbstractJacobian
 from .linearise import linearise
+from .residual import residual_of
 
 # The relative distance to the state at which it is tested whether gradients are parallel
 # everywhere.
@@ -40,6 +56,38 @@ def certain(equations: Equations, y: Y, jacobian: AbstractJacobian) -> Float[Arr
     amplified = moved > _SHORT_CORRECTION * sines * tree_norm(y)
     doubtful = (sines <= eps ** (1 / 3)) | ((sines <= _SMALL_ANGLE) & amplified)
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, 1.0).astype(dtype)
+
+
+@eqx.filter_custom_jvp
+def if_certain(
+    x: PyTree[Array], manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> PyTree[Array]:
+    """`x`, with a derivative that is NaN if a gradient at `y` vanishes up to roundoff: then no
+    derivative of a projection to `y`, or of a solve from there, is well determined."""
+    return x
+
+
+@if_certain.def_jvp
+def _if_certain_jvp(primals: Any, tangents: Any) -> tuple[PyTree[Array], PyTree[Array]]:
+    x, *at = primals
+    factor = jnp.where(_gradient_vanishes(*tree_stop_gradient(at)), jnp.nan, 1)
+    return x, tree_scale(factor, tree_tangents(x, tangents[0]))
+
+
+def _gradient_vanishes(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> Bool[Array, ""]:
+    """Whether a gradient is zero at a state so close to `y` that the relative distance hardly
+    exceeds the roundoff of `y`, or what the roundoff of the conserved value lets it move."""
+    residual, magnitude = residual_of(manifold, values, t, y, args)
+    view = real_view(y)
+    offset = tree_sub(_beside(view), view)
+    uniform = tree_uniform(view)
+    gradient = linearise(residual, view)[1].scale(uniform)
+    _, change = linearise(lambda x: residual(tree_add(x, offset)) - residual(x), view)
+    curvature = change.scale(uniform) / _OFFSET
+    roundoff = float(jnp.finfo(gradient.dtype).eps) ** (2 / 3) * (magnitude + gradient)
+    return jnp.any((gradient > 0) & (gradient**2 <= roundoff * curvature))
 
 
 def _beside(y: Y) -> Y:

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._custom_types import RealScalarLike, Values, Y
+from .._options import check_function
 from .._tree import real_view
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
 
@@ -47,11 +48,7 @@ class ClosedForm(AbstractProjection):
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
-        if not callable(self.fn):
-            raise TypeError(
-                f"`fn` of a `ClosedForm` is {self.fn!r}, which is not callable. Pass a function "
-                "`fn(t, y, args, values)` that returns the projected state."
-            )
+        check_function("fn", "ClosedForm", self.fn, "t, y, args, values", "the projected state")
         check_options(self)
 
     def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:

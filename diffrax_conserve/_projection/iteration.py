@@ -8,10 +8,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Int, PyTree
 
 from .._custom_types import Y
-from .._tree import tree_cancel, tree_max, tree_sub
+from .._tree import tree_cancel, tree_sub, tree_uniform
 from .elimination import Vector
 from .equations import Equations
-from .jacobian import AbstractJacobian
 from .linearise import linearise
 from .residual import within
 
@@ -70,7 +69,8 @@ def iterate(
     `start` is more than a hundredth of the candidate's, the iteration begins at the candidate.
     """
     before, at_candidate = linearise(equations.residual, equations.candidate)
-    first = _most_scale(equations, at_candidate, equations.candidate)
+    # A term may vanish at one state and not at the next; this scale does not.
+    first = equations.scale(at_candidate, tree_uniform(equations.candidate))
 
     # In a batch, a loop evaluates its condition in two places. If these round differently, the loop
     # may never end, so the condition is evaluated once and carried.
@@ -92,7 +92,8 @@ def iterate(
         base = at_candidate if frozen else jacobian
         # Near a state where all terms vanish, the residual never becomes small relative to their
         # size there.
-        most = jtu.tree_map(jnp.maximum, first, _most_scale(equations, jacobian, y))
+        most = equations.scale(jacobian, tree_uniform(y))
+        most = jtu.tree_map(jnp.maximum, first, most)
         vanishing = jnp.minimum(1e-2, equations.merit(g, most))
         change = equations.gram_solver(jacobian, base, damping * vanishing).solve(g)
         trial = tree_cancel(y, equations.correction(base, change)), tree_sub(multiplier, change)
@@ -108,14 +109,6 @@ def iterate(
 
     carry = _begin(equations, before, first, start, jnp.asarray(enabled))
     return before, lax.while_loop(lambda carry: carry.unfinished, body, carry).best
-
-
-def _most_scale(equations: Equations, jacobian: AbstractJacobian, y: Y) -> Vector:
-    """The scale that the residual would have if all components of `y` were as large as the
-    largest. A term may vanish at one state and not at the next; this one does not."""
-    largest = tree_max(y)
-    uniform = jtu.tree_map(lambda x: jnp.full_like(x, largest.astype(x.dtype)), y)
-    return equations.scale(jacobian, uniform)
 
 
 def _begin(

@@ -22,6 +22,7 @@ from .._manifold import (
 from .._options import dtype_of
 from .._tree import from_view, real_view, tree_mul, tree_sub
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
+from .certainty import if_certain
 from .linearise import linearise
 from .newton import Newton
 from .residual import residual_of
@@ -79,7 +80,8 @@ def project(
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
     values = given_values(manifold, value, t, y, args)
-    return apply(projection, manifold, values, t, y, args)
+    projected, info = apply(projection, manifold, values, t, y, args)
+    return if_certain(projected, manifold, values, t, projected, args), info
 
 
 def given_values(

@@ -17,8 +17,8 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._tree import (
     real_view,
     tree_all_finite,
-    tree_max,
     tree_stop_gradient,
+    tree_uniform,
     unflatten,
     working_dtype,
 )
@@ -64,11 +64,8 @@ def judge(
     residual, magnitude = residual_of(manifold, values, t, y, args)
     view = real_view(y)
     g, jacobian = linearise(residual, view)
-    most = tree_max(view)
-    # The scale of a state whose components are all as large as the largest, so that a constraint on
-    # a component that is zero up to roundoff has a meaningful scale.
-    uniform = jtu.tree_map(lambda x: jnp.full_like(x, most), view)
-    scale = magnitude + jacobian.scale(uniform)
+    # A constraint on a component that is zero up to roundoff has this scale too.
+    scale = magnitude + jacobian.scale(tree_uniform(view))
     changed = jnp.zeros_like(g)
     if vector_field is not None and any(isinstance(x, FirstIntegral) for x in entries):
         along = vector_field, manifold, values, t, y, args, step, g

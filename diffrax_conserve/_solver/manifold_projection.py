@@ -23,6 +23,7 @@ from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import check_manifold, check_outputs, check_values, conserved_values
 from .._options import check_count, check_number
 from .._projection.base import AbstractProjection, check_projection, option
+from .._projection.certainty import if_certain
 from .._projection.project import check_metric, check_state, tangential
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
@@ -197,7 +198,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         num_constraints = sum(jnp.size(value) for value in jtu.tree_leaves(values))
         return State(
             self.solver.init(terms, t0, t1, y0, args),
-            values,
+            if_certain(values, self.manifold, values, t, y0, args),
             jtu.tree_map(jnp.zeros_like, values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
             ProjectionStatistics.zero(working_dtype(y0), num_constraints),

@@ -1,5 +1,7 @@
 """Laws of the derivative of a projection."""
 
+import diffrax as dfx
+import equinox as eqx
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
@@ -119,3 +121,40 @@ def test_derivatives_agree_with_finite_differences(name):
 
     # The conserved values are small beside the curvature of some systems: the differences err.
     dct.assert_gradients(run, y, values, rtol=1e-5)
+
+
+def balancing(t, y, args):
+    rate, angle = args
+    return jnp.stack([y[1], -jnp.sin(rate * y[0] - angle)])
+
+
+def balancing_energy(t, y, args):
+    rate, angle = args
+    return y[1] ** 2 / 2 - jnp.cos(rate * y[0] - angle) / rate
+
+
+@eqx.filter_jit
+def sensitivity(solver, y0, args):
+    def end(y0):
+        sol = dfx.diffeqsolve(dfx.ODETerm(balancing), solver, 0, 0.5, 0.05, y0, args)
+        return sol.ys[-1]
+
+    return jax.jacrev(end)(y0)
+
+
+@given(
+    rate=st.floats(0.5, 2),
+    angle=st.floats(-3, 3),
+    exponent=st.floats(-17, -1),
+    side=st.sampled_from([-1, 0, 1]),
+)
+def test_a_start_near_an_unstable_equilibrium(rate, angle, exponent, side):
+    """The gradient of the energy is small there, and at last only its roundoff is left."""
+    args, distance = jnp.array([rate, angle]), side * 10**exponent
+    y0 = jnp.array([(angle + jnp.pi) / rate + distance, 0.0])
+    projected = dfc.ManifoldProjection(dfc.RK4(), dfc.FirstIntegral(balancing_energy))
+    found, plain = (sensitivity(solver, y0, args) for solver in (projected, dfc.RK4()))
+    if abs(distance) > 1e-4:
+        assert jnp.all(jnp.isfinite(found))
+    # Both are derivatives of the flow up to the error of the method.
+    assert jnp.all(jnp.isnan(found)) or jnp.max(jnp.abs(found - plain)) < 1e-4
