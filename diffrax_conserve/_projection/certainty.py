@@ -28,7 +28,7 @@ from .._tree import (
 )
 from .equations import Equations
 from .jacobian import AbstractJacobian
-from .linearise import linearise
+from .linearise import Joined, linearise
 from .residual import residual_of
 
 # The relative distance to the state at which it is tested whether gradients are parallel
@@ -58,33 +58,32 @@ def certain(equations: Equations, y: Y, jacobian: AbstractJacobian) -> Float[Arr
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, 1.0).astype(dtype)
 
 
-@eqx.filter_custom_jvp
 def if_certain(
     x: PyTree[Array], manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> PyTree[Array]:
     """`x`, with a derivative that is NaN if a gradient at `y` vanishes up to roundoff: then no
     derivative of a projection to `y`, or of a solve from there, is well determined."""
+    return _if_certain(x, *residual_of(manifold, values, t, y, args), real_view(y))
+
+
+@eqx.filter_custom_jvp
+def _if_certain(x: PyTree[Array], residual: Joined, magnitude: Array, y: Y) -> PyTree[Array]:
     return x
 
 
-@if_certain.def_jvp
+@_if_certain.def_jvp
 def _if_certain_jvp(primals: Any, tangents: Any) -> tuple[PyTree[Array], PyTree[Array]]:
     x, *at = primals
     factor = jnp.where(_gradient_vanishes(*tree_stop_gradient(at)), jnp.nan, 1)
     return x, tree_scale(factor, tree_tangents(x, tangents[0]))
 
 
-def _gradient_vanishes(
-    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
-) -> Bool[Array, ""]:
+def _gradient_vanishes(residual: Joined, magnitude: Array, y: Y) -> Bool[Array, ""]:
     """Whether a gradient is zero at a state so close to `y` that the relative distance hardly
     exceeds the roundoff of `y`, or what the roundoff of the conserved value lets it move."""
-    residual, magnitude = residual_of(manifold, values, t, y, args)
-    view = real_view(y)
-    offset = tree_sub(_beside(view), view)
-    uniform = tree_uniform(view)
-    gradient = linearise(residual, view)[1].scale(uniform)
-    _, change = linearise(lambda x: residual(tree_add(x, offset)) - residual(x), view)
+    offset, uniform = tree_sub(_beside(y), y), tree_uniform(y)
+    gradient = linearise(residual, y)[1].scale(uniform)
+    _, change = linearise(lambda x: residual(tree_add(x, offset)) - residual(x), y)
     curvature = change.scale(uniform) / _OFFSET
     roundoff = float(jnp.finfo(gradient.dtype).eps) ** (2 / 3) * (magnitude + gradient)
     return jnp.any((gradient > 0) & (gradient**2 <= roundoff * curvature))

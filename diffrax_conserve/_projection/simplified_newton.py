@@ -124,8 +124,9 @@ _State = tuple[Y, Vector, Int[Array, ""], Outcome]
 _RARE_SCALARS_MAX = 64
 # Iterations converge if each reduces the largest relative residual to this fraction.
 _NEAR = 0.05
-# The number of starts between the candidate and the anchor that are tried.
-_STARTS = 8
+# The number of starts between the candidate and the anchor that are tried. They approach the anchor
+# faster and faster; the last is the anchor.
+_STARTS = 12
 
 
 @eqx.filter_custom_jvp
@@ -222,8 +223,8 @@ def _finish(
 ) -> _State:
     """Further iterations from `state`, if `unfinished`.
 
-    With an anchor, a state near the manifold, iterations that fail are restarted halfway to the
-    anchor.
+    With an anchor, a state near the manifold, iterations that fail are restarted between the
+    candidate and the anchor.
     """
     equations, anchor = operands
 
@@ -260,15 +261,16 @@ def _from_between(
 ) -> _State:
     def body(carry: _Attempts) -> _Attempts:
         unfinished, index, _ = carry
-        share = jnp.asarray(0.5, working_dtype(anchor)) ** index
+        share = jnp.asarray(0.5, working_dtype(anchor)) ** (index * (index + 1) // 2)
         offset = tree_scale(share, tree_sub(equations.candidate, anchor))
 
-        def choose(a: Y, b: Y) -> Y:
-            return jtu.tree_map(lambda a, b: jnp.where(index == 0, a, b), a, b)
+        def choose(flag: Array, a: Y, b: Y) -> Y:
+            return jtu.tree_map(lambda a, b: jnp.where(flag, a, b), a, b)
 
-        candidate = choose(equations.candidate, tree_add(anchor, offset))
+        candidate = choose(index == 0, equations.candidate, tree_add(anchor, offset))
+        candidate = choose(index == _STARTS - 1, anchor, candidate)
         zeros = jnp.zeros_like(first.multiplier), jnp.zeros_like(first.num_steps)
-        start = choose(first, Start(candidate, *zeros))
+        start = choose(index == 0, first, Start(candidate, *zeros))
         y, multiplier, count, outcome = attempt(
             dataclasses.replace(equations, candidate=candidate), start, unfinished
         )

@@ -93,7 +93,21 @@ LAWS = [
 ]
 
 
-@every_law_on_every_system(LAWS)
+# A soliton has the least energy for its mass and momentum: gradients are parallel there, and the
+# derivative is NaN.
+PARALLEL = "korteweg-de-vries"
+
+
+@every_law_on_every_system(
+    LAWS,
+    skip={
+        (law.__name__, PARALLEL)
+        for law in (
+            on_the_manifold_it_keeps_the_flow,
+            the_integrals_of_the_projected_state_do_not_change,
+        )
+    },
+)
 @settings(max_examples=6)
 @given(data=st.data())
 def test_law(law, name, data):
@@ -108,7 +122,7 @@ def test_law(law, name, data):
     [
         n if n == "kepler" else pytest.param(n, marks=pytest.mark.slow)
         for n in SYSTEMS
-        if n != "outer-solar-system"
+        if n not in (PARALLEL, "outer-solar-system")
     ],
 )
 def test_derivatives_agree_with_finite_differences(name):
