@@ -89,31 +89,33 @@ def inverse_distances(rows, q):
     return d, jax.lax.rsqrt(jnp.sum(d * d, -1) + SOFTENING**2)
 
 
+def pair_sums(q):
+    """The accelerations and the potential energy."""
+
+    def of_rows(rows):
+        d, inverse = inverse_distances(rows, q)
+        return -jnp.einsum("ij,ijk->ik", inverse**3, d), jnp.sum(inverse)
+
+    pulls, sums = over_rows(of_rows, q)
+    return pulls.reshape(q.shape) / len(q), -(jnp.sum(sums) - len(q) / SOFTENING) / (2 * len(q))
+
+
 def bodies_vector_field(t, y, args):
     q, v = y
-
-    def accelerations(rows):
-        d, inverse = inverse_distances(rows, q)
-        return -jnp.einsum("ij,ijk->ik", inverse**3, d) / len(q)
-
-    return v, over_rows(accelerations, q).reshape(q.shape)
+    return v, pair_sums(q)[0]
 
 
 @jax.custom_jvp
 def potential(q):
-    def row_sums(rows):
-        _, inverse = inverse_distances(rows, q)
-        return jnp.sum(inverse)
-
-    return -(jnp.sum(over_rows(row_sums, q)) - len(q) / SOFTENING) / (2 * len(q))
+    return pair_sums(q)[1]
 
 
 @potential.defjvp
 def _(primals, tangents):
-    # The gradient of the potential is minus the force, which the vector field has anyway.
+    # The gradient is minus the acceleration, whose pairs are those of the energy.
     (q,), (dq,) = primals, tangents
-    _, acceleration = bodies_vector_field(0.0, (q, q), None)
-    return potential(q), -jnp.sum(acceleration * dq)
+    acceleration, energy = pair_sums(q)
+    return energy, -jnp.sum(acceleration * dq)
 
 
 def energy(t, y, args):
