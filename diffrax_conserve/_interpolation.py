@@ -49,7 +49,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     Where the projection of the interpolant fails, `SimplifiedNewton` is tried, which starts again
     closer and closer to the nearer end of the step, a state on the manifold, and at last there. If
-    that fails too, the value is NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
+    that fails too, the value is NaN. There is no extrapolation: a time outside the step is replaced
+    by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -77,7 +77,8 @@ def within(residual: Vector, tolerance: Vector) -> Bool[Array, ""]:
 
 class Tolerance(eqx.Module):
     """The largest residual that counts as zero, `atol + rtol * scale`. The default of `rtol` is
-    `ROUNDOFF_MULTIPLE` units of roundoff."""
+    `ROUNDOFF_MULTIPLE` units of roundoff. It is NaN, which no residual satisfies, where the scale
+    is so small that a residual of this size underflows."""
 
     rtol: float | Array | None
     atol: float | Array | None
@@ -87,6 +88,8 @@ class Tolerance(eqx.Module):
             roundoff = ROUNDOFF_MULTIPLE * jnp.finfo(x.dtype).eps
             rtol = roundoff if self.rtol is None else self.rtol
             atol = 0.0 if self.atol is None else self.atol
-            return jnp.asarray(rtol, x.dtype) * x + jnp.asarray(atol, x.dtype)
+            tolerance = jnp.asarray(rtol, x.dtype) * x + jnp.asarray(atol, x.dtype)
+            underflows = (x > 0) & (tolerance < jnp.finfo(x.dtype).tiny)
+            return jnp.where(underflows, jnp.nan, tolerance)
 
         return jtu.tree_map(combine, scale)

@@ -237,7 +237,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         success = info.ok & ~too_far & (solver_state.initial.cause == FINE)
         shown = None if step is None else error
         error = self._error(error, target, t1, y1)
-        error = _judged(error, success, _is_hopeless(solver_state.initial, y0, candidate))
+        hopeless = _is_hopeless(solver_state.initial, t0, t1, y0, candidate)
+        error = _judged(error, success, hopeless)
         failed = failure(info, too_far, solver_state.initial, self.manifold, solver_state.values)
         result = dfx.RESULTS.where(success | (result != dfx.RESULTS.successful), result, failed)
         dense_info = dict(inner=dense_info, ends=(y0, y1), error=shown, target=PackedTarget(start))
@@ -294,13 +295,16 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         return tangential(self.projection, self.manifold, target.now, t1, y1, target.args, error)
 
 
-def _is_hopeless(initial: Initial, y0: Y, candidate: Y) -> Array:
+def _is_hopeless(
+    initial: Initial, t0: RealScalarLike, t1: RealScalarLike, y0: Y, candidate: Y
+) -> Array:
     """Whether a failed projection cannot succeed with smaller steps, because the candidate is
-    already very close to `y0` or the initial state is invalid."""
-    dtype = working_dtype(candidate)
-    little = max(1e-4, 16 * float(jnp.finfo(dtype).eps))
+    already very close to `y0`, the step is a roundoff of time, or the initial state is invalid."""
+    little = max(1e-4, 16 * float(jnp.finfo(working_dtype(candidate)).eps))
     moved = tree_norm(tree_sub(candidate, y0))
-    return (moved <= little * tree_norm(candidate)) | (initial.cause != FINE)
+    near = moved <= little * tree_norm(candidate)
+    instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
+    return near | instant | (initial.cause != FINE)
 
 
 def _judged(error: Y | None, success: BoolScalarLike, hopeless: BoolScalarLike) -> Y | None:

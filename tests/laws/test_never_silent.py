@@ -99,6 +99,20 @@ def in_units(projection, y, value, factor):
     return found, info.ok
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@given(share=st.floats(0.01, 0.5), angle=st.floats(0, 6), off=st.floats(-0.1, 0.1))
+def test_what_underflows_is_no_success(dtype, share, angle, off):
+    """Residuals of small values underflow long before the values do."""
+    numbers = np.finfo(dtype)
+    size = float(numbers.tiny) ** share
+    value = dtype(size**2)
+    candidate = (size * (1 + off) * np.array([np.cos(angle), np.sin(angle)])).astype(dtype)
+    found, ok = in_units(PROJECTIONS["simplified"], candidate, value, jnp.asarray(1, dtype))
+    error = np.sum(np.asarray(found, np.longdouble) ** 2) - value
+    assert not ok or abs(error) <= 64 * numbers.eps * value
+    assert ok or value <= numbers.tiny / numbers.eps
+
+
 # ---- Derivatives ----
 
 

@@ -239,6 +239,26 @@ def test_an_adaptive_solve_without_hope_ends(after):
     assert sol.stats["num_steps"] <= plain.stats["num_steps"] + 40
 
 
+@pytest.mark.parametrize(("late", "dtype"), [(1e13, jnp.float64), (2e4, jnp.float32)])
+def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
+    """There even the shortest step of time moves the state by much."""
+    jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
+    start, end = (jnp.asarray(late + x, dtype) for x in (-20, 20))
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: rotation(t, y, args) * jnp.asarray(0.3, dtype)),
+        dfc.ManifoldProjection(dfx.Tsit5(), jump),
+        start,
+        end,
+        None,
+        Y0.astype(dtype),
+        stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
+        max_steps=None,
+        throw=False,
+    )
+    assert "`manifold`" in dfx.RESULTS[sol.result]
+    assert sol.stats["num_steps"] <= 60
+
+
 # ---- max_correction ----
 
 
