@@ -13,6 +13,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .common import (
+    PARALLEL,
     SYSTEMS,
     check,
     displaced,
@@ -91,11 +92,6 @@ LAWS = [
     reverse_mode_is_the_transpose_of_forward_mode,
     the_integrals_of_the_projected_state_do_not_change,
 ]
-
-
-# A soliton has the least energy for its mass and momentum: gradients are parallel there, and the
-# derivative is NaN.
-PARALLEL = "korteweg-de-vries"
 
 
 @every_law_on_every_system(

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from .common import SYSTEMS, check, every_law_on_every_system, inputs, within
+from .common import PARALLEL, SYSTEMS, check, every_law_on_every_system, inputs, within
 
 STEPS = 8
 
@@ -174,7 +174,9 @@ LAWS = [
 ]
 
 
-@every_law_on_every_system(LAWS)
+@every_law_on_every_system(
+    LAWS, skip={(the_gradient_of_an_integral_is_carried_back_unchanged.__name__, PARALLEL)}
+)
 @settings(max_examples=6)
 @given(data=st.data())
 def test_law(law, name, data):
@@ -239,8 +241,8 @@ def test_random_quadratic_integrals_are_conserved(dimension, integrals, data):
 )
 def test_the_order_survives_the_projection(name):
     system = SYSTEMS[name]
-    # The paper's steps for the rigid body are so short that the errors would be roundoff.
-    dt = 8 * system.dt if name == "rigid-body" else system.dt
+    # Their own steps are so short that the errors would be roundoff.
+    dt = {"rigid-body": 8, "korteweg-de-vries": 4}.get(name, 1) * system.dt
     dct.assert_order(
         dfc.ManifoldProjection(dfc.RK4(), system.manifold),
         dfx.ODETerm(system.vector_field),

@@ -106,6 +106,8 @@ def run(seed: int, number: int, lanes: int) -> Tally:
     unnamed = (
         np.array([not blames(m, manifold_of(case, beside), "alpha") for m in messages]) & ~okay
     )
+    if case not in AT_START | NEVER_CONSERVED:
+        unnamed &= ended  # otherwise all steps were taken before
     allowed = np.where(case in AT_START, 0, np.where(ended, before, np.inf)) + MORE
     if case == "runs away":
         # What is taken away reaches -1 at the latest 0.5 after; at the same pace of steps.
