@@ -300,7 +300,7 @@ def _is_hopeless(
 ) -> Array:
     """Whether a failed projection cannot succeed with smaller steps, because the candidate is
     already very close to `y0`, the step is a roundoff of time, or the initial state is invalid."""
-    little = max(1e-4, 16 * float(jnp.finfo(working_dtype(candidate)).eps))
+    little = max(5e-4, 16 * float(jnp.finfo(working_dtype(candidate)).eps))
     moved = tree_norm(tree_sub(candidate, y0))
     near = moved <= little * tree_norm(candidate)
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
