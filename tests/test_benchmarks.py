@@ -187,9 +187,11 @@ def test_the_others_arrive_where_we_do(precision, name, program):
 def test_a_smoke_run_of_work_and_precision(precision, tmp_path):
     out = tmp_path / "work_precision.json"
     found = precision.main(["--smoke", "--out", str(out)])
-    for part in ("rigid-body", "batch"):
+    # At toy sizes only these reach the target.
+    projected = {"rigid-body": "projected Tsit5", "batch": "projected Tsit5, fixed steps"}
+    for part, name in projected.items():
         times = found[part]["times"]
-        assert times["projected Tsit5"]["error and drift"] > 0
+        assert times[name]["error and drift"] > 0
         assert times["plain Dopri8"]["error and drift"] is None
     assert found["unlike"]["steps"][0] < found["unlike"]["steps"][2]
     assert json.loads(out.read_text())["parts"] == json.loads(json.dumps(found))
