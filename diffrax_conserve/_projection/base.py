@@ -89,7 +89,7 @@ class Problem(eqx.Module):
         equations, y = tree_stop_gradient((equations, y))
         before, jacobian = linearise(equations.residual, equations.candidate)
         rank = equations.gram_solver(jacobian).rank
-        return equations.report(y, before, jnp.asarray(num_steps), rank)
+        return equations.report(y, before, equations.measure(y), jnp.asarray(num_steps), rank)
 
     def equations(self, candidate: Y, tolerance: Tolerance, linear_solver: Any = None) -> Equations:
         weights, magnitude = self.weights, self.magnitude

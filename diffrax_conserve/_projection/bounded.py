@@ -152,7 +152,7 @@ def project_into(
 
     y, count = choose((free, free_info.num_steps), (end.y, end.num_steps))
     rank = at_candidate.gram_solver(equations.weights).rank
-    info = equations.report(y, before, count, rank)
+    info = equations.report(y, before, equations.measure(y), count, rank)
     # Only the nearest point has a derivative.
     moving = jnp.asarray(False) if frozen else end.last > eps**0.5
     multiplier = jtu.tree_map(lambda x: jnp.where(moving, jnp.nan, x), end.multiplier)

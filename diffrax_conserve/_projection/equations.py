@@ -160,12 +160,23 @@ class Equations(eqx.Module):
     def safely_satisfied(self, g: Vector, scale: Vector) -> Bool[Array, ""]:
         return within(g, tree_scale(SAFELY, self.tolerance(scale)))
 
+    def measure(self, y: Y) -> tuple[Vector, Vector]:
+        """The residual at `y`, and its scale there."""
+        g, jacobian = linearise(self.residual, y)
+        return g, self.scale(jacobian, y)
+
     def report(
-        self, y: Y, before: Vector, count: Array, rank: Array, outcome: Outcome | None = None
+        self,
+        y: Y,
+        before: Vector,
+        measured: tuple[Vector, Vector],
+        count: Array,
+        rank: Array,
+        outcome: Outcome | None = None,
     ) -> ProjectionInfo:
-        """The report on a projection to `y`, from a candidate with the residual `before`."""
-        after, at_y = linearise(self.residual, y)
-        scale = self.scale(at_y, y)
+        """The report on a projection to `y`, from a candidate with the residual `before`;
+        `measured` is the residual at `y` and its scale."""
+        after, scale = measured
         outcome = Outcome.of(before, after, scale, self.tolerance) if outcome is None else outcome
         return ProjectionInfo(
             result=outcome.result,

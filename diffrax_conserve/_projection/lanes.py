@@ -112,6 +112,12 @@ def _gather(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
     length = lanes // blocks
     width = min(length, -(-max(lanes // _SHARES, _LEAST_WIDTH) // blocks))
     rounds = -(-length // width)
+
+    def finished(flag: Array, state: Any, batch: Any) -> Any:
+        return lane(flag, state, eqx.combine(batch, shared))
+
+    if rounds == 1:  # All lanes fit.
+        return _choose(flags, jax.vmap(finished)(flags, states, batch), states)
     flags, states, batch = jtu.tree_map(
         lambda x: x.reshape(blocks, length, *x.shape[1:]), (flags, states, batch)
     )
@@ -123,9 +129,6 @@ def _gather(lane: Callable, flags: Bool[Array, " lanes"], states: Any, batch: An
 
     def put(x: Array, index: Array, y: Array) -> Array:
         return x.at[index].set(y, mode="drop")
-
-    def finished(flag: Array, state: Any, batch: Any) -> Any:
-        return lane(flag, state, eqx.combine(batch, shared))
 
     def body(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         start, states = carry

@@ -120,11 +120,13 @@ def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, Projec
     before, reached = iterate(equations, frozen=False, max_steps=max_steps)
     nearest, multiplier, num_steps, arrived = _nearest(equations, reached.y, max_steps)
 
-    g, jacobian = linearise(equations.residual, nearest)
-    found = within(g, equations.tolerance(equations.scale(jacobian, nearest))) & arrived
+    g, scale = equations.measure(nearest)
+    found = within(g, equations.tolerance(scale)) & arrived
     y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
-    rank = linearise(equations.residual, y)[1].gram_solver(equations.weights).rank
-    info = equations.report(y, before, reached.num_steps + num_steps, rank)
+    g, jacobian = linearise(equations.residual, y)
+    measured = g, equations.scale(jacobian, y)
+    rank = jacobian.gram_solver(equations.weights).rank
+    info = equations.report(y, before, measured, reached.num_steps + num_steps, rank)
     # Only the multipliers of the nearest point have a derivative.
     return y, jnp.where(info.ok & ~found, jnp.nan, multiplier), info
 

@@ -124,6 +124,8 @@ _State = tuple[Y, Vector, Int[Array, ""], Outcome]
 _RARE_SCALARS_MAX = 64
 # Iterations converge if each reduces the largest relative residual to this fraction.
 _NEAR = 0.05
+# From this many unknowns evaluations cost more than tests.
+_LARGE = 512
 # The number of starts between the candidate and the anchor that are tried. They approach the anchor
 # faster and faster; the last is the anchor.
 _STARTS = 12
@@ -137,21 +139,32 @@ def _project(
     before, jacobian = at_candidate = linearise(inline.residual, inline.candidate)
     count = min(jacobian.inline_steps, max_steps)
     start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
-    y, multiplier, _, done = _iterations(inline, at_candidate, start, at_candidate, count)
+    large = count > 1 and tree_size(inline.candidate) >= _LARGE
+    y, multiplier, num_steps, measured, done = (_tested if large else _iterations)(
+        inline, at_candidate, start, at_candidate, count
+    )
     # The few steps that need more iterations linearise again: sharing the values known here would
     # write them to memory at every step of the solve.
-    state = join(y), as_array(multiplier), jnp.asarray(count), Outcome.success()
+    state = join(y), as_array(multiplier), num_steps, Outcome.success()
     finish = ft.partial(_finish, max_steps)
     rounds = max_steps - count if count > 0 else 0
-    y, multiplier, count, outcome = continue_if_any(
+    y, multiplier, num_steps, outcome = continue_if_any(
         finish, ~done, state, (equations, anchor), crowd=_once_more, rounds=rounds
     )
     # The rest is computed only if the report is used.
+    if large:
+        g, scale = map(as_array, measured)
+        measured = lax.cond(done, lambda: (g, scale), lambda: equations.measure(y))
+    else:
+        measured = equations.measure(y)
     rank = inline.gram_solver(jacobian).rank
-    return y, multiplier, equations.report(y, as_array(before), count, rank, outcome)
+    return y, multiplier, equations.report(y, as_array(before), measured, num_steps, rank, outcome)
 
 
 _Linearised = tuple[Vector, AbstractJacobian]
+# The state, the multipliers, the number of iterations, the residual there and its scale, and
+# whether they are enough.
+_Iterations = tuple[Y, Vector, Int[Array, ""], tuple[Vector, Vector], Bool[Array, ""]]
 
 
 def _iterations(
@@ -160,9 +173,8 @@ def _iterations(
     start: tuple[Y, Vector],
     at_start: _Linearised,
     count: int,
-) -> tuple[Y, Vector, tuple[Vector, Vector], Bool[Array, ""]]:
-    """`count` iterations with the Gram matrix at the start, with the residual that they end with
-    and its scale, and whether they are enough."""
+) -> _Iterations:
+    """`count` iterations with the Gram matrix at the start."""
     (before, base), (g, jacobian) = at_candidate, at_start
     gram_solver = equations.gram_solver(jacobian, None if jacobian is base else base)
     y, multiplier = start
@@ -182,7 +194,27 @@ def _iterations(
         jtu.tree_map(lambda s, b: jnp.where(s > 0, s, jnp.abs(b)), scale, before)
     )
     close = within(last, tree_scale(roundoff ** (-2 / 3), small))
-    return y, multiplier, (g, scale), close & equations.safely_satisfied(g, scale)
+    done = close & equations.safely_satisfied(g, scale)
+    return y, multiplier, jnp.asarray(count), (g, scale), done
+
+
+def _tested(
+    equations: Equations,
+    at_candidate: _Linearised,
+    start: tuple[Y, Vector],
+    at_start: _Linearised,
+    count: int,
+) -> _Iterations:
+    """As `_iterations`, but no more than the first if that is enough."""
+    first = _iterations(equations, at_candidate, start, at_start, 1)
+    y, multiplier, _, (g, _), done = first
+
+    def others() -> _Iterations:
+        now = g, at_start[1]
+        *end, measured, done = _iterations(equations, at_candidate, (y, multiplier), now, count - 1)
+        return *end[:2], jnp.asarray(count), measured, done
+
+    return lax.cond(done, lambda: first, others)
 
 
 def _once_more(
@@ -194,7 +226,7 @@ def _once_more(
     equations, split, join = _converted(operands[0])
     start = split(y), equations.as_vector(multiplier)
     candidate, here = (linearise(equations.residual, x) for x in (equations.candidate, start[0]))
-    y, multiplier, (g, scale), done = _iterations(equations, candidate, start, here, 1)
+    y, multiplier, _, (g, scale), done = _iterations(equations, candidate, start, here, 1)
     before, last, now = (largest(relative(x, scale)) for x in (candidate[0], here[0], g))
     converges = (last <= _NEAR * before) & (done | (now <= _NEAR * last))
     state = join(y), as_array(multiplier), count + 1, outcome

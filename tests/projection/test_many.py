@@ -1,5 +1,7 @@
 """Many constraints: the rows are never formed, and nothing else changes."""
 
+import math
+
 import diffrax as dfx
 import jax
 import jax.extend.core
@@ -15,6 +17,7 @@ from diffrax_conserve._projection.linearise import DENSE_MAX
 
 from ..problems import solve
 
+EPS = float(np.finfo(float).eps)
 BONDS = DENSE_MAX + 22
 
 
@@ -134,3 +137,24 @@ def test_newton_copes_with_many_constraints():
     y, info = jax.jit(lambda q: dfc.project(CHAIN, q, args=1.0))(chain(noise=1e-2))
     assert info.residual_after <= 4e-15
     assert float(jnp.max(jnp.abs(bonds(0.0, y, 1.0)))) <= 1e-12
+
+
+def test_a_large_state_takes_no_iteration_more_than_it_needs():
+    def energy(t, y, args):
+        return jnp.sum(y**4) / 4
+
+    integral = dfc.FirstIntegral(energy, value=2.0)
+    project = jax.jit(lambda y: dfc.project(integral, y, projection=dfc.SimplifiedNewton()))
+    y = np.random.default_rng(3).normal(size=1000)
+    y *= (2.0 / energy(0.0, y, None)) ** 0.25
+    counts = []
+    for off in (1e-9, 1e-5, 1e-2):
+        found, info = project(y * (1 + off))
+        counts.append(int(info.num_steps))
+        assert info.ok
+        exact = math.fsum(float(x) ** 4 for x in found) / 4
+        scale = 2.0 + math.fsum(float(x) ** 4 for x in found)
+        assert abs(exact - 2.0) <= 16 * EPS * scale
+    assert counts[0] == 1 < counts[1] < counts[2]
+    _, infos = jax.jit(jax.vmap(project))(np.stack([y * (1 + off) for off in (1e-9, 1e-5, 1e-2)]))
+    assert infos.num_steps.tolist() == counts
