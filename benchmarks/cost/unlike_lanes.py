@@ -7,6 +7,7 @@ more than the two iterations that every projection makes. `python benchmarks/cos
 import measuring  # isort: skip  (it sets XLA's options)
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax as dfx
@@ -63,8 +64,10 @@ def vortices(lanes: int) -> tuple[Any, dict[str, tuple[Any, float]]]:
 FAMILIES: dict[str, Callable] = {"bodies": bodies, "orbits": orbits, "vortices": vortices}
 
 
-def solver_of(system: Any, y: Any, dt: float, steps: int) -> Callable[[], Any]:
-    def one(y0: Any) -> Any:
+def runs_of(
+    system: Any, cases: dict[str, tuple[Any, float]], steps: int
+) -> dict[str, Callable[[], Any]]:
+    def one(dt: Any, y0: Any) -> Any:
         solution = dfx.diffeqsolve(
             dfx.ODETerm(system.vector_field),
             dfc.ManifoldProjection(dfc.RK4(), system.manifold, max_correction=None),
@@ -77,8 +80,11 @@ def solver_of(system: Any, y: Any, dt: float, steps: int) -> Callable[[], Any]:
         )
         return solution.ys, dfx.is_okay(solution.result)
 
-    program, _ = measuring.compiled(jax.vmap(one), y)
-    return lambda: program(y)
+    arguments = {
+        case: (jnp.asarray(dt), jax.tree.map(jnp.asarray, y)) for case, (y, dt) in cases.items()
+    }
+    program, _ = measuring.compiled(jax.vmap(one, (None, 0)), *next(iter(arguments.values())))
+    return {case: partial(program, *xs) for case, xs in arguments.items()}
 
 
 def main() -> None:
@@ -93,10 +99,7 @@ def main() -> None:
         steps = sizes["steps"] if options.smoke else max(40, sizes["steps"] // lanes)
         for name, family in FAMILIES.items():
             system, cases = family(lanes)
-            runs = {
-                case: solver_of(system, jax.tree.map(jnp.asarray, y), dt, steps)
-                for case, (y, dt) in cases.items()
-            }
+            runs = runs_of(system, cases, steps)
             times = measuring.take_turns(runs, rounds=1 if options.smoke else 3)
             easy = next(iter(times.values())).seconds
             for case, found in times.items():

@@ -181,10 +181,11 @@ NEWTON_OPTIONS = r"""**Arguments:**
     projection fails. In derivatives, components at a bound are constant. For a complex component
     the bounds apply to both parts. Default: none.
 - `linear_solver`: a solver of lineax for the systems of the iterations with the matrix
-    $G M^{-1} G^\top$, which is positive semi-definite, and singular if constraints depend on each
-    other: `lineax.Cholesky()`, `lineax.CG(...)` or `lineax.SVD()`. The systems of derivatives and
-    those with two different Jacobians are solved as by default: by an elimination that leaves out
-    dependent constraints, and with more than 128 constraints by conjugate gradients.
+    $G M^{-1} G^\top$: `lineax.Cholesky()`, `lineax.CG(...)` or `lineax.SVD()`. It is positive
+    definite even if constraints depend on each other, because $\varepsilon^{3/4}$ of its diagonal
+    is added to it. The systems of derivatives and those with two different Jacobians are solved as
+    by default: by an elimination that leaves out dependent constraints, and with more than 128
+    constraints by conjugate gradients.
 
 **Raises:**
 

@@ -240,7 +240,7 @@ class MatrixFree(AbstractJacobian):
         return estimated_norms(self.forward, y)
 
     def unit_rows(self) -> tuple["MatrixFree", Vector]:
-        return self, jnp.ones(())
+        return self, jnp.asarray(1.0)  # weakly typed, so that it changes no dtype
 
     def _product(self, x: Vector, weights: Y, other: "MatrixFree") -> Vector:
         return self.forward(tree_mul(other.backward(x), weights))
@@ -285,6 +285,9 @@ def lineax_solver(
     rows, row_sizes = jacobian.unit_rows()
     columns, column_sizes = (rows, row_sizes) if other is None else other.unit_rows()
     diagonal = jtu.tree_map(jnp.square, rows.scale(jtu.tree_map(jnp.sqrt, weights)))
+    # If constraints depend on each other, the roundoff of their residuals does not. Undamped, it
+    # would be solved for, by huge multipliers.
+    damping = jnp.maximum(damping, float(jnp.finfo(working_dtype(diagonal)).eps) ** 0.75)
 
     def product(x: Vector, columns: AbstractJacobian = rows) -> Vector:
         g = rows.pushforward(tree_mul(columns.pullback(x), weights))

@@ -98,6 +98,32 @@ def test_redundant_constraints_change_nothing():
     np.testing.assert_allclose(y, projected(q)[0], rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_dependent_linear_constraints_against_their_pseudoinverse(dtype):
+    rng, eps = np.random.default_rng(0), float(jnp.finfo(dtype).eps)
+    rows = rng.normal(size=(DENSE_MAX + 2, 200))
+    rows[-20:] = rng.normal(size=(20, DENSE_MAX - 18)) @ rows[:-20] / 10
+    y0, ys = rng.normal(size=200), rng.normal(size=(3, 200))
+    ys = jnp.asarray(y0 + np.array([1e-4, 1e-2, 1.0])[:, None] * ys, dtype)
+    y0, matrix = jnp.asarray(y0, dtype), jnp.asarray(rows, dtype)
+    integrals = dfc.FirstIntegral(lambda t, y, args: matrix @ y, value=matrix @ y0)
+
+    @jax.jit
+    @jax.vmap
+    def projected(y):
+        project = lambda y: dfc.project(integrals, y, projection=dfc.SimplifiedNewton())  # noqa: E731
+        return *project(y), jax.grad(lambda y: jnp.sum(jnp.sin(project(y)[0])))(y)
+
+    found, info, gradients = projected(ys)
+    assert np.all(info.ok)
+    assert found.dtype == dtype
+    inverse = np.linalg.pinv(rows, rcond=1e-10)
+    exact = ys - (ys @ rows.T - rows @ y0) @ inverse.T
+    np.testing.assert_allclose(found, exact, atol=100 * eps)
+    cosines = np.cos(exact)
+    np.testing.assert_allclose(gradients, cosines - cosines @ inverse @ rows, atol=200 * eps)
+
+
 def test_contradicting_constraints_fail():
     other = dfc.Constraint(lambda t, q, args: bonds(t, q, 1.01 * args))
     both, simplified = [CHAIN, other], dfc.SimplifiedNewton()
