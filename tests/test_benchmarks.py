@@ -245,6 +245,7 @@ def test_a_goal_is_reached_or_missed():
     assert not goal("", 2, None).reached
 
 
+@pytest.mark.slow
 def test_the_figures_show_every_curve(tmp_path):
     report = benchmark("report")
     results = report.read_results()

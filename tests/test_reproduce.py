@@ -93,6 +93,7 @@ def test_it_says_what_it_is_doing_before_it_is_done(of_kepler):
     assert said[1] == "[2/2] projected rk4: compiles and solves"
 
 
+@pytest.mark.slow
 def test_metrics_of_the_harmonic_oscillator(tmp_path, monkeypatch):
     monkeypatch.setattr(_job, "is_learned", lambda system: False)  # the others are slow to compile
     t1, h, steps = 3.0, 0.25, 12
@@ -166,6 +167,7 @@ def test_a_last_step_that_is_shorter(tmp_path, monkeypatch):
     assert metrics["solvers"]["projected rk4"]["state_error"] < 1e-4
 
 
+@pytest.mark.slow
 def test_flow_maps_are_compared_on_many_initial_states():
     for name in PAPER:
         system = dfc.systems.get(name)
@@ -428,6 +430,7 @@ def test_a_state_that_blows_up(tmp_path):
     assert "not finite" in metrics["solvers"]["rk4"]["failure"]
 
 
+@pytest.mark.slow
 def test_the_lines_between_the_steps_are_those_of_the_solution():
     system = dfc.systems.get("rigid-body")
     ts = np.linspace(0, system.t1, 36)

@@ -164,6 +164,7 @@ def test_invariance_is_proved():
     assert not dfc.check_invariance(FALLING, ROD_MANIFOLD, states).ok
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_solve_are_those_of_differences():
     solver = dfc.ManifoldProjection(dfx.Euler(), ROD_MANIFOLD)  # the quickest to compile
 

@@ -290,6 +290,7 @@ def test_success(law, name, data):
     law(system, data.draw(inputs(system)))
 
 
+@pytest.mark.slow
 @settings(max_examples=3)
 @given(packing=dct.restructurings(SYSTEMS["kepler"].y0))
 def test_every_pytree_of_the_state_gives_the_same(packing):

@@ -133,6 +133,7 @@ def test_a_layer_or_args_of_the_polynomial_are_refused():
 # ---- Training ----
 
 
+@pytest.mark.slow
 def test_a_training_draws_args_and_leaves_the_domain(trained):
     flow_map, log = trained
     assert isinstance(flow_map, dfc.DeepONet)

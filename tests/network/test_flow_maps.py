@@ -113,6 +113,7 @@ def test_its_domain_is_the_box_round_its_states():
 # ---- Windows ----
 
 
+@pytest.mark.slow
 def test_a_pinn_of_windows_follows_them():
     pinn = solution(t1=3.0, windows=3)
     assert pinn.windows == 3
@@ -139,6 +140,7 @@ def test_wrong_windows_are_named(wrong):
         solution(**wrong)
 
 
+@pytest.mark.slow
 def test_the_units_of_a_first_layer_are_spread_over_the_interval():
     pinn = dfc.PINN(EAST, 0.0, 1.0, width=500, depth=1, slope=2.0, key=jr.key(0))
     net = pinn.window(0).net

@@ -41,6 +41,7 @@ def test_enough_iterations_reach_the_manifold_from_far_away(seed, halves):
     assert residual(layer, y, values) < 1e-14
 
 
+@pytest.mark.slow
 def test_each_iteration_comes_nearer():
     candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
     left = []

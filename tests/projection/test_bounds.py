@@ -104,6 +104,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     assert jnp.quantile(residual, 0.999) <= 4 * EPS
 
 
+@pytest.mark.slow
 def test_a_candidate_within_the_bounds_is_projected_as_without():
     rng = np.random.default_rng(3)
     atoms, values, candidates = chemistry(rng, MANY)
@@ -162,6 +163,7 @@ def test_a_bound_that_is_nan_is_never_ignored():
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
 
+@pytest.mark.slow
 def test_the_nearest_point_of_a_sphere_within_an_orthant():
     """Which is known: what is negative becomes zero, and the rest is divided by its norm."""
     candidates = jnp.asarray(np.random.default_rng(4).normal(size=(200, 4)))

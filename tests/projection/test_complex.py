@@ -195,6 +195,7 @@ def test_it_is_the_solve_in_real_and_imaginary_parts(name, inner):
     assert (got.result == dfx.RESULTS.successful) == (expected.result == dfx.RESULTS.successful)
 
 
+@pytest.mark.slow
 def test_adaptive_steps_directions_and_formulas():
     number = {"q": dfc.FirstIntegral(lambda t, y, args: quanta(t, y, args)["number"])}
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)

@@ -153,6 +153,7 @@ def test_second_derivatives(projection):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradient_with_redundant_constraints_is_that_without():
     def run(inputs, copies):
         manifold = (dfc.FirstIntegral(Energy(inputs["inertia"])),) * copies

@@ -102,6 +102,7 @@ def test_the_order_survives(inner, order):
     dct.assert_order(solver, TERM, Y0, t1=0.3, dt0=0.05, args=ONE, order=order)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_agree_with_finite_differences():
     def run(y0, args):
         return jax.tree.map(lambda x: x[-1], solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2).ys)

@@ -85,6 +85,7 @@ def test_derivatives_are_those_of_autodiff(derivative):
     same(derivative(CALLED), derivative(SEEN))
 
 
+@pytest.mark.slow
 def test_a_direction_needs_no_derivative_of_the_jacobian():
     same(gradient(ALL_CALLED, dfc.Directional()), gradient(SEEN, dfc.Directional()))
 

@@ -112,6 +112,7 @@ def differences_and_derivatives(y0, x, v):
     return infos.ok[0], found, slope, pulled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [1e-4, 1e-2, 0.1, 0.3])
 def test_the_derivative_with_many_constraints_is_right_or_nan(distance):
     y0, offset = candidate(150)
@@ -124,6 +125,7 @@ def test_the_derivative_with_many_constraints_is_right_or_nan(distance):
         assert jnp.all(jnp.isfinite(slope))
 
 
+@pytest.mark.slow
 def test_with_bounds_and_a_metric():
     y0, offset = candidate(3)
     agree(chained(3), y0, y0 + offset, dfc.SimplifiedNewton, lx.Cholesky(), lower=0.95, metric=2.0)

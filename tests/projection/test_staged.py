@@ -45,6 +45,7 @@ def solve(projection, y0=Y0, args=GRAVITY, t1=30.0, tol=1e-7, inner=None, **opti
     return dfx.diffeqsolve(TERM, solver, 0.0, t1, y0=y0, args=jnp.asarray(args), **options)
 
 
+@pytest.mark.slow
 def test_cvode_s_pendulum():
     """After 15 periods it is where it was. CVODE itself is off by 7.8e-5."""
     errors = [

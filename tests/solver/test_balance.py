@@ -178,6 +178,7 @@ def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
     assert 1e-12 < worst(solve(manifold=None, saveat=late)) < 1e-10
 
 
+@pytest.mark.slow
 def test_a_continued_solve_is_one_solve():
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     whole, half = solve(saveat=saveat), solve(t1=1.0, saveat=saveat)

@@ -160,6 +160,7 @@ def test_projection_makes_the_error_no_worse_than_thrice(name):
     assert error(dfc.ManifoldProjection(inner, RIGID_BODY)) <= 3 * error(inner) + 1e-14
 
 
+@pytest.mark.slow
 def test_ito_and_stratonovich_paths_agree():
     """Projection leaves the interpretation of the noise alone: on one Brownian path, projected
     Euler-Maruyama with the Itô drift and projected Heun without it end at the same place."""

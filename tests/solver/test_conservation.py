@@ -80,6 +80,7 @@ def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
     assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
+@pytest.mark.slow
 def test_dense_output_agrees_with_the_vector_field():
     """The time derivative of the interpolant, which an event's root finder uses."""
     projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)

@@ -56,6 +56,7 @@ def test_implicit_solvers_take_the_tolerances_of_the_controller(solver):
     assert on_rigid_body(sol.ys)
 
 
+@pytest.mark.slow
 def test_half_solver_on_either_side():
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
     reference = solve(

@@ -98,6 +98,7 @@ def test_contradicting_constraints_name_one_of_them(errors_raise):
         run(manifold)
 
 
+@pytest.mark.slow
 def test_many_entries_are_not_named_one_by_one(errors_raise):
     manifold = [
         dfc.FirstIntegral(lambda t, y, args, k=k: out_of_reach(t, y[k], args)) for k in range(18)

@@ -223,6 +223,7 @@ def test_adjoints_agree(reverse):
     np.testing.assert_allclose(backward, forward, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_the_weights_of_a_pinn():
     @eqx.filter_jit
     @eqx.filter_grad

@@ -107,6 +107,7 @@ def lorenz(**options):
     return sol, np.linalg.norm(sol.ys[-1] - system.reference(np.array([0.0, 100.0]))[-1])
 
 
+@pytest.mark.slow
 def test_a_projected_error_estimate_saves_steps_and_costs_accuracy():
     (plain, error), (projected, larger_error) = lorenz(), lorenz(project_error=True)
     assert projected.stats["num_steps"] < 0.95 * plain.stats["num_steps"]
@@ -171,6 +172,7 @@ def test_statistics_of_a_duplicated_integral_show_the_rank():
     assert dfc.statistics(sol).rank == 1
 
 
+@pytest.mark.slow
 def test_statistics_of_a_batch_and_of_a_nested_solver():
     def lane(scale):
         solver = dfx.HalfSolver(dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY))

@@ -53,6 +53,7 @@ def test_exact_solutions_agree_with_a_numerical_one(name):
         np.testing.assert_allclose(x, y, atol=2e-11)
 
 
+@pytest.mark.slow
 def test_the_pendulum_swings_and_turns_as_a_numerical_solution_does():
     many, y0s = batch(systems.CartesianPendulum(), 24)
     a = many_solutions(exact)(many, TS, y0s)

@@ -65,6 +65,7 @@ def test_a_flow_map_learns_from_trajectories(field):
     assert log.error < 1e-3
 
 
+@pytest.mark.slow
 def test_the_same_key_gives_the_same_result():
     before = network()
     first, second = (
@@ -170,6 +171,7 @@ def test_a_measured_rate_is_that_of_the_coordinates(name):
     assert not bool(flow_map.domain.contains(1e6 * states[0] + 1e6))
 
 
+@pytest.mark.slow
 def test_species_of_all_sizes_are_learned():
     """A chain of decays over eight orders of magnitude, from data, in Box-Cox coordinates."""
     mechanism = dfc.systems.Mechanism(["A -> B", "B -> C"], [1.0, 30.0])

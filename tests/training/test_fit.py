@@ -234,6 +234,7 @@ def test_the_schedules():
     np.testing.assert_array_equal(dfc.learned.constant_weight(es, epochs, steps), np.ones(epochs))
 
 
+@pytest.mark.slow
 def test_the_trained_loss_follows_the_schedule():
     """At the start of the staged schedule the layer does nothing, at its end everything."""
     still = dict(optimiser=optax.sgd(0.0), epochs=6, times=dfc.learned.grid_times)

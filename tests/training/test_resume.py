@@ -81,6 +81,7 @@ def test_an_interrupted_training_goes_on(make):
         assert model.windows > network.windows
 
 
+@pytest.mark.slow
 def test_twice_the_epochs_in_two_halves():
     """For an optimiser that does not know how many epochs there will be."""
     network, options = small_flow_map()
