@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 from hypothesis import given, settings
 from jax.flatten_util import ravel_pytree
 

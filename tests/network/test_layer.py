@@ -137,7 +137,8 @@ def finite_difference(f, x, direction, h=1e-5):
     return (f(x + h * direction) - f(x - h * direction)) / (2 * h)
 
 
-@pytest.mark.parametrize("distance", [pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
+@pytest.mark.slow
+@pytest.mark.parametrize("distance", [1e-3, 0.3])
 def test_first_and_second_derivatives(distance):
     """To second order, since every loss with a time derivative needs the gradient of one."""
     layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)

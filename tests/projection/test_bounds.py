@@ -123,7 +123,8 @@ def test_a_candidate_within_the_bounds_is_projected_as_without():
     assert largest((y - expected)[untouched]) < 1e-13
 
 
-@SIMPLIFIED_BY_DEFAULT
+@pytest.mark.slow
+@BOTH
 def test_bounds_that_are_far_away_change_nothing(kind):
     """Also for candidates from which a bounded iteration alone would not arrive."""
 
@@ -210,7 +211,7 @@ def test_derivatives_are_those_of_differences(kind):
     assert jnp.allclose(reverse, forward, atol=1e-12)
 
 
-@BOTH
+@SIMPLIFIED_BY_DEFAULT
 def test_what_cannot_be_fails(kind):
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
     y = jnp.array([0.3, -0.2, 0.5])

@@ -56,7 +56,8 @@ def soliton(solver, steps):
     )
 
 
-@pytest.mark.parametrize("steps", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [200, 100_000])
 def test_a_soliton_keeps_norm_and_energy(steps):
     sol = soliton(dfc.ManifoldProjection(dfc.RK4(), MANIFOLD), steps)
     assert largest(drift_of(sol, MANIFOLD)) < 4e-15
@@ -159,11 +160,11 @@ def in_parts_and_whole(complex_one, real_one):
 
 
 def projections(*default):
-    """By default those that join several options, one at a time in the slow run."""
+    """By default those named, and all in the slow run."""
     return [n if n in default else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS]
 
 
-@pytest.mark.parametrize("name", projections("bounded-metric", "staged"))
+@pytest.mark.parametrize("name", projections("bounded-metric"))
 def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     (got, info), (expected, real_info) = in_parts_and_whole(*PROJECTIONS[name])
     assert info.ok

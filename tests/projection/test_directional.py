@@ -90,12 +90,10 @@ def test_it_lies_on_the_line_along_the_embedded_difference():
     assert abs(energy(0.0, jax.tree.map(lambda x: x[-1], plain), ONE) - energy(0.0, Y0, ONE)) > 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inner", "order"),
-    [
-        pytest.param(dfx.Bosh3(), 3, id="bosh3", marks=pytest.mark.slow),
-        pytest.param(dfx.Dopri5(), 5, id="dopri5"),
-    ],
+    [pytest.param(dfx.Bosh3(), 3, id="bosh3"), pytest.param(dfx.Dopri5(), 5, id="dopri5")],
 )
 def test_the_order_survives(inner, order):
     solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())

@@ -65,13 +65,14 @@ PAIRS = {
 }
 
 
-@some_of("projection,linear_solver", PAIRS.values(), ids=PAIRS, period=3)
+@some_of("projection,linear_solver", PAIRS.values(), ids=PAIRS, period=4)
 def test_few_constraints(projection, linear_solver):
     y = jax.tree.map(lambda x: x + 1e-3 * jnp.arange(1, x.size + 1), KEPLER.y0)
     agree(KEPLER.manifold, KEPLER.y0, y, projection, linear_solver)
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [20, 150])
 def test_many_constraints(count):
     y0, offset = candidate(count)
     solvers = lx.Cholesky(), lx.CG(1e-12, 0.0)

@@ -12,7 +12,6 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..problems import drift_of, largest
-from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
 
@@ -90,7 +89,10 @@ def between(first, last):
     [
         pytest.param({}, marks=pytest.mark.slow),
         {"stepsize_controller": ADAPTIVE},
-        {"t0": 2.0, "t1": 0.0, "dt0": -0.1, "saveat": between(1.97, 0.03)},
+        pytest.param(
+            {"t0": 2.0, "t1": 0.0, "dt0": -0.1, "saveat": between(1.97, 0.03)},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"t0": 1.0, "t1": -1.0, "dt0": -0.1}, marks=pytest.mark.slow),
         pytest.param({"saveat": between(0.03, 1.97)}, marks=pytest.mark.slow),
         pytest.param({"solver": dfc.RK4(), "dt0": 0.3}, marks=pytest.mark.slow),
@@ -142,16 +144,17 @@ def test_the_balance_holds_against_an_independent_integral():
 SLOW = pytest.mark.slow
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("solver", "step", "order"),
     [
-        pytest.param(dfx.Euler(), 0.25, 1, id="euler", marks=SLOW),
-        pytest.param(dfx.Heun(), 0.25, 2, id="heun", marks=SLOW),
-        pytest.param(dfx.Bosh3(), 0.25, 3, id="bosh3", marks=SLOW),
-        pytest.param(dfc.RK4(), 0.25, 4, id="rk4", marks=SLOW),
+        pytest.param(dfx.Euler(), 0.25, 1, id="euler"),
+        pytest.param(dfx.Heun(), 0.25, 2, id="heun"),
+        pytest.param(dfx.Bosh3(), 0.25, 3, id="bosh3"),
+        pytest.param(dfc.RK4(), 0.25, 4, id="rk4"),
         pytest.param(dfx.Tsit5(), 0.25, 5, id="tsit5"),
         # Its dense output, and with it the balance, is of a lower order than the state.
-        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8", marks=SLOW),
+        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8"),
     ],
 )
 def test_the_order_survives(solver, step, order):
@@ -166,11 +169,11 @@ def test_the_order_survives(solver, step, order):
     )
 
 
-@some_of(
+@SLOW
+@pytest.mark.parametrize(
     "balance",
     [BALANCE, dfc.FirstIntegral(energy, rate=power, value=0.1)],
     ids=["of-the-start", "given"],
-    period=2,
 )
 def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
     late = dfx.SaveAt(ts=jnp.array([0.5, 1.0]), dense=True)
@@ -325,11 +328,11 @@ def test_mistakes_are_named():
         dct.assert_conserved(solve(), BALANCE, ARGS)
 
 
-@some_of(
-    "solver,step",
+@SLOW
+@pytest.mark.parametrize(
+    ("solver", "step"),
     [(dfx.Heun(), 0.02), (dfx.Bosh3(), 0.05), (dfx.Tsit5(), 0.1)],
     ids=["heun", "bosh3", "tsit5"],
-    period=3,
 )
 def test_the_dissipated_entropy_of_arkode(solver, step):
     """`u' = -e^u` with the entropy `e^u`: no worse than without, by more than a fifth."""

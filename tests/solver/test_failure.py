@@ -153,10 +153,10 @@ def test_what_a_vector_field_does_not_conserve_is_kept_on_demand():
 @pytest.mark.parametrize(
     "source",
     [
-        lambda q, p: -0.1 * p,
+        pytest.param(lambda q, p: -0.1 * p, marks=pytest.mark.slow),
         lambda q, p: -(p**3),
-        lambda q, p: (1 - q**2) * p,
-        lambda q, p: q - jnp.sin(q),
+        pytest.param(lambda q, p: (1 - q**2) * p, marks=pytest.mark.slow),
+        pytest.param(lambda q, p: q - jnp.sin(q), marks=pytest.mark.slow),
     ],
     ids=["friction", "cubic-friction", "van-der-pol", "pendulum"],
 )

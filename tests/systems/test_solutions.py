@@ -44,7 +44,10 @@ def batch(system, num):
     return eqx.filter_jit(eqx.filter_vmap(draw))(jr.split(jr.key(3), num))
 
 
-@pytest.mark.parametrize("name", ["harmonic-oscillator", "rigid-body", "kepler"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) for n in ("harmonic-oscillator", "rigid-body")] + ["kepler"],
+)
 def test_exact_solutions_agree_with_a_numerical_one(name):
     many, y0s = batch(systems.get(name), 16)
     a = many_solutions(exact)(many, TS, y0s)

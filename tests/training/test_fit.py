@@ -79,14 +79,9 @@ def test_a_pinn_learns_a_solution(layer):
     assert log.best < log.criteria[0] / 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "layer",
-    [
-        None,
-        pytest.param(
-            dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2), marks=pytest.mark.slow
-        ),
-    ],
+    "layer", [None, dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2)]
 )
 def test_a_deeponet_learns_a_flow_map(layer):
     before = flow_map(layer=layer)

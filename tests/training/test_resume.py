@@ -64,7 +64,9 @@ def same(found, expected):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("make", [small_flow_map, small_pinn])
+@pytest.mark.parametrize(
+    "make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_training_goes_on(make):
     network, options = make()
     whole = dfc.fit(network, **options)
