@@ -165,6 +165,7 @@ def test_the_others_solve_our_equations(precision, name):
         np.testing.assert_allclose(gradient(*state), ours, rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rigid-body", "kepler"])
 @pytest.mark.parametrize("program", ["CVODE", "CVODE with projection", "heyoka", "homproj"])
 def test_the_others_arrive_where_we_do(precision, name, program):

@@ -232,10 +232,7 @@ def test_success_implies_that_the_solution_is_conserved(name, data):
 
 @pytest.mark.parametrize(
     ("dimension", "integrals"),
-    [
-        pytest.param(*p, marks=pytest.mark.slow)
-        for p in [(3, 2), (2, 1), (5, 1), (4, 2), (6, 2)]
-    ],
+    [pytest.param(*p, marks=pytest.mark.slow) for p in [(3, 2), (2, 1), (5, 1), (4, 2), (6, 2)]],
 )
 @settings(max_examples=15)
 @given(data=st.data())

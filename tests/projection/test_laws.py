@@ -215,7 +215,6 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
         assert abs(int(info.num_steps[i]) - int(alone_info.num_steps)) <= 1
 
 
-@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]))
 def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
     """From none to all of a batch: few are gathered, many iterate together, and some then fail."""

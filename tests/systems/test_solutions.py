@@ -46,7 +46,8 @@ def batch(system, num):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow) for n in ("harmonic-oscillator", "rigid-body")] + ["kepler"],
+    [pytest.param(n, marks=pytest.mark.slow) for n in ("harmonic-oscillator", "rigid-body")]
+    + ["kepler"],
 )
 def test_exact_solutions_agree_with_a_numerical_one(name):
     many, y0s = batch(systems.get(name), 16)

@@ -80,9 +80,7 @@ def test_a_pinn_learns_a_solution(layer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "layer", [None, dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2)]
-)
+@pytest.mark.parametrize("layer", [None, dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2)])
 def test_a_deeponet_learns_a_flow_map(layer):
     before = flow_map(layer=layer)
     after, log = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=150, points=200)

@@ -64,9 +64,7 @@ def same(found, expected):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
 def test_an_interrupted_training_goes_on(make):
     network, options = make()
     whole = dfc.fit(network, **options)
