@@ -127,6 +127,7 @@ def test_one_lucky_error_does_not_count(precision_curves):
     assert 100 < precision_curves.time_to(rows, "error", 1e-5) < 1000
 
 
+@pytest.mark.slow
 def test_every_timed_answer_is_judged(precision):
     system = precision.SYSTEMS["rigid-body"]
     solver = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)

@@ -210,6 +210,7 @@ def test_a_conservative_network_is_its_candidate_moved():
     np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_lanes():
     net = flow_map(layer=dfc.learned.ConservativeLayer(LORENZ.manifold))
     y0s, hs = states(6), jnp.linspace(0, 0.25, 6)

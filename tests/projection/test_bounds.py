@@ -72,8 +72,15 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
-@BOTH
-@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        pytest.param(dfc.Newton, 60, id="60-newton"),
+        pytest.param(dfc.SimplifiedNewton, 60, id="60-simplified", marks=pytest.mark.slow),
+        pytest.param(dfc.Newton, 1000, id="1000-newton", marks=pytest.mark.slow),
+        pytest.param(dfc.SimplifiedNewton, 1000, id="1000-simplified", marks=pytest.mark.slow),
+    ],
+)
 def test_it_solves_the_quadratic_program(kind, count):
     rng = np.random.default_rng(1)
     atoms, values, candidates = chemistry(rng, count)

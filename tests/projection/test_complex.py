@@ -159,12 +159,8 @@ def in_parts_and_whole(complex_one, real_one):
     return got, (join(expected[0]), expected[1])
 
 
-def projections(*default):
-    """By default those named, and all in the slow run."""
-    return [n if n in default else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS]
-
-
-@pytest.mark.parametrize("name", projections("bounded-metric"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROJECTIONS)
 def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     (got, info), (expected, real_info) = in_parts_and_whole(*PROJECTIONS[name])
     assert info.ok
@@ -178,7 +174,10 @@ def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     [dfx.Euler(), pytest.param(dfx.Bosh3(), marks=pytest.mark.slow)],
     ids=["euler", "bosh3"],
 )
-@pytest.mark.parametrize("name", projections("simplified"))
+@pytest.mark.parametrize(
+    "name",
+    [n if n == "simplified" else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS],
+)
 def test_it_is_the_solve_in_real_and_imaginary_parts(name, inner):
     complex_one, real_one = PROJECTIONS[name]
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9))

@@ -174,6 +174,7 @@ def test_gradient_with_redundant_constraints_is_that_without():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_constraints_agree_with_finite_differences():
     chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args)
     rng = np.random.default_rng(0)

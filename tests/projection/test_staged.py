@@ -114,6 +114,7 @@ def test_derivatives_in_both_modes_agree_with_finite_differences(forward):
     dct.assert_gradients(run, gravity, rtol=1e-6, forward=forward, reverse=not forward)
 
 
+@pytest.mark.slow
 def test_a_lane_of_a_batch_is_that_lane_alone():
     gravities = jnp.array([9.81, 13.0, 1.6])
     # The simplest of all solvers, as it is the projection that is in question.

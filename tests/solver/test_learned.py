@@ -199,12 +199,10 @@ def test_gradients_of_a_rollout(layer, projection):
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reverse",
-    [
-        dfx.RecursiveCheckpointAdjoint(),
-        pytest.param(dfx.DirectAdjoint(), marks=pytest.mark.slow),
-    ],
+    [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()],
     ids=["checkpoints", "direct"],
 )
 def test_adjoints_agree(reverse):
