@@ -176,6 +176,7 @@ LAWS = [
 
 # Tests of single features hold these by default.
 SLOW = {
+    an_autonomous_solve_may_start_at_any_time,
     a_moving_frame_moves_the_solution,
     a_continued_solve_is_one_solve,
     every_way_to_save_shows_the_same,

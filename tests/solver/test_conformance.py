@@ -104,7 +104,7 @@ def problem(kind):
     raise AssertionError(kind)
 
 
-# By default one solver of each kind, but one kind of noise.
+# By default one solver of each kind, but none of additive noise and of Langevin's equations.
 FIRST_OF_ITS_KIND = {
     name
     for kind, name in {kind: name for name, kind in reversed(TABLE.items())}.items()

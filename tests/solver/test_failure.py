@@ -187,7 +187,7 @@ def attracted(t, y, args):
     [
         (cancelling, [0.3, -0.4, 0.1, 0.2, 0.5], None, 4),
         (attracted, [0.6, 0.0, 0.8], 1e-12, 2),
-        (attracted, [0.6, 0.0, 0.8], 10.0, 2),
+        pytest.param(attracted, [0.6, 0.0, 0.8], 10.0, 2, marks=pytest.mark.slow),
     ],
     ids=["forces-cancel", "weak", "strong"],
 )
@@ -205,9 +205,14 @@ TIMES = {"t0": 2.0, "t1": 1.0, "dt0": -0.1}
 @pytest.mark.parametrize(
     ("fn", "rate", "options"),
     [
-        (square, None, TIMES),
+        pytest.param(square, None, TIMES, marks=pytest.mark.slow),
         (lambda t, y, args: square(t, y, args) + t**2, lambda t, y, args: 2 * t, TIMES),
-        (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, {}),
+        pytest.param(
+            lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t),
+            None,
+            {},
+            marks=pytest.mark.slow,
+        ),
         (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, TIMES),
     ],
     ids=["backwards", "balance-backwards", "in-time", "in-time-backwards"],

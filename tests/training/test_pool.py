@@ -318,6 +318,7 @@ def test_a_domain_of_shapes_is_extended_by_shapes():
     assert extended.fastest == domain.fastest
 
 
+@pytest.mark.slow
 def test_vortices_that_turn_too_fast_start_again():
     """For the network time would be longer than what it calls one."""
     network = framed()

@@ -113,7 +113,7 @@ def test_it_ends_at_a_target_and_after_a_time():
     assert np.isinf(log.errors[1])
 
 
-@pytest.mark.parametrize("make", [small_flow_map, small_pinn])
+@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
 def test_a_checkpoint_is_the_state(make, tmp_path):
     network, options = make()
     path = tmp_path / "training.checkpoint"
