@@ -127,6 +127,7 @@ def test_one_lucky_error_does_not_count(precision_curves):
     assert 100 < precision_curves.time_to(rows, "error", 1e-5) < 1000
 
 
+@pytest.mark.slow
 def test_every_timed_answer_is_judged(precision):
     system = precision.SYSTEMS["rigid-body"]
     solver = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)
@@ -165,6 +166,7 @@ def test_the_others_solve_our_equations(precision, name):
         np.testing.assert_allclose(gradient(*state), ours, rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rigid-body", "kepler"])
 @pytest.mark.parametrize("program", ["CVODE", "CVODE with projection", "heyoka", "homproj"])
 def test_the_others_arrive_where_we_do(precision, name, program):
@@ -245,6 +247,7 @@ def test_a_goal_is_reached_or_missed():
     assert not goal("", 2, None).reached
 
 
+@pytest.mark.slow
 def test_the_figures_show_every_curve(tmp_path):
     report = benchmark("report")
     results = report.read_results()

@@ -208,6 +208,7 @@ for path in sys.argv[2:]:
 """
 
 
+@pytest.mark.slow
 def test_memory(tmp_path):
     """The peak of a process that reads all of them, over that of one that has read a good file."""
     good, paths = tmp_path / "good.network", []

@@ -146,6 +146,7 @@ def test_nested_implicit_solver_without_tolerances():
         dfc.ManifoldProjection(dfx.HalfSolver(dfx.Kvaerno3()), RIGID_BODY)
 
 
+@pytest.mark.slow
 def test_initial_state_off_a_constraint(errors_raise):
     sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
     with pytest.raises(eqx.EquinoxRuntimeError, match="initial state violates `manifold`"):

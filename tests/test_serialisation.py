@@ -14,6 +14,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator, solution, states
+from .thinned import some_of
 
 VORTICES = dfc.systems.PointVortices()
 
@@ -263,7 +264,7 @@ def test_every_pretrained_network(name, kind):
         np.testing.assert_allclose(y, system.y0, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@some_of("name", SYSTEMS, ids=SYSTEMS, period=5)
 def test_every_network_of_the_zoo(name):
     network = dfc.load_pretrained(name)
     file = dfc.learned.pretrained_path(name)

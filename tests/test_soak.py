@@ -24,6 +24,7 @@ def run():
     return lanes, combinations.run_batch(PROGRAM, lanes)
 
 
+@pytest.mark.slow
 def test_what_is_right_is_judged_right(run):
     verdict = combinations.judge(PROGRAM, *run)
     assert not verdict.failed.any()
@@ -31,6 +32,7 @@ def test_what_is_right_is_judged_right(run):
     assert 0 < verdict.worst_ratio <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [("ratio", 1.5, "residual"), ("ratio", np.nan, "residual"), ("finite", False, "not finite")],
@@ -45,6 +47,7 @@ def test_what_is_wrong_is_found(run, field, value, reason):
     assert combinations.judge(PROGRAM, lanes, failed).wrong == {}
 
 
+@pytest.mark.slow
 def test_a_wrong_solution_on_the_manifold_is_found(run):
     lanes, outcome = run
     mirrored = eqx.tree_at(lambda o: o.states, outcome, jax.tree.map(lambda x: -x, outcome.states))

@@ -116,9 +116,8 @@ def pendulum_end():
     return jax.tree.map(lambda y: y[-1], PENDULUM.reference(jnp.array([0.0, T1])))
 
 
-@pytest.mark.parametrize(
-    "which", ["pendulum", pytest.param("double pendulum", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["pendulum", "double pendulum"])
 def test_rk4_is_of_order_four(which, double_end):
     if which == "pendulum":
         field, manifold, y0, end = ROD, ROD_MANIFOLD, PENDULUM.y0, pendulum_end()
@@ -164,6 +163,7 @@ def test_invariance_is_proved():
     assert not dfc.check_invariance(FALLING, ROD_MANIFOLD, states).ok
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_solve_are_those_of_differences():
     solver = dfc.ManifoldProjection(dfx.Euler(), ROD_MANIFOLD)  # the quickest to compile
 
@@ -253,9 +253,8 @@ def turning(angle, rate):
     return jax.jvp(positions, (angle,), (rate,))
 
 
-@pytest.mark.parametrize(
-    "turns", [20, pytest.param(10_000, marks=pytest.mark.slow)], ids=lambda n: f"{n}-turns"
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("turns", [20, 10_000], ids=lambda n: f"{n}-turns")
 def test_a_four_bar_linkage_closes_and_keeps_its_branch(turns):
     @eqx.filter_jit
     def run(y0, steps):

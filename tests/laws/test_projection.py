@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 from hypothesis import given, settings
 from jax.flatten_util import ravel_pytree
 
@@ -254,7 +255,19 @@ LAWS = [
 SKIP = {("the_correction_is_orthogonal_to_the_flow", "cartesian-pendulum")}
 
 
-@every_law_on_every_system(LAWS, SKIP)
+# `projection/test_laws.py` holds these by default, and a law like it the others.
+SLOW = {
+    the_order_of_the_constraints_is_free,
+    a_duplicated_constraint_changes_nothing,
+    affine_functions_of_the_integrals_change_nothing,
+    a_constant_factor_of_the_metric_changes_nothing,
+    the_pytree_of_the_state_is_free,
+    translations_of_the_coordinates_commute,
+    a_lane_of_a_batch_is_that_lane_alone,
+}
+
+
+@every_law_on_every_system(LAWS, SKIP, SLOW)
 @settings(max_examples=8)
 @given(data=st.data())
 def test_law(law, name, data):
@@ -290,6 +303,7 @@ def test_success(law, name, data):
     law(system, data.draw(inputs(system)))
 
 
+@pytest.mark.slow
 @settings(max_examples=3)
 @given(packing=dct.restructurings(SYSTEMS["kepler"].y0))
 def test_every_pytree_of_the_state_gives_the_same(packing):

@@ -174,8 +174,21 @@ LAWS = [
 ]
 
 
+# Tests of single features hold these by default.
+SLOW = {
+    an_autonomous_solve_may_start_at_any_time,
+    a_moving_frame_moves_the_solution,
+    a_continued_solve_is_one_solve,
+    every_way_to_save_shows_the_same,
+    a_lane_of_a_batch_is_that_lane_alone,
+    the_gradient_of_an_integral_is_carried_back_unchanged,
+}
+
+
 @every_law_on_every_system(
-    LAWS, skip={(the_gradient_of_an_integral_is_carried_back_unchanged.__name__, PARALLEL)}
+    LAWS,
+    skip={(the_gradient_of_an_integral_is_carried_back_unchanged.__name__, PARALLEL)},
+    slow=SLOW,
 )
 @settings(max_examples=6)
 @given(data=st.data())
@@ -221,10 +234,7 @@ def test_success_implies_that_the_solution_is_conserved(name, data):
 
 @pytest.mark.parametrize(
     ("dimension", "integrals"),
-    [
-        (3, 2),
-        *(pytest.param(*p, marks=pytest.mark.slow) for p in [(2, 1), (5, 1), (4, 2), (6, 2)]),
-    ],
+    [pytest.param(*p, marks=pytest.mark.slow) for p in [(3, 2), (2, 1), (5, 1), (4, 2), (6, 2)]],
 )
 @settings(max_examples=15)
 @given(data=st.data())
@@ -235,10 +245,8 @@ def test_random_quadratic_integrals_are_conserved(dimension, integrals, data):
     dct.assert_conserved(sol, system.manifold, y0=system.y0)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [n if n == "conservative-lorenz" else pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_the_order_survives_the_projection(name):
     system = SYSTEMS[name]
     # Their own steps are so short that the errors would be roundoff.

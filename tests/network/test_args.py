@@ -13,6 +13,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from ..learned import unchecked
+
 BOX = dfc.learned.Box(
     {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
 )
@@ -71,7 +73,10 @@ def test_its_polynomial_has_the_args_of_the_call():
     np.testing.assert_allclose(slope, spring(0.0, Y0, ARGS), rtol=1e-14)
 
 
-@pytest.mark.parametrize("wrap", ["repeated", "transformed", "function"])
+@pytest.mark.parametrize(
+    "wrap",
+    ["repeated", *(pytest.param(w, marks=pytest.mark.slow) for w in ("transformed", "function"))],
+)
 def test_what_wraps_a_flow_map_hands_args_on(wrap):
     inner = family()
     match wrap:
@@ -133,6 +138,7 @@ def test_a_layer_or_args_of_the_polynomial_are_refused():
 # ---- Training ----
 
 
+@pytest.mark.slow
 def test_a_training_draws_args_and_leaves_the_domain(trained):
     flow_map, log = trained
     assert isinstance(flow_map, dfc.DeepONet)
@@ -149,23 +155,25 @@ def test_a_training_draws_args_and_leaves_the_domain(trained):
     assert np.max(error(jr.split(jr.key(4), 8))) < 2e-3
 
 
-def test_derivatives_by_args_are_those_of_the_solve_and_of_the_equation(trained):
-    flow_map, _ = trained
+def _last(args, solver):
+    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8).ys[0]
 
-    def last(args, solver):
-        return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8).ys[0]
 
-    @eqx.filter_jit
-    def derivatives(args, learned):
-        forward = jax.jacfwd(lambda args: _forward(args, learned))(args)
-        return forward, jax.jacrev(last)(args, learned), jax.jacfwd(_fine)(args)
-
-    learned = dfc.DeepONetSolver(flow_map)
-    forward, reverse, exact = derivatives(ARGS, learned)
-    compiled_last = eqx.filter_jit(last)
+@pytest.mark.slow
+def test_derivatives_by_args_are_those_of_the_equation(trained):
+    learned = dfc.DeepONetSolver(trained[0])
+    forward = eqx.filter_jit(jax.jacfwd(_forward))(ARGS, learned)
+    reverse = eqx.filter_jit(jax.jacrev(_last))(ARGS, learned)
+    exact = jax.jit(jax.jacfwd(_fine))(ARGS)
     for name in ARGS:
         np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9)
         np.testing.assert_allclose(reverse[name], exact[name], atol=2e-2)
+
+
+def test_derivatives_by_args_are_those_of_the_solve():
+    learned = unchecked(family())
+    reverse = eqx.filter_jit(jax.jacrev(_last))(ARGS, learned)
+    compiled_last = eqx.filter_jit(_last)
     step = 1e-5
     for name, direction in (("w", 1.0), ("b", jnp.array([0.0, 1.0]))):
         ends = [
@@ -186,6 +194,7 @@ def _fine(args):
     return dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 2.0, 0.05, Y0, args, adjoint=adjoint).ys[0]
 
 
+@pytest.mark.slow
 def test_it_learns_from_data_of_many_args():
     args = jax.vmap(BOX.sample)(jr.split(jr.key(5), 40))
     field = lambda t, y, _: (spring(t, *y), jax.tree.map(jnp.zeros_like, y[1]))  # noqa: E731

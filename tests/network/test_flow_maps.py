@@ -113,6 +113,7 @@ def test_its_domain_is_the_box_round_its_states():
 # ---- Windows ----
 
 
+@pytest.mark.slow
 def test_a_pinn_of_windows_follows_them():
     pinn = solution(t1=3.0, windows=3)
     assert pinn.windows == 3
@@ -139,6 +140,7 @@ def test_wrong_windows_are_named(wrong):
         solution(**wrong)
 
 
+@pytest.mark.slow
 def test_the_units_of_a_first_layer_are_spread_over_the_interval():
     pinn = dfc.PINN(EAST, 0.0, 1.0, width=500, depth=1, slope=2.0, key=jr.key(0))
     net = pinn.window(0).net
@@ -147,21 +149,23 @@ def test_the_units_of_a_first_layer_are_spread_over_the_interval():
     np.testing.assert_allclose(jnp.quantile(centres, jnp.array([0, 0.5, 1])), [-1, 0, 1], atol=0.1)
 
 
-def test_a_solve_across_windows():
+@pytest.mark.parametrize("projected", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_solve_across_windows(projected):
     pinn = dfc.PINN(EAST, 0.0, 4.0, windows=2, width=8, depth=1, slope=2.0, key=jr.key(0))
     end = pinn.window(0)(2.0)
     pinn = eqx.tree_at(lambda p: p.y0s, pinn, jnp.stack([EAST, end]))
     ts = jnp.linspace(0, 4, 9)
 
-    def solve(solver):
-        return eqx.filter_jit(dfx.diffeqsolve)(
-            dfx.ODETerm(oscillator), solver, 0.0, 4.0, 0.4, EAST, saveat=dfx.SaveAt(ts=ts)
-        ).ys
-
-    plain = dfc.PINNSolver(pinn)
-    np.testing.assert_allclose(solve(plain), jax.jit(jax.vmap(pinn))(ts), atol=1e-8)
-    projected = solve(dfc.ManifoldProjection(plain, RADIUS, projection=dfc.Newton()))
-    np.testing.assert_allclose(jnp.sum(projected**2, axis=1), 1, rtol=4e-15)
+    solver = dfc.PINNSolver(pinn)
+    if projected:
+        solver = dfc.ManifoldProjection(solver, RADIUS, projection=dfc.Newton())
+    ys = eqx.filter_jit(dfx.diffeqsolve)(
+        dfx.ODETerm(oscillator), solver, 0.0, 4.0, 0.4, EAST, saveat=dfx.SaveAt(ts=ts)
+    ).ys
+    if projected:
+        np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 1, rtol=4e-15)
+    else:
+        np.testing.assert_allclose(ys, jax.jit(jax.vmap(pinn))(ts), atol=1e-8)
 
 
 # ---- Other coordinates ----

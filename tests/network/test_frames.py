@@ -112,6 +112,7 @@ def test_its_domain_is_one_of_shapes():
     np.testing.assert_array_equal(contains(0.01 * y0s), False)
 
 
+@pytest.mark.slow
 def test_training_measures_the_defect_in_the_frame():
     network = framed(1, core=dfc.learned.Concatenated)
     y0s, ts = states(20, VORTICES), jnp.linspace(0.0, STEP, 20)
@@ -156,6 +157,7 @@ def test_training_lessens_the_error():
     assert after < 0.1 * before
 
 
+@pytest.mark.slow
 def test_a_frame_of_a_dictionary():
     def polar(y):
         x = jnp.stack([y["q"], y["p"]])

@@ -156,6 +156,7 @@ def test_its_step_against_keplers_equation():
     assert np.max(error) < 2e-5
 
 
+@pytest.mark.slow
 def test_a_hundred_projected_steps_against_keplers_equation():
     elements, place = random_orbits(40, seed=2)
     y0s = arrays(ellipses(**elements, **place))

@@ -41,6 +41,7 @@ def test_enough_iterations_reach_the_manifold_from_far_away(seed, halves):
     assert residual(layer, y, values) < 1e-14
 
 
+@pytest.mark.slow
 def test_each_iteration_comes_nearer():
     candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
     left = []
@@ -136,7 +137,8 @@ def finite_difference(f, x, direction, h=1e-5):
     return (f(x + h * direction) - f(x - h * direction)) / (2 * h)
 
 
-@pytest.mark.parametrize("distance", [pytest.param(1e-3, marks=pytest.mark.slow), 0.3])
+@pytest.mark.slow
+@pytest.mark.parametrize("distance", [1e-3, 0.3])
 def test_first_and_second_derivatives(distance):
     """To second order, since every loss with a time derivative needs the gradient of one."""
     layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)
@@ -208,6 +210,7 @@ def test_a_conservative_network_is_its_candidate_moved():
     np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_lanes():
     net = flow_map(layer=dfc.learned.ConservativeLayer(LORENZ.manifold))
     y0s, hs = states(6), jnp.linspace(0, 0.25, 6)

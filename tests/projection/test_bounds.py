@@ -72,8 +72,15 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
-@BOTH
-@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        pytest.param(dfc.Newton, 60, id="60-newton"),
+        pytest.param(dfc.SimplifiedNewton, 60, id="60-simplified", marks=pytest.mark.slow),
+        pytest.param(dfc.Newton, 1000, id="1000-newton", marks=pytest.mark.slow),
+        pytest.param(dfc.SimplifiedNewton, 1000, id="1000-simplified", marks=pytest.mark.slow),
+    ],
+)
 def test_it_solves_the_quadratic_program(kind, count):
     rng = np.random.default_rng(1)
     atoms, values, candidates = chemistry(rng, count)
@@ -104,6 +111,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     assert jnp.quantile(residual, 0.999) <= 4 * EPS
 
 
+@pytest.mark.slow
 def test_a_candidate_within_the_bounds_is_projected_as_without():
     rng = np.random.default_rng(3)
     atoms, values, candidates = chemistry(rng, MANY)
@@ -122,7 +130,8 @@ def test_a_candidate_within_the_bounds_is_projected_as_without():
     assert largest((y - expected)[untouched]) < 1e-13
 
 
-@SIMPLIFIED_BY_DEFAULT
+@pytest.mark.slow
+@BOTH
 def test_bounds_that_are_far_away_change_nothing(kind):
     """Also for candidates from which a bounded iteration alone would not arrive."""
 
@@ -162,6 +171,7 @@ def test_a_bound_that_is_nan_is_never_ignored():
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
 
+@pytest.mark.slow
 def test_the_nearest_point_of_a_sphere_within_an_orthant():
     """Which is known: what is negative becomes zero, and the rest is divided by its norm."""
     candidates = jnp.asarray(np.random.default_rng(4).normal(size=(200, 4)))
@@ -208,7 +218,7 @@ def test_derivatives_are_those_of_differences(kind):
     assert jnp.allclose(reverse, forward, atol=1e-12)
 
 
-@BOTH
+@SIMPLIFIED_BY_DEFAULT
 def test_what_cannot_be_fails(kind):
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
     y = jnp.array([0.3, -0.2, 0.5])

@@ -39,6 +39,7 @@ def test_it_agrees_with_newton_and_so_do_its_derivatives():
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_dense_output_is_projected_by_it():
     sol = run(dfc.ClosedForm(rescale), jnp.array([3.0, 4.0]), 1.0, saveat=dfx.SaveAt(dense=True))
     ys = evaluated(sol, jnp.linspace(0, 1, 7))

@@ -56,7 +56,8 @@ def soliton(solver, steps):
     )
 
 
-@pytest.mark.parametrize("steps", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [200, 100_000])
 def test_a_soliton_keeps_norm_and_energy(steps):
     sol = soliton(dfc.ManifoldProjection(dfc.RK4(), MANIFOLD), steps)
     assert largest(drift_of(sol, MANIFOLD)) < 4e-15
@@ -158,12 +159,8 @@ def in_parts_and_whole(complex_one, real_one):
     return got, (join(expected[0]), expected[1])
 
 
-def projections(*default):
-    """By default those that join several options, one at a time in the slow run."""
-    return [n if n in default else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS]
-
-
-@pytest.mark.parametrize("name", projections("bounded-metric", "staged"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROJECTIONS)
 def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     (got, info), (expected, real_info) = in_parts_and_whole(*PROJECTIONS[name])
     assert info.ok
@@ -177,24 +174,34 @@ def test_it_is_the_projection_in_real_and_imaginary_parts(name):
     [dfx.Euler(), pytest.param(dfx.Bosh3(), marks=pytest.mark.slow)],
     ids=["euler", "bosh3"],
 )
-@pytest.mark.parametrize("name", projections("simplified"))
+@pytest.mark.parametrize(
+    "name",
+    [n if n == "simplified" else pytest.param(n, marks=pytest.mark.slow) for n in PROJECTIONS],
+)
 def test_it_is_the_solve_in_real_and_imaginary_parts(name, inner):
     complex_one, real_one = PROJECTIONS[name]
-    saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9), dense=True)
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9))
     got = solve(complex_one, inner=inner, saveat=saveat)
     expected = solve(
         real_one, split(Z0), vf=real_field, manifold=REAL_QUANTA, inner=inner, saveat=saveat
     )
     assert got.ys["z"].dtype == jnp.complex128
-    for a, b in [
-        (got.ys, join(expected.ys)),
-        (evaluated(got, 0.37), join(evaluated(expected, 0.37))),
-    ]:
-        for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-11)
+    for x, y in zip(jax.tree.leaves(got.ys), jax.tree.leaves(join(expected.ys)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-11)
     assert (got.result == dfx.RESULTS.successful) == (expected.result == dfx.RESULTS.successful)
 
 
+@pytest.mark.slow
+def test_dense_output_is_that_in_real_and_imaginary_parts():
+    saveat = dfx.SaveAt(dense=True)
+    got = solve(SIMPLIFIED, saveat=saveat)
+    expected = solve(SIMPLIFIED, split(Z0), vf=real_field, manifold=REAL_QUANTA, saveat=saveat)
+    pair = evaluated(got, 0.37), join(evaluated(expected, 0.37))
+    for x, y in zip(*map(jax.tree.leaves, pair), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-11)
+
+
+@pytest.mark.slow
 def test_adaptive_steps_directions_and_formulas():
     number = {"q": dfc.FirstIntegral(lambda t, y, args: quanta(t, y, args)["number"])}
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
@@ -240,8 +247,8 @@ def one_projection(vf, manifold, adjoint):
 @pytest.mark.parametrize(
     "run", [one_projection, pytest.param(end_of_a_solve, marks=pytest.mark.slow)]
 )
-def test_derivatives_agree_with_those_in_parts(run):
-    reverse, forward = dfx.RecursiveCheckpointAdjoint(), dfx.ForwardMode()
+def test_gradients_agree_with_those_in_parts(run):
+    reverse = dfx.RecursiveCheckpointAdjoint()
 
     def total(y):
         z, x = y["z"], y["x"]
@@ -259,6 +266,12 @@ def test_derivatives_agree_with_those_in_parts(run):
     # jax's convention of the gradient by a complex number: the conjugate.
     np.testing.assert_allclose(got[0]["z"], expected[0]["re"] - 1j * expected[0]["im"], rtol=1e-10)
     np.testing.assert_allclose(got[1], expected[1], rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [one_projection, end_of_a_solve])
+def test_tangents_agree_with_those_in_parts(run):
+    forward = dfx.ForwardMode()
 
     @jax.jit
     def tangents(y, t):

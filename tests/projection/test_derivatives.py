@@ -9,7 +9,6 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..problems import OMEGA0
-from ..thinned import some_of
 
 PROJECTIONS = {"simplified": dfc.SimplifiedNewton(), "newton": dfc.Newton()}
 each_projection = pytest.mark.parametrize("projection", list(PROJECTIONS.values()), ids=PROJECTIONS)
@@ -116,15 +115,17 @@ def test_gradient_agrees_with_finite_differences(projection):
         assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(part)), name
 
 
-def test_derivatives_agree_with_the_unrolled_iteration():
+@pytest.mark.parametrize(
+    "transform", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev]
+)
+def test_derivatives_agree_with_the_unrolled_iteration(transform):
     def implicit(inputs):
         return projected(inputs, dfc.SimplifiedNewton())
 
-    for transform in (jax.jacfwd, jax.jacrev):
-        ours = jax.jit(transform(implicit))(INPUTS)
-        theirs = jax.jit(transform(unrolled_simplified_newton))(INPUTS)
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
+    ours = jax.jit(transform(implicit))(INPUTS)
+    theirs = jax.jit(transform(unrolled_simplified_newton))(INPUTS)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
 
 
 @each_projection
@@ -140,7 +141,8 @@ def test_forward_and_reverse_agree(projection):
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
-@some_of("projection", PROJECTIONS.values(), ids=PROJECTIONS, period=2)
+@pytest.mark.slow
+@each_projection
 def test_second_derivatives(projection):
     d = directions(3)
     _, second = eqx.filter_jit(
@@ -153,6 +155,7 @@ def test_second_derivatives(projection):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradient_with_redundant_constraints_is_that_without():
     def run(inputs, copies):
         manifold = (dfc.FirstIntegral(Energy(inputs["inertia"])),) * copies
@@ -171,6 +174,7 @@ def test_gradient_with_redundant_constraints_is_that_without():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_constraints_agree_with_finite_differences():
     chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args)
     rng = np.random.default_rng(0)
@@ -193,11 +197,11 @@ def test_many_constraints_agree_with_finite_differences():
 UNITS = jnp.array([1e-20, 1.0, 1e5, 1e13, 1e24])
 
 
-@some_of(
-    "kind,bounds",
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "bounds"),
     [(k, b) for b in ({}, {"lower": -9.0}) for k in (dfc.SimplifiedNewton, dfc.Newton)],
     ids=["free-simplified", "free-newton", "bounded-simplified", "bounded-newton"],
-    period=3,
 )
 def test_the_units_of_a_constraint_do_not_count(kind, bounds):
     """Nor do those of the state, if the metric follows."""

@@ -90,18 +90,17 @@ def test_it_lies_on_the_line_along_the_embedded_difference():
     assert abs(energy(0.0, jax.tree.map(lambda x: x[-1], plain), ONE) - energy(0.0, Y0, ONE)) > 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inner", "order"),
-    [
-        pytest.param(dfx.Bosh3(), 3, id="bosh3", marks=pytest.mark.slow),
-        pytest.param(dfx.Dopri5(), 5, id="dopri5"),
-    ],
+    [pytest.param(dfx.Bosh3(), 3, id="bosh3"), pytest.param(dfx.Dopri5(), 5, id="dopri5")],
 )
 def test_the_order_survives(inner, order):
     solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())
     dct.assert_order(solver, TERM, Y0, t1=0.3, dt0=0.05, args=ONE, order=order)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_agree_with_finite_differences():
     def run(y0, args):
         return jax.tree.map(lambda x: x[-1], solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2).ys)

@@ -36,7 +36,7 @@ def solve(projection, dtype):
 CASES = combinations({name: name for name in WORK}, {x.__name__: x for x in DTYPES})
 
 
-@some_of("name,dtype", CASES.values(), ids=CASES, period=2)
+@some_of("name,dtype", CASES.values(), ids=CASES, period=4)
 def test_it_works_in_half_precision(name, dtype):
     ys = solve(WORK[name], dtype).ys
     assert ys.dtype == dtype

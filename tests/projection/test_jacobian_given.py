@@ -80,11 +80,13 @@ def tangent(manifold, projection=None):
     return jax.jvp(end, (Y0, ONE), (Y0[::-1], 3 * ONE))[1]
 
 
-@pytest.mark.parametrize("derivative", [gradient, pytest.param(tangent, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [gradient, tangent])
 def test_derivatives_are_those_of_autodiff(derivative):
     same(derivative(CALLED), derivative(SEEN))
 
 
+@pytest.mark.slow
 def test_a_direction_needs_no_derivative_of_the_jacobian():
     same(gradient(ALL_CALLED, dfc.Directional()), gradient(SEEN, dfc.Directional()))
 

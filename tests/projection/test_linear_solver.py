@@ -65,13 +65,14 @@ PAIRS = {
 }
 
 
-@some_of("projection,linear_solver", PAIRS.values(), ids=PAIRS, period=3)
+@some_of("projection,linear_solver", PAIRS.values(), ids=PAIRS, period=4)
 def test_few_constraints(projection, linear_solver):
     y = jax.tree.map(lambda x: x + 1e-3 * jnp.arange(1, x.size + 1), KEPLER.y0)
     agree(KEPLER.manifold, KEPLER.y0, y, projection, linear_solver)
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(150, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [20, 150])
 def test_many_constraints(count):
     y0, offset = candidate(count)
     solvers = lx.Cholesky(), lx.CG(1e-12, 0.0)
@@ -112,6 +113,7 @@ def differences_and_derivatives(y0, x, v):
     return infos.ok[0], found, slope, pulled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [1e-4, 1e-2, 0.1, 0.3])
 def test_the_derivative_with_many_constraints_is_right_or_nan(distance):
     y0, offset = candidate(150)
@@ -124,6 +126,7 @@ def test_the_derivative_with_many_constraints_is_right_or_nan(distance):
         assert jnp.all(jnp.isfinite(slope))
 
 
+@pytest.mark.slow
 def test_with_bounds_and_a_metric():
     y0, offset = candidate(3)
     agree(chained(3), y0, y0 + offset, dfc.SimplifiedNewton, lx.Cholesky(), lower=0.95, metric=2.0)

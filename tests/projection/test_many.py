@@ -89,6 +89,7 @@ def test_a_lane_of_a_batch_is_that_lane_alone():
         np.testing.assert_allclose(y, projected(q)[0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_redundant_constraints_change_nothing():
     twice = {"once": CHAIN, "again": CHAIN}
     q = chain()

@@ -63,7 +63,8 @@ def test_relaxation_with_the_time_kept_loses_at_most_one_order():
     dct.assert_order(RELAXED, TERM, Y0, t1=2.0, dt0=0.2, args=ONE, order=3)
 
 
-@pytest.mark.parametrize("forward", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("forward", [True, False])
 def test_the_derivative_of_relaxation_is_that_of_its_solve(forward):
     adjoint = dfx.ForwardMode() if forward else dfx.RecursiveCheckpointAdjoint()
 
@@ -103,6 +104,7 @@ class Seen(dfc.AbstractProjection):
         return y, problem.judge(candidate, y, atol=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t1", [1.0, -1.0], ids=["forwards", "backwards"])
 def test_a_projection_sees_the_step_of_every_candidate(t1):
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())

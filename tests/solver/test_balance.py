@@ -12,7 +12,6 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..problems import drift_of, largest
-from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
 
@@ -90,7 +89,10 @@ def between(first, last):
     [
         pytest.param({}, marks=pytest.mark.slow),
         {"stepsize_controller": ADAPTIVE},
-        {"t0": 2.0, "t1": 0.0, "dt0": -0.1, "saveat": between(1.97, 0.03)},
+        pytest.param(
+            {"t0": 2.0, "t1": 0.0, "dt0": -0.1, "saveat": between(1.97, 0.03)},
+            marks=pytest.mark.slow,
+        ),
         pytest.param({"t0": 1.0, "t1": -1.0, "dt0": -0.1}, marks=pytest.mark.slow),
         pytest.param({"saveat": between(0.03, 1.97)}, marks=pytest.mark.slow),
         pytest.param({"solver": dfc.RK4(), "dt0": 0.3}, marks=pytest.mark.slow),
@@ -142,16 +144,17 @@ def test_the_balance_holds_against_an_independent_integral():
 SLOW = pytest.mark.slow
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("solver", "step", "order"),
     [
-        pytest.param(dfx.Euler(), 0.25, 1, id="euler", marks=SLOW),
-        pytest.param(dfx.Heun(), 0.25, 2, id="heun", marks=SLOW),
-        pytest.param(dfx.Bosh3(), 0.25, 3, id="bosh3", marks=SLOW),
-        pytest.param(dfc.RK4(), 0.25, 4, id="rk4", marks=SLOW),
+        pytest.param(dfx.Euler(), 0.25, 1, id="euler"),
+        pytest.param(dfx.Heun(), 0.25, 2, id="heun"),
+        pytest.param(dfx.Bosh3(), 0.25, 3, id="bosh3"),
+        pytest.param(dfc.RK4(), 0.25, 4, id="rk4"),
         pytest.param(dfx.Tsit5(), 0.25, 5, id="tsit5"),
         # Its dense output, and with it the balance, is of a lower order than the state.
-        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8", marks=SLOW),
+        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8"),
     ],
 )
 def test_the_order_survives(solver, step, order):
@@ -166,11 +169,11 @@ def test_the_order_survives(solver, step, order):
     )
 
 
-@some_of(
+@SLOW
+@pytest.mark.parametrize(
     "balance",
     [BALANCE, dfc.FirstIntegral(energy, rate=power, value=0.1)],
     ids=["of-the-start", "given"],
-    period=2,
 )
 def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
     late = dfx.SaveAt(ts=jnp.array([0.5, 1.0]), dense=True)
@@ -178,6 +181,7 @@ def test_the_drift_does_not_depend_on_which_times_are_saved(balance):
     assert 1e-12 < worst(solve(manifold=None, saveat=late)) < 1e-10
 
 
+@pytest.mark.slow
 def test_a_continued_solve_is_one_solve():
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     whole, half = solve(saveat=saveat), solve(t1=1.0, saveat=saveat)
@@ -198,27 +202,35 @@ def test_a_lane_of_a_batch_is_that_lane_alone():
     assert largest(jax.tree.map(lambda a, b: a[2] - b, batch, alone)) < 4 * EPS
 
 
-def test_derivatives_forward_and_reverse_are_those_of_differences():
-    def final(x, adjoint=dfx.RecursiveCheckpointAdjoint()):
-        solution = solve(
-            (x[0], x[1]),
-            (x[2], x[3]),
-            saveat=dfx.SaveAt(t1=True),
-            adjoint=adjoint,
-            dt0=0.2,
-            solver=dfx.Euler(),  # the quickest to compile
-        )
-        return solution.ys[0][-1] + 2 * solution.ys[1][-1]
+def final(x, adjoint=dfx.RecursiveCheckpointAdjoint()):
+    solution = solve(
+        (x[0], x[1]),
+        (x[2], x[3]),
+        saveat=dfx.SaveAt(t1=True),
+        adjoint=adjoint,
+        dt0=0.2,
+        solver=dfx.Euler(),  # the quickest to compile
+    )
+    return solution.ys[0][-1] + 2 * solution.ys[1][-1]
 
+
+@pytest.mark.slow
+def test_derivatives_forward_are_those_in_reverse():
     x = jnp.stack([*Y0, *ARGS])
     reverse = jax.jit(jax.grad(final))(x)
     forward = jax.jit(jax.jacfwd(lambda x: final(x, dfx.ForwardMode())))(x)
-    steps = 1e-4 * jnp.eye(4)
-    ends = jax.vmap(final)(jnp.concatenate([x + steps, x - steps]))
-    assert jnp.allclose(reverse, (ends[:4] - ends[4:]) / 2e-4, rtol=1e-6, atol=1e-7)
     assert jnp.allclose(reverse, forward, rtol=1e-12)
 
 
+def test_derivatives_are_those_of_differences():
+    x = jnp.stack([*Y0, *ARGS])
+    reverse = jax.jit(jax.grad(final))(x)
+    steps = 1e-4 * jnp.eye(4)
+    ends = jax.vmap(final)(jnp.concatenate([x + steps, x - steps]))
+    assert jnp.allclose(reverse, (ends[:4] - ends[4:]) / 2e-4, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.slow
 def test_an_event_is_found_on_the_balance():
     """At the highest point the speed vanishes."""
     root_finder = optx.Newton(rtol=1e-12, atol=1e-12)
@@ -324,11 +336,11 @@ def test_mistakes_are_named():
         dct.assert_conserved(solve(), BALANCE, ARGS)
 
 
-@some_of(
-    "solver,step",
+@SLOW
+@pytest.mark.parametrize(
+    ("solver", "step"),
     [(dfx.Heun(), 0.02), (dfx.Bosh3(), 0.05), (dfx.Tsit5(), 0.1)],
     ids=["heun", "bosh3", "tsit5"],
-    period=3,
 )
 def test_the_dissipated_entropy_of_arkode(solver, step):
     """`u' = -e^u` with the entropy `e^u`: no worse than without, by more than a fifth."""

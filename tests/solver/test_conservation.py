@@ -43,7 +43,7 @@ CASES = combinations(
 )
 
 
-@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=14)
+@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=20)
 def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
     system = dfc.systems.get(name)
     step = jnp.asarray(STEP.get(name, 0.05), dtype)
@@ -80,6 +80,7 @@ def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
     assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
+@pytest.mark.slow
 def test_dense_output_agrees_with_the_vector_field():
     """The time derivative of the interpolant, which an event's root finder uses."""
     projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
@@ -172,8 +173,9 @@ def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
     np.testing.assert_allclose(sol.ys["q"][-1], exact, atol=2e-4)
 
 
-@some_of(
-    "solver,projection",
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("solver", "projection"),
     [
         (dfc.RK4(), dfc.Newton()),
         (dfx.Dopri8(), dfc.SimplifiedNewton()),
@@ -181,7 +183,6 @@ def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
         (dfx.Dopri8(), dfc.Newton()),
     ],
     ids=["rk4-newton", "dopri8-simplified", "rk4-simplified", "dopri8-newton"],
-    period=4,
 )
 def test_a_manifold_with_parallel_gradients_everywhere(solver, projection):
     """On a circular Kepler orbit the energy is the least that the angular momentum allows."""

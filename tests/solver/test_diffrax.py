@@ -56,6 +56,7 @@ def test_implicit_solvers_take_the_tolerances_of_the_controller(solver):
     assert on_rigid_body(sol.ys)
 
 
+@pytest.mark.slow
 def test_half_solver_on_either_side():
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
     reference = solve(
@@ -80,7 +81,15 @@ def test_half_solver_on_either_side():
         pytest.param(dfc.RK4(), id="rk4", marks=pytest.mark.slow),
     ],
 )
-def test_adjoints_agree(solver):
+@pytest.mark.parametrize(
+    ("backwards", "forwards"),
+    [
+        (dfx.RecursiveCheckpointAdjoint(), dfx.ForwardMode()),
+        pytest.param(dfx.DirectAdjoint(), dfx.DirectAdjoint(), marks=pytest.mark.slow),
+    ],
+    ids=["one-mode", "both-modes"],
+)
+def test_adjoints_agree(solver, backwards, forwards):
     """Reverse and forward mode, through the loops of each adjoint."""
     projected = dfc.ManifoldProjection(solver, RIGID_BODY)
 
@@ -99,22 +108,24 @@ def test_adjoints_agree(solver):
     h = 1e-5
     plus, minus = (final(OMEGA0 + s * direction, dfx.RecursiveCheckpointAdjoint()) for s in (h, -h))
     expected = (plus - minus) / (2 * h)
-    for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
-        found = reverse(OMEGA0, adjoint) @ direction
-        np.testing.assert_allclose(found, weights @ expected, atol=1e-8)
-    for adjoint in (dfx.ForwardMode(), dfx.DirectAdjoint()):
-        np.testing.assert_allclose(forward(OMEGA0, adjoint), expected, atol=1e-8)
+    found = reverse(OMEGA0, backwards) @ direction
+    np.testing.assert_allclose(found, weights @ expected, atol=1e-8)
+    np.testing.assert_allclose(forward(OMEGA0, forwards), expected, atol=1e-8)
 
 
-def test_backsolve_adjoint_explains_and_works_with_the_inner_solver():
+def backsolved(y0, adjoint):
     projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+    return jnp.sum(solve(rigid_body, projected, y0, t1=0.3, dt0=0.01, adjoint=adjoint).ys ** 3)
 
-    def final(y0, adjoint):
-        return jnp.sum(solve(rigid_body, projected, y0, t1=0.3, dt0=0.01, adjoint=adjoint).ys ** 3)
 
+def test_backsolve_adjoint_explains():
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=inner\)"):
-        jax.grad(final)(OMEGA0, dfx.BacksolveAdjoint())
-    got = eqx.filter_jit(jax.grad(final))(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
+        jax.grad(backsolved)(OMEGA0, dfx.BacksolveAdjoint())
+
+
+@pytest.mark.slow
+def test_backsolve_adjoint_works_with_the_inner_solver():
+    got = eqx.filter_jit(jax.grad(backsolved))(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Tsit5()))
     assert bool(jnp.all(jnp.isfinite(got)))
 
 

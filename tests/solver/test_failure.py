@@ -98,6 +98,7 @@ def test_contradicting_constraints_name_one_of_them(errors_raise):
         run(manifold)
 
 
+@pytest.mark.slow
 def test_many_entries_are_not_named_one_by_one(errors_raise):
     manifold = [
         dfc.FirstIntegral(lambda t, y, args, k=k: out_of_reach(t, y[k], args)) for k in range(18)
@@ -152,10 +153,10 @@ def test_what_a_vector_field_does_not_conserve_is_kept_on_demand():
 @pytest.mark.parametrize(
     "source",
     [
-        lambda q, p: -0.1 * p,
+        pytest.param(lambda q, p: -0.1 * p, marks=pytest.mark.slow),
         lambda q, p: -(p**3),
-        lambda q, p: (1 - q**2) * p,
-        lambda q, p: q - jnp.sin(q),
+        pytest.param(lambda q, p: (1 - q**2) * p, marks=pytest.mark.slow),
+        pytest.param(lambda q, p: q - jnp.sin(q), marks=pytest.mark.slow),
     ],
     ids=["friction", "cubic-friction", "van-der-pol", "pendulum"],
 )
@@ -186,7 +187,7 @@ def attracted(t, y, args):
     [
         (cancelling, [0.3, -0.4, 0.1, 0.2, 0.5], None, 4),
         (attracted, [0.6, 0.0, 0.8], 1e-12, 2),
-        (attracted, [0.6, 0.0, 0.8], 10.0, 2),
+        pytest.param(attracted, [0.6, 0.0, 0.8], 10.0, 2, marks=pytest.mark.slow),
     ],
     ids=["forces-cancel", "weak", "strong"],
 )
@@ -204,9 +205,14 @@ TIMES = {"t0": 2.0, "t1": 1.0, "dt0": -0.1}
 @pytest.mark.parametrize(
     ("fn", "rate", "options"),
     [
-        (square, None, TIMES),
+        pytest.param(square, None, TIMES, marks=pytest.mark.slow),
         (lambda t, y, args: square(t, y, args) + t**2, lambda t, y, args: 2 * t, TIMES),
-        (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, {}),
+        pytest.param(
+            lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t),
+            None,
+            {},
+            marks=pytest.mark.slow,
+        ),
         (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, TIMES),
     ],
     ids=["backwards", "balance-backwards", "in-time", "in-time-backwards"],

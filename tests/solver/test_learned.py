@@ -56,9 +56,8 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "solver", [FLOW, pytest.param(FOLLOW, marks=pytest.mark.slow)], ids=["deeponet", "pinn"]
-)
+@pytest.mark.slow
+@SOLVERS
 def test_more_nodes_follow_it_more_closely(solver):
     def error(nodes):
         follows = solver is FOLLOW
@@ -164,15 +163,12 @@ def loss(network, y0, args, adjoint, projection=None):
     return jnp.sum(jnp.sin(ys))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layer", "projection"),
     [
         (None, dfc.SimplifiedNewton()),
-        pytest.param(
-            dfc.learned.ConservativeLayer(LORENZ.manifold, steps=8),
-            dfc.Newton(),
-            marks=pytest.mark.slow,
-        ),
+        (dfc.learned.ConservativeLayer(LORENZ.manifold, steps=8), dfc.Newton()),
     ],
 )
 def test_gradients_of_a_rollout(layer, projection):
@@ -203,12 +199,10 @@ def test_gradients_of_a_rollout(layer, projection):
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reverse",
-    [
-        dfx.RecursiveCheckpointAdjoint(),
-        pytest.param(dfx.DirectAdjoint(), marks=pytest.mark.slow),
-    ],
+    [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()],
     ids=["checkpoints", "direct"],
 )
 def test_adjoints_agree(reverse):
@@ -223,6 +217,7 @@ def test_adjoints_agree(reverse):
     np.testing.assert_allclose(backward, forward, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_the_weights_of_a_pinn():
     @eqx.filter_jit
     @eqx.filter_grad

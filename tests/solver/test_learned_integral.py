@@ -53,6 +53,7 @@ def test_its_value_is_kept_under_jit_and_without():
     np.testing.assert_allclose(sol.ys, states(NETWORK, OMEGA0).ys, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_one_network_of_a_batch_equals_that_network_alone():
     networks = eqx.filter_vmap(NetworkIntegral)(jr.split(jr.key(4), 3))
     batch = eqx.filter_jit(eqx.filter_vmap(states, in_axes=(eqx.if_array(0), None)))
@@ -63,10 +64,9 @@ def test_one_network_of_a_batch_equals_that_network_alone():
         np.testing.assert_allclose(together[index], compiled(alone, OMEGA0).ys, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "projection",
-    [dfc.SimplifiedNewton(), pytest.param(dfc.Newton(), marks=pytest.mark.slow)],
-    ids=["simplified", "newton"],
+    "projection", [dfc.SimplifiedNewton(), dfc.Newton()], ids=["simplified", "newton"]
 )
 def test_gradients_with_respect_to_its_weights(projection):
     """Against finite differences; the first test shows that there is something to correct."""

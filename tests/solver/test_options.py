@@ -37,6 +37,7 @@ def test_every_leaves_dense_output_alone_in_between():
     np.testing.assert_array_equal(sol.evaluate(0.15), plain.evaluate(0.15))
 
 
+@pytest.mark.slow
 def test_every_continues_where_it_stopped():
     solver = dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY, every=3)
     saveat = dfx.SaveAt(t1=True, solver_state=True)
@@ -107,6 +108,7 @@ def lorenz(**options):
     return sol, np.linalg.norm(sol.ys[-1] - system.reference(np.array([0.0, 100.0]))[-1])
 
 
+@pytest.mark.slow
 def test_a_projected_error_estimate_saves_steps_and_costs_accuracy():
     (plain, error), (projected, larger_error) = lorenz(), lorenz(project_error=True)
     assert projected.stats["num_steps"] < 0.95 * plain.stats["num_steps"]
@@ -171,6 +173,7 @@ def test_statistics_of_a_duplicated_integral_show_the_rank():
     assert dfc.statistics(sol).rank == 1
 
 
+@pytest.mark.slow
 def test_statistics_of_a_batch_and_of_a_nested_solver():
     def lane(scale):
         solver = dfx.HalfSolver(dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY))
@@ -190,7 +193,8 @@ def test_statistics_need_the_solver_state():
         dfc.statistics(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=saveat))
 
 
-@pytest.mark.parametrize("t1", [0.4, pytest.param(-0.4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("t1", [0.4, -0.4])
 def test_rejections_because_of_projection_are_counted(t1):
     """Two iterations are too few for a long step with the first-order method."""
 

@@ -56,6 +56,7 @@ def test_a_nonlinear_solution_to_roundoff():
     np.testing.assert_allclose(sol.ys[-1], exponential_solution(1.0), rtol=0, atol=2e-14)
 
 
+@pytest.mark.slow
 def test_more_features_and_shorter_steps_are_more_accurate():
     def error(features, dt0):
         sol = solve(oscillator, NORTH, 12.0, solver=dfc.RandomFeatureSolver(features), dt0=dt0)
@@ -167,9 +168,8 @@ def test_a_stiff_problem():
 # ---- Structure ----
 
 
-@pytest.mark.parametrize(
-    "name", ["henon-heiles", pytest.param("toda-lattice", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["henon-heiles", "toda-lattice"])
 def test_energy_is_kept_to_roundoff_where_the_state_is_not(name):
     """As by every Galerkin method in time, for canonical equations."""
     system = dfc.systems.get(name)

@@ -128,9 +128,8 @@ def along(h, **options):
     return loss(EXPONENTIAL0 + h * DIRECTION, 1.0 + 0.7 * h, adjoint, **options)
 
 
-@pytest.mark.parametrize(
-    "tol", [None, pytest.param(1e-10, marks=pytest.mark.slow)], ids=["fixed", "adaptive"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("tol", [None, 1e-10], ids=["fixed", "adaptive"])
 def test_gradients_against_finite_differences(tol):
     """In reverse mode and forwards."""
     function = jax.jit(lambda h: along(h, tol=tol))

@@ -93,6 +93,7 @@ def test_progress_meters_and_unlimited_steps(meter, capsys):
     np.testing.assert_allclose(energies(sol.ys), ENERGY, rtol=4e-16)
 
 
+@pytest.mark.slow
 def test_continued_from_every_part_of_the_state():
     saveat = dfx.SaveAt(t1=True, solver_state=True, controller_state=True, made_jump=True)
     options = dict(

@@ -204,12 +204,10 @@ def test_a_mechanism_whose_balances_have_signs_has_none():
         mechanism.positive_projection()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "step", "t1", "median", "largest_error"),
-    [
-        ("pollu", 2.0, 61.0, 1e-3, 2e-2),
-        pytest.param("robertson", 1.0, 41.0, 3e-5, 3e-4, marks=pytest.mark.slow),
-    ],
+    [("pollu", 2.0, 61.0, 1e-3, 2e-2), ("robertson", 1.0, 41.0, 3e-5, 3e-4)],
 )
 def test_the_flow_maps_keep_signs_and_balances(name, step, t1, median, largest_error):
     system = STIFF[name]

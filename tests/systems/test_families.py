@@ -99,6 +99,7 @@ def test_centre_of_mass_is_a_first_integral_that_depends_on_time():
     assert check_invariance(system.vector_field, centre, ys, t=ts).ok
 
 
+@pytest.mark.slow
 def test_the_mass_metric_keeps_momentum_and_the_euclidean_does_not():
     system = systems.OuterSolarSystem()
     y = system.sample(jr.key(0))
@@ -185,6 +186,7 @@ def test_the_body_axis_turns_by_the_angular_velocity():
     np.testing.assert_allclose(axis, expected, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_soliton_solves_the_equation_on_the_ring():
     """Against the exact solution on the line, which differs where it has died away."""
     wave = systems.KortewegDeVries()

@@ -44,7 +44,11 @@ def batch(system, num):
     return eqx.filter_jit(eqx.filter_vmap(draw))(jr.split(jr.key(3), num))
 
 
-@pytest.mark.parametrize("name", ["harmonic-oscillator", "rigid-body", "kepler"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) for n in ("harmonic-oscillator", "rigid-body")]
+    + ["kepler"],
+)
 def test_exact_solutions_agree_with_a_numerical_one(name):
     many, y0s = batch(systems.get(name), 16)
     a = many_solutions(exact)(many, TS, y0s)
@@ -53,6 +57,7 @@ def test_exact_solutions_agree_with_a_numerical_one(name):
         np.testing.assert_allclose(x, y, atol=2e-11)
 
 
+@pytest.mark.slow
 def test_the_pendulum_swings_and_turns_as_a_numerical_solution_does():
     many, y0s = batch(systems.CartesianPendulum(), 24)
     a = many_solutions(exact)(many, TS, y0s)

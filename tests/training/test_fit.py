@@ -79,15 +79,8 @@ def test_a_pinn_learns_a_solution(layer):
     assert log.best < log.criteria[0] / 100
 
 
-@pytest.mark.parametrize(
-    "layer",
-    [
-        None,
-        pytest.param(
-            dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2), marks=pytest.mark.slow
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("layer", [None, dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2)])
 def test_a_deeponet_learns_a_flow_map(layer):
     before = flow_map(layer=layer)
     after, log = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=150, points=200)
@@ -234,6 +227,7 @@ def test_the_schedules():
     np.testing.assert_array_equal(dfc.learned.constant_weight(es, epochs, steps), np.ones(epochs))
 
 
+@pytest.mark.slow
 def test_the_trained_loss_follows_the_schedule():
     """At the start of the staged schedule the layer does nothing, at its end everything."""
     still = dict(optimiser=optax.sgd(0.0), epochs=6, times=dfc.learned.grid_times)

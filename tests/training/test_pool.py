@@ -210,6 +210,7 @@ def test_the_same_key_gives_the_same_result():
     assert not eqx.tree_equal(a, c)
 
 
+@pytest.mark.slow
 def test_it_compiles_once():
     def count(epochs):
         field = Counted(oscillator)
@@ -299,6 +300,7 @@ def framed():
     return dfc.DeepONet(APART, 0.125, taylor=dfc.learned.Taylor(VORTICES.vector_field), **options)
 
 
+@pytest.mark.slow
 def test_a_domain_of_shapes_is_extended_by_shapes():
     domain, others = framed().domain, states(100, VORTICES, seed=8)
     extended = eqx.filter_jit(lambda domain: domain.extended(others))(domain)
@@ -316,6 +318,7 @@ def test_a_domain_of_shapes_is_extended_by_shapes():
     assert extended.fastest == domain.fastest
 
 
+@pytest.mark.slow
 def test_vortices_that_turn_too_fast_start_again():
     """For the network time would be longer than what it calls one."""
     network = framed()

@@ -64,7 +64,7 @@ def same(found, expected):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("make", [small_flow_map, small_pinn])
+@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
 def test_an_interrupted_training_goes_on(make):
     network, options = make()
     whole = dfc.fit(network, **options)
@@ -81,6 +81,7 @@ def test_an_interrupted_training_goes_on(make):
         assert model.windows > network.windows
 
 
+@pytest.mark.slow
 def test_twice_the_epochs_in_two_halves():
     """For an optimiser that does not know how many epochs there will be."""
     network, options = small_flow_map()
@@ -112,7 +113,7 @@ def test_it_ends_at_a_target_and_after_a_time():
     assert np.isinf(log.errors[1])
 
 
-@pytest.mark.parametrize("make", [small_flow_map, small_pinn])
+@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
 def test_a_checkpoint_is_the_state(make, tmp_path):
     network, options = make()
     path = tmp_path / "training.checkpoint"

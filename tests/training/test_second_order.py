@@ -135,6 +135,7 @@ def test_windows_follow_each_other():
     np.testing.assert_array_equal(trained.y0, EAST)
 
 
+@pytest.mark.slow
 def test_a_window_knows_what_time_it_is():
     """y' = 2 t, whose right-hand side depends on time alone."""
     pinn = dfc.PINN(jnp.array([1.0]), 1.0, 3.0, windows=2, width=8, depth=1, key=KEY)
@@ -168,6 +169,7 @@ def test_spring_trains_a_flow_map():
     assert eqx.tree_equal(trained, again)
 
 
+@pytest.mark.slow
 def test_updates_that_are_never_finite_are_an_error():
     states, network = flow_map()
     recipe = dataclasses.replace(dfc.learned.second_order(network, epochs=4), points=10)
@@ -226,6 +228,7 @@ def test_reachable_states_are_on_the_solutions():
     np.testing.assert_array_equal(kept, states[states[:, 0] > 0])
 
 
+@pytest.mark.slow
 def test_reachable_states_by_a_flow_map_of_ones_own():
     states, network = flow_map(order=2)
     solver = dfc.ManifoldProjection(
@@ -239,6 +242,7 @@ def test_reachable_states_by_a_flow_map_of_ones_own():
     np.testing.assert_allclose(found, exact, atol=0.05)
 
 
+@pytest.mark.slow
 def test_states_that_explode_are_left_out():
     """y' = y² from 1 has no solution beyond t = 1, from -1 it has."""
     y0s = jnp.where(jnp.arange(10) < 5, 1.0, -1.0)

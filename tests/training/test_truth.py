@@ -106,6 +106,7 @@ def test_a_window_that_failed_is_trained_until_it_is_right():
     assert log.error < 1e-5
 
 
+@pytest.mark.slow
 def test_windows_are_trained_until_the_whole_solution_is_right(monkeypatch):
     """Each window is good enough by itself, as if errors did not add up."""
     monkeypatch.setattr(windows_module, "_GROWTH", 1e-4)
