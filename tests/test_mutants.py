@@ -16,4 +16,4 @@ def test_a_defect_without_a_place_is_told(monkeypatch):
     with pytest.raises(LookupError, match="0 functions or classes named no_such_function"):
         package.function("no_such_function", lambda old: old)
     with pytest.raises(LookupError, match="ManifoldProjection defines no no_such_method"):
-        package.method("ManifoldProjection.no_such_method", None)
+        package.method("ManifoldProjection.no_such_method", lambda old: old)

@@ -146,7 +146,6 @@ def sensitivity(solver, y0, args):
     return jax.jacrev(end)(y0)
 
 
-@pytest.mark.slow
 @given(
     rate=st.floats(0.5, 2),
     angle=st.floats(-3, 3),

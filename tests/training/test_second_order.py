@@ -169,7 +169,6 @@ def test_spring_trains_a_flow_map():
     assert eqx.tree_equal(trained, again)
 
 
-@pytest.mark.slow
 def test_updates_that_are_never_finite_are_an_error():
     states, network = flow_map()
     recipe = dataclasses.replace(dfc.learned.second_order(network, epochs=4), points=10)
