@@ -211,8 +211,8 @@ def _tested(
 
     def others() -> _Iterations:
         now = g, at_start[1]
-        *end, measured, done = _iterations(equations, at_candidate, (y, multiplier), now, count - 1)
-        return *end[:2], jnp.asarray(count), measured, done
+        end = _iterations(equations, at_candidate, (y, multiplier), now, count - 1)
+        return end[0], end[1], jnp.asarray(count), end[3], end[4]
 
     return lax.cond(done, lambda: first, others)
 
