@@ -112,5 +112,5 @@ def evaluated(sol, ts):
 
 
 def largest(tree):
-    """The largest absolute value in a PyTree."""
-    return max(float(np.max(np.abs(x))) for x in jax.tree.leaves(tree))
+    """The largest absolute value in a PyTree, or NaN if any is NaN."""
+    return float(np.max([np.max(np.abs(x)) for x in jax.tree.leaves(tree)]))

@@ -26,7 +26,8 @@ def on_rigid_body(ys):
     w, inertia = np.asarray(ys, np.longdouble), INERTIA.astype(np.longdouble)
     for weights in (inertia, inertia**2):
         value = np.sum(weights)
-        if np.max(np.abs(np.sum(weights * w**2, axis=-1) - value)) > 3 * 4e-15 * value:
+        # NaN is not below any bound.
+        if not np.max(np.abs(np.sum(weights * w**2, axis=-1) - value)) <= 3 * 4e-15 * value:
             return False
     return True
 
