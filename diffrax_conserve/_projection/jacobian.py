@@ -237,7 +237,8 @@ class MatrixFree(AbstractJacobian):
         return self.forward(y)
 
     def scale(self, y: Y) -> Vector:
-        return estimated_norms(self.forward, y)
+        # Neither is more than the sum of the moduli; the second equals it where no terms cancel.
+        return jnp.maximum(estimated_norms(self.forward, y), jnp.abs(self.forward(y)))
 
     def unit_rows(self) -> tuple["MatrixFree", Vector]:
         return self, jnp.asarray(1.0)  # weakly typed, so that it changes no dtype
@@ -284,7 +285,10 @@ def lineax_solver(
         return jacobian.gram_solver(weights, other, damping)  # not symmetric
     rows, row_sizes = jacobian.unit_rows()
     columns, column_sizes = (rows, row_sizes) if other is None else other.unit_rows()
-    diagonal = jtu.tree_map(jnp.square, rows.scale(jtu.tree_map(jnp.sqrt, weights)))
+    roots = jtu.tree_map(jnp.sqrt, weights)
+    many = isinstance(rows, MatrixFree)
+    norms = estimated_norms(rows.forward, roots) if many else rows.scale(roots)
+    diagonal = jtu.tree_map(jnp.square, norms)
     # If constraints depend on each other, the roundoff of their residuals does not. Undamped, it
     # would be solved for, by huge multipliers.
     damping = jnp.maximum(damping, float(jnp.finfo(working_dtype(diagonal)).eps) ** 0.75)

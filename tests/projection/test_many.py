@@ -125,6 +125,19 @@ def test_dependent_linear_constraints_against_their_pseudoinverse(dtype):
     np.testing.assert_allclose(gradients, cosines - cosines @ inverse @ rows, atol=200 * eps)
 
 
+def test_the_scale_of_terms_that_do_not_cancel():
+    """Their sum is as large as that of their moduli, and so is the roundoff."""
+    rng = np.random.default_rng(1)
+    matrix, y = rng.uniform(0.5, 1.5, (DENSE_MAX + 2, 2000)), rng.uniform(0.5, 1.5, 2000)
+    kept = dfc.Constraint(lambda t, y, b: jnp.asarray(matrix) @ y - b)
+    project = jax.jit(lambda y, b: dfc.project(kept, y, args=b, projection=dfc.SimplifiedNewton()))
+    _, info = project(y * (1 + 1e-6 * rng.normal(size=2000)), matrix @ y)
+    assert info.ok
+    _, info = project(1.001 * y, matrix @ y)
+    # The residual is a thousandth of the sum of the moduli.
+    np.testing.assert_allclose(info.residual_before, 1e-3, rtol=0.01)
+
+
 def test_contradicting_constraints_fail():
     other = dfc.Constraint(lambda t, q, args: bonds(t, q, 1.01 * args))
     both, simplified = [CHAIN, other], dfc.SimplifiedNewton()
