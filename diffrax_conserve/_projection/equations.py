@@ -32,9 +32,9 @@ class ProjectionInfo(eqx.Module):
     - `num_steps`: the number of iterations (of `Newton`: of both phases).
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint at the projected state,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$. With more than 128
-        constraints the sum is estimated by what is hardly ever larger, so the residuals may be
-        reported too large.
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$. With more than
+        128 constraints the sum is estimated, mostly from below, so that residuals may be reported
+        too large.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate (for
         `Newton`: at the result). With more than 128 constraints the matrix is not formed, and this
