@@ -251,7 +251,7 @@ class MatrixFree(AbstractJacobian):
 
         def checked(product: Callable[[Vector], Vector], b: Vector) -> Vector:
             x = _corrected(approximate.solve, product, b)
-            tolerance = jnp.sqrt(jnp.finfo(b.dtype).eps) * tree_max(b)
+            tolerance = float(jnp.finfo(b.dtype).eps) ** 0.75 * tree_max(b)
             return jnp.where(tree_max(b - product(x)) <= tolerance, x, jnp.nan)
 
         def product(x: Vector) -> Vector:

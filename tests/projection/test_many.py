@@ -125,6 +125,27 @@ def test_dependent_linear_constraints_against_their_pseudoinverse(dtype):
     np.testing.assert_allclose(gradients, cosines - cosines @ inverse @ rows, atol=200 * eps)
 
 
+@pytest.mark.parametrize("near", [1e-6, 1e-8, 1e-10])
+def test_the_derivative_with_nearly_dependent_constraints_is_right_or_nan(near):
+    rng, n, m = np.random.default_rng(0), 200, DENSE_MAX + 4
+    rows, y, v = rng.normal(size=(m, n)), rng.normal(size=n), rng.normal(size=n)
+    rows[-40:] = rows[:40] + near * rng.normal(size=(40, n))
+    _, slope = _slope(rows, y, rows @ y, v)
+    _, _, basis = np.linalg.svd(rows, full_matrices=False)
+    error = np.abs(slope - (v - basis.T @ (basis @ v)))
+    assert np.all(np.isnan(error)) or np.max(error) < 1e-3
+
+
+@jax.jit
+def _slope(rows, y, values, v):
+    def project(y):
+        integrals = dfc.FirstIntegral(lambda t, y, rows: rows @ y)
+        simplified = dfc.SimplifiedNewton()
+        return dfc.project(integrals, y, args=rows, value=values, projection=simplified)[0]
+
+    return jax.jvp(project, (y,), (v,))
+
+
 def test_the_scale_of_terms_that_do_not_cancel():
     """Their sum is as large as that of their moduli, and so is the roundoff."""
     rng = np.random.default_rng(1)
