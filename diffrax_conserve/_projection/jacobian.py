@@ -299,7 +299,7 @@ def lineax_solver(
 
     struct, tag = jax.eval_shape(lambda: diagonal), lx.positive_semidefinite_tag
     operator, options = lx.FunctionLinearOperator(product, struct, tag), {}
-    if isinstance(jacobian, MatrixFree):
+    if many:
         inverse = lx.DiagonalLinearOperator(1 / jnp.where(diagonal > 0, diagonal, 1))
         options = dict(preconditioner=lx.TaggedLinearOperator(inverse, tag))
         rank = jnp.asarray(diagonal.size)

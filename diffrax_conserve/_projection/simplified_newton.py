@@ -140,9 +140,11 @@ def _project(
     count = min(jacobian.inline_steps, max_steps)
     start = inline.candidate, jtu.tree_map(jnp.zeros_like, before)
     large = count > 1 and tree_size(inline.candidate) >= _LARGE
-    y, multiplier, num_steps, measured, done = (_tested if large else _iterations)(
-        inline, at_candidate, start, at_candidate, count
-    )
+    if large:
+        taken = _tested(inline, at_candidate, start, count)
+    else:
+        taken = _iterations(inline, at_candidate, start, at_candidate, count)
+    y, multiplier, num_steps, measured, done = taken
     # The few steps that need more iterations linearise again: sharing the values known here would
     # write them to memory at every step of the solve.
     state = join(y), as_array(multiplier), num_steps, Outcome.success()
@@ -199,18 +201,14 @@ def _iterations(
 
 
 def _tested(
-    equations: Equations,
-    at_candidate: _Linearised,
-    start: tuple[Y, Vector],
-    at_start: _Linearised,
-    count: int,
+    equations: Equations, at_candidate: _Linearised, start: tuple[Y, Vector], count: int
 ) -> _Iterations:
-    """As `_iterations`, but no more than the first if that is enough."""
-    first = _iterations(equations, at_candidate, start, at_start, 1)
+    """As `_iterations` from the candidate, but no more than the first if that is enough."""
+    first = _iterations(equations, at_candidate, start, at_candidate, 1)
     y, multiplier, _, (g, _), done = first
 
     def others() -> _Iterations:
-        now = g, at_start[1]
+        now = g, at_candidate[1]
         end = _iterations(equations, at_candidate, (y, multiplier), now, count - 1)
         return end[0], end[1], jnp.asarray(count), end[3], end[4]
 
