@@ -198,16 +198,21 @@ def test_a_figure_is_the_median_over_the_initial_states(tmp_path, monkeypatch):
 # ---- What it writes and prints ----
 
 
+def assert_written(folder, names, printed, *texts):
+    """Figures of these names, the metrics and nothing else; and the texts in what was printed."""
+    files = list(folder.iterdir())
+    figures = {f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")}
+    assert {f.name for f in files} == {*figures, "metrics.json"}
+    assert all(f.stat().st_size > 100 for f in files)
+    for text in (*texts, "steps", "compile"):
+        assert text in printed
+
+
 @pytest.mark.draws
 def test_files_and_nothing_else(tmp_path, capsys, only_rk4):
     reproduce(tmp_path, *KEPLER)
-    files = list((tmp_path / "out").iterdir())
-    figures = {f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "pdf")}
-    assert {f.name for f in files} == {*figures, "metrics.json"}
-    assert all(f.stat().st_size > 100 for f in files)
     printed = capsys.readouterr().out
-    for text in ("rk4", "drift of angular momentum", "steps", "compile"):
-        assert text in printed
+    assert_written(tmp_path / "out", FIGURES, printed, "rk4", "drift of angular momentum")
 
 
 @pytest.mark.slow
@@ -217,14 +222,8 @@ def test_files_of_learned_solvers_and_nothing_else(tmp_path, capsys):
     assert set(metrics["solvers"]) == {"rk4", "projected rk4", *LEARNED}
     assert max(metrics["solvers"]["conservative"]["drift"].values()) < 1e-14
     assert metrics["solvers"]["conservative"]["state_error"] < 1e-2
-    files = list((tmp_path / "out").iterdir())
-    names = (*FIGURES, "loss")
-    figures = {f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")}
-    assert {f.name for f in files} == {*figures, "metrics.json"}
-    assert all(f.stat().st_size > 100 for f in files)
-    printed = capsys.readouterr().out
-    for text in ("projected rk4", "drift of squared angular momentum", "steps", "compile"):
-        assert text in printed
+    texts = "projected rk4", "drift of squared angular momentum"
+    assert_written(tmp_path / "out", (*FIGURES, "loss"), capsys.readouterr().out, *texts)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
