@@ -10,7 +10,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
 What is conserved    FirstIntegral, Constraint, check_invariance, drift
-Solvers              ManifoldProjection, RK4, Unrolled, statistics, fast_cpu
+Solvers              ManifoldProjection, RK4, Unrolled, statistics
 Projections          SimplifiedNewton (the default), Newton, ClosedForm, Directional, Staged,
                      project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
@@ -27,7 +27,6 @@ from ._diagnostics.check_invariance import InvarianceEntry as InvarianceEntry
 from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
-from ._fast_cpu import fast_cpu as fast_cpu
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
@@ -43,7 +42,6 @@ from ._projection.staged import Staged as Staged
 from ._projection.step import Step as Step
 from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
-from ._solver.count_rejections import CountRejections as CountRejections
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
 from ._solver.rk4 import RK4 as RK4
 from ._solver.statistics import ProjectionStatistics as ProjectionStatistics

@@ -13,15 +13,21 @@ from typing import Any, final
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.simplified_newton import SimplifiedNewton
+from ._projection.loop import any_lane
+from ._projection.step import Step
 from ._projection.target import Target
-from ._tree import tree_sub
+from ._tree import tree_add, tree_scale, tree_sub
+
+# The candidates that are tried. They approach the end of the step faster and faster; the last is
+# the end itself.
+_CANDIDATES = 12
 
 
 @final
@@ -47,10 +53,9 @@ class PackedTarget(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
-    Where the projection of the interpolant fails, `SimplifiedNewton` is tried, which starts again
-    closer and closer to the nearer end of the step, a state on the manifold, and at last there. If
-    that fails too, the value is NaN. There is no extrapolation: a time outside the step is replaced
-    by the nearer end.
+    Where the projection of the interpolant fails, it starts again closer and closer to the nearer
+    end of the step, a state on the manifold, and at last there. If that fails too, the value is
+    NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -59,6 +64,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ends: tuple[Y, Y]
     error: Y | None
     target: PackedTarget
+    due: Bool[Array, ""] | None
 
     def evaluate(
         self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
@@ -69,22 +75,53 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
         t0 = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         early = jnp.abs(t0 - self.t0) < jnp.abs(self.t1 - t0)
-        anchor = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
+        end = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         step = target.step(self.t0, self.t1, self.ends[0], self.error, lambda: self.inner)
-        y, info = target.project(t0, candidate, anchor, step)
-        okay = info.ok
-        if not isinstance(target.projection, SimplifiedNewton):
-            lower, upper = (getattr(target.projection, name, None) for name in ("lower", "upper"))
-            metric = target.projection.metric
-            again = SimplifiedNewton(metric=metric, lower=lower, upper=upper)
-            second, info = dataclasses.replace(target, projection=again).project(
-                t0, candidate, anchor
-            )
-            y = jtu.tree_map(lambda a, b: jnp.where(okay, a, b), y, second)
-            okay = okay | info.ok
-        return jtu.tree_map(lambda x: jnp.where(okay, x, jnp.asarray(np.nan, x.dtype)), y)
+        y, _ = _projected(target, t0, candidate, step, end)
+        if self.due is None:
+            return y
+        return jtu.tree_map(lambda a, b: jnp.where(self.due, a, b), y, candidate)
+
+
+@eqx.filter_custom_jvp
+def _projected(
+    target: Target, t: RealScalarLike, candidate: Y, step: Step | None, end: Y
+) -> tuple[Y, Bool[Array, ""]]:
+    """The first candidate that can be projected, on the way from the interpolant to `end`; and
+    whether that was the interpolant."""
+
+    def body(carry: tuple[Array, Array, Y]) -> tuple[Array, Array, Y]:
+        index, going, last = carry
+        share = 0.5 ** (index * (index + 1) // 2)
+        share = jnp.where(index == _CANDIDATES - 1, 0, share)
+        between = tree_add(end, tree_scale(share, tree_sub(candidate, end)))
+        start = jtu.tree_map(
+            lambda a, b, c: jnp.where(index == 0, a, jnp.where(share == 0, b, c)),
+            candidate,
+            end,
+            between,
+        )
+        y, info = target.project(t, start, step)
+        y = jtu.tree_map(lambda x: jnp.where(info.ok, x, jnp.asarray(np.nan, x.dtype)), y)
+        y = jtu.tree_map(lambda a, b: jnp.where(going, a, b), y, last)
+        more = going & ~info.ok & (index + 1 < _CANDIDATES)
+        return index + going, more, y
+
+    carry = jnp.asarray(0), jnp.asarray(True), candidate
+    index, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, carry)
+    return y, index == 1
+
+
+@_projected.def_jvp
+def _projected_jvp(primals: Any, tangents: Any) -> Any:
+    """Only the projection of the interpolant itself has a derivative."""
+    y, direct = _projected(*primals)
+    given = primals[:-1], tangents[:-1]
+    _, t_y = eqx.filter_jvp(lambda target, *args: target.project(*args)[0], *given)
+    t_y = jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, y, t_y)
+    return (y, direct), (tree_scale(jnp.where(direct, 1, jnp.nan), t_y), None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,6 @@ from ._along import Along
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 from ._options import check_function, check_numbers, check_vector_field, dtype_of, is_real
 from ._tree import tree_shapes
-from ._with_jacobian import WithJacobian
 
 
 class AbstractConserved(eqx.Module):
@@ -63,9 +62,8 @@ class FirstIntegral(AbstractConserved):
         *,
         value: Values | None = None,
         rate: ConstraintFn | None = None,
-        jacobian: Any = None,
     ):
-        self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
+        self.fn = fn
         self.rate = rate
         check_numbers("value", value)
         # Arrays, so that a different value does not trigger another compilation.
@@ -91,7 +89,6 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
     from the initial state of the solve. With `rate` it is the value at the start of the solve.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
     $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
-- `jacobian`: the derivative of `fn` by the state, as in [`diffrax_conserve.Constraint`][].
 """
 
 
@@ -112,9 +109,6 @@ class Constraint(AbstractConserved):
     """
 
     fn: ConstraintFn
-
-    def __init__(self, fn: ConstraintFn, *, jacobian: Any = None):
-        self.fn = fn if jacobian is None else WithJacobian(fn, jacobian)
 
     def __check_init__(self):
         _check_fn(self)
@@ -164,18 +158,11 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
     constraint.
-- `jacobian`: a callable `jacobian(t, y, args)` that returns $\partial g/\partial y$ as
-    `jax.jacrev(fn, argnums=1)` does, for a function that autodiff cannot see, such as a
-    `jax.pure_callback`. All other derivatives are taken by autodiff of `fn` and `jacobian`; where
-    that is impossible it is an error. The scales of residuals and all derivatives depend on it. A
-    solve compares it with difference quotients at the initial state, and does not start if it is
-    wrong there; [`diffrax_conserve.project`][] does not check it.
 """
 
 
 def _check_fn(entry: AbstractConserved) -> None:
-    fn = entry.fn.fn if isinstance(entry.fn, WithJacobian) else entry.fn
-    check_function("fn", type(entry).__name__, fn, "t, y, args", "real arrays")
+    check_function("fn", type(entry).__name__, entry.fn, "t, y, args", "real arrays")
 
 
 def is_entry(x: Any) -> bool:

@@ -151,3 +151,14 @@ def tree_stop_gradient(a: Any) -> Any:
 def tree_tangents(a: Any, t_a: Any) -> Any:
     """`t_a`, the tangents of `a`, with `None` replaced by zeros."""
     return jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, a, t_a)
+
+
+def ravel(y: Any) -> Any:
+    """The components of `y` as one real vector, complex ones as real and imaginary parts."""
+    leaves = [jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def unravel(vector: Any, like: Any) -> Any:
+    """The state whose `ravel` is `vector`, with the structure, shapes and dtypes of `like`."""
+    return from_view(unflatten(vector, jax.eval_shape(real_view, like)), like)

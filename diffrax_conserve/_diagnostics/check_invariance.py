@@ -4,28 +4,30 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Real
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 
 from .._balance import rates
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values
-from .._projection.linearise import linearise
-from .._projection.residual import largest, measure, relative, residual_of
-from .._tree import real_view, tree_all_finite, tree_max, unflatten, working_dtype
+from .._custom_types import Args, Manifold, RealScalarLike
+from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values, rate_of
+from .._projection.equations import equations_of, measure, relative
+from .._tree import ravel, tree_all_finite, tree_max
 
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceEntry:
     """The result of `check_invariance` for one entry of the manifold.
 
-    `defect` is the largest relative defect over all states and elements, and `state` the index of
-    the state where it was found.
+    `kind` is "first integral", "balance" (with a `rate`) or "constraint". `defect` is the largest
+    relative defect over all states and elements, and `state` the index of the state where it was
+    found. `is_constant` tells that the gradient is zero at every state: a function that does not
+    depend on the state, or that autodiff does not see through, is conserved by any field.
     """
 
     name: str
@@ -33,6 +35,7 @@ class InvarianceEntry:
     defect: float
     state: int
     ok: bool
+    is_constant: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +64,8 @@ class InvarianceReport:
         ]
         for entry in self.entries:
             result = "conserved" if entry.ok else f"NOT conserved, see state {entry.state}"
+            if entry.is_constant:
+                result += "; its gradient is zero at every state: nothing is kept"
             lines.append(f"  {entry.name:{width}}  {entry.kind:14}  {entry.defect:<8.1e}  {result}")
         return "\n".join(lines)
 
@@ -93,7 +98,7 @@ def check_invariance(
 
     **Arguments:**
 
-    - `vector_field`: $f$, called as `vector_field(t, y, args)`.
+    - `vector_field`: $f$, called as `vector_field(t, y, args)`, or a `diffrax.ODETerm` of it.
     - `manifold`: a [`diffrax_conserve.FirstIntegral`][], a [`diffrax_conserve.Constraint`][] or a
         PyTree of them.
     - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree of arrays like `y` with an
@@ -135,6 +140,8 @@ def check_invariance(
         ```
     """
     check_manifold(manifold)
+    if isinstance(vector_field, dfx.ODETerm):
+        vector_field = vector_field.vector_field
     ys = _batch(states, jr.key(0) if key is None else key, num_states)
     ts = _times(t, ys)
     if rtol is None:
@@ -142,12 +149,13 @@ def check_invariance(
     _check_like_y(vector_field, ts[0], jtu.tree_map(lambda x: x[0], ys), args)
     found = _measure(vector_field, manifold, ts, ys, args)
     entries = [
-        _verdict(name, entry, np.asarray(defects), np.asarray(residuals), rtol)
-        for (name, entry), (defects, residuals) in zip(_entries(manifold), found, strict=True)
+        _verdict(name, entry, *map(np.asarray, measured), rtol)
+        for (name, entry), measured in zip(_entries(manifold), found, strict=True)
     ]
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
 
+_KINDS = ("first integral", "balance")
 _ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
 
 
@@ -209,57 +217,60 @@ def _entries(manifold: Manifold) -> list[tuple[str, AbstractConserved]]:
 @eqx.filter_jit
 def _measure(
     vector_field: Callable, manifold: Manifold, ts: Float[Array, " states"], ys: Any, args: Args
-) -> list[tuple[Float[Array, " states"], Float[Array, " states"]]]:
-    """The relative defects and residuals of each entry at each state, largest over elements."""
+) -> list[tuple[Float[Array, " states"], Float[Array, " states"], Bool[Array, " states"]]]:
+    """The relative defects and residuals of each entry at each state, largest over elements, and
+    whether its gradient is zero there."""
 
-    def at_one_state(t: Float[Array, ""], y: Any) -> list[tuple[Array, Array]]:
+    def at_one_state(t: Float[Array, ""], y: Any) -> list[tuple[Array, Array, Array]]:
         f = vector_field(t, y, args)
         return [_relative_sizes(entry, t, y, f, args) for _, entry in _entries(manifold)]
 
     return jax.vmap(at_one_state)(ts, ys)
 
 
-def _change_along(
-    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args, slope: Y
-) -> Values:
-    """The derivative of each residual by time along `slope`, less its rate, relative to the sum of
-    the moduli of its terms. What may be roundoff of a slope in which larger terms cancel is
-    relative to those of the largest component of the slope."""
-    t, view, slope = jnp.asarray(t, working_dtype(y)), real_view(y), real_view(slope)
-    fn, _ = residual_of(manifold, values, t, y, args)
-    _, jacobian = linearise(fn, view)
-
-    def at_time(t: Array) -> tuple[Array, Values]:
-        fn, _ = residual_of(manifold, values, t, y, args)
-        return fn(view), rates(manifold, t, y, args)
-
-    (_, rate), (in_time, _) = jax.jvp(at_time, (t,), (jnp.ones_like(t),))
-    rate = jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(rate)])
-    change = jacobian.pushforward(slope) + in_time - rate
-    terms = jacobian.scale(slope) + jnp.abs(in_time) + jnp.abs(rate)
-    fastest = jtu.tree_map(lambda x: jnp.full_like(x, tree_max(slope)), slope)
-    most = jacobian.scale(fastest)
-    roundoff = 100 * jnp.finfo(change.dtype).eps * most
-    terms = jnp.where(jnp.abs(change) <= roundoff, jnp.maximum(terms, most), terms)
-    return unflatten(relative(change, terms), values)
-
-
 def _relative_sizes(
     entry: AbstractConserved, t: Float[Array, ""], y: Any, f: Any, args: Args
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
+    """The largest relative defect and residual of an entry, and whether its gradient is zero."""
     f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, y)
     values = conserved_values(entry, t, y, args)
-    defect = largest(_change_along(entry, values, t, y, args, f))
-    residual, scale = measure(entry, values, t, y, args)
+    vector, slope = ravel(y), ravel(f)
+    numbers = ravel(values).astype(vector.dtype)
+
+    def residual(t: Array) -> Array:
+        return equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args).residual(vector)
+
+    t = jnp.asarray(t, vector.dtype)
+    now, in_time = jax.jvp(residual, (t,), (jnp.ones_like(t),))
+    rate = ravel(rates(entry, t, y, args)).astype(vector.dtype)
+    equations = equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args)
+    _, jacobian = equations.linearise(vector)
+    along = jacobian * slope
+    change = jnp.sum(along, axis=1) + in_time - rate
+    # The slope itself may be the roundoff of larger terms: a component has the size of the largest
+    # among those that enter the function.
+    enters = jacobian != 0
+    largest = jnp.max(jnp.where(enters, jnp.abs(slope), 0), axis=1, keepdims=True)
+    terms = jnp.sum(jnp.abs(along), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
+    most = jnp.sum(jnp.abs(jacobian) * largest, axis=1)
+    roundoff = 100 * float(jnp.finfo(vector.dtype).eps) * most
+    terms = jnp.where(jnp.abs(change) <= roundoff, jnp.maximum(terms, most), terms)
+    defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may
     # vanish.
-    defect = jnp.where(tree_all_finite(residual), defect, jnp.nan)
-    violation = largest(relative(residual, scale))
-    return defect, violation if isinstance(entry, Constraint) else jnp.zeros_like(violation)
+    defect = jnp.where(tree_all_finite(now), defect, jnp.nan)
+    violation = tree_max(relative(*measure(entry, values, t, y, args)))
+    violation = violation if isinstance(entry, Constraint) else jnp.zeros_like(violation)
+    return defect, violation, ~jnp.any(enters) & jnp.all(in_time == 0)
 
 
 def _verdict(
-    name: str, entry: AbstractConserved, defects: np.ndarray, residuals: np.ndarray, rtol: float
+    name: str,
+    entry: AbstractConserved,
+    defects: np.ndarray,
+    residuals: np.ndarray,
+    constant: np.ndarray,
+    rtol: float,
 ) -> InvarianceEntry:
     if not np.all(residuals <= rtol):
         worst = _worst(residuals)
@@ -272,10 +283,11 @@ def _verdict(
     worst = _worst(defects)
     return InvarianceEntry(
         name=name,
-        kind="constraint" if isinstance(entry, Constraint) else "first integral",
+        kind="constraint" if isinstance(entry, Constraint) else _KINDS[rate_of(entry) is not None],
         defect=float(defects[worst]),
         state=worst,
         ok=bool(defects[worst] <= rtol),
+        is_constant=bool(np.all(constant)),
     )
 
 

@@ -20,7 +20,7 @@ from .._manifold import (
     named_entries,
 )
 from .._options import check_solution
-from .._projection.residual import measure, relative
+from .._projection.equations import measure, relative
 from .._tree import tree_add, tree_shapes, tree_sub
 
 

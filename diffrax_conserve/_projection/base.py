@@ -1,77 +1,121 @@
 """The interface of projections: the problem, the report, and the checks of options."""
 
 import abc
+import dataclasses
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._options import check_count, check_number, check_numbers
-from .._tree import from_view, tree_stop_gradient
-from .elimination import Vector
-from .equations import Equations, ProjectionInfo
-from .linearise import Joined, linearise
-from .residual import Tolerance
+from .._printing import is_traced, printed
+from .._tree import tree_stop_gradient, unravel
+from .equations import Equations, relative, within
 from .step import Step
 
 
-class Problem(eqx.Module):
-    """The problem that a projection solves.
+class ProjectionInfo(eqx.Module):
+    """The report on a projection.
 
     **Attributes:**
 
-    - `residual`: `y ↦ g(y)`, of shape `(m,)`, whose closed-over arrays are part of its PyTree.
-    - `magnitude`: the absolute conserved values, as `residual` returns them.
-    - `weights`: `M⁻¹`, the inverse of the metric, shaped like the state.
+    - `ok`: whether every residual is within its tolerance at the state that is returned.
+    - `num_steps`: the number of iterations.
+    - `residual_before`, `residual_after`: the largest residual of the candidate and of the
+        projected state, each relative to the scale of its own constraint at the projected state,
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus the measured
+        part.
+    - `correction`: the Euclidean norm of the projected state minus the candidate.
+    - `roundoff`: the largest measured share of a scale, which its gradient does not show: near one
+        where `fn` is less accurate than its gradient tells.
+    - `worst`: if the projection failed, the position of the scalar constraint with the largest
+        relative residual (the smaller of its residuals before and after), in the order in which the
+        manifold is flattened; otherwise 0.
+    """
+
+    ok: Bool[Array, ""]
+    num_steps: Int[Array, ""]
+    residual_before: Float[Array, ""]
+    residual_after: Float[Array, ""]
+    correction: Float[Array, ""]
+    roundoff: Float[Array, ""]
+    worst: Int[Array, ""]
+
+    @property
+    def result(self) -> optx.RESULTS:
+        """An `optimistix.RESULTS`, successful if and only if `ok`: `nonfinite` if the candidate has
+        no finite residual, divergence if only the result has none."""
+        kinds = optx.RESULTS
+        finite = jnp.isfinite(self.residual_after)
+        failed = kinds.where(finite, kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence)
+        failed = kinds.where(jnp.isfinite(self.residual_before), failed, kinds.nonfinite)
+        return kinds.where(self.ok, kinds.successful, failed)
+
+    def __str__(self) -> str:
+        if is_traced(self):
+            return repr(self)
+        ok = np.asarray(self.ok)
+        if ok.ndim > 0:
+            title = f"{ok.sum()} of {ok.size} projections succeeded"
+        else:
+            title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
+        names = ("num_steps", "residual_before", "residual_after", "correction", "roundoff")
+        rows = {name: getattr(self, name) for name in names}
+        return printed(title, rows if ok.all() else rows | {"worst": self.worst})
+
+
+class Problem(eqx.Module):
+    """The problem that a projection solves. States are real vectors of `n` numbers; `state` makes
+    one a state of the solve.
+
+    **Attributes:**
+
+    - `equations`: the residuals `g` and their scales; `residual(y)` is the vector of the `m`
+        residuals.
     - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
-        manifold, from which `residual` was made.
-    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s. For a complex leaf, all
-        other attributes, the candidate and the result have the real and the imaginary part along a
-        new first axis; `state` combines them.
-    - `anchor`: a state near the manifold, from which an iteration can start if it fails from the
-        candidate: in dense output the nearer end of the step, in a step `None`.
+        manifold.
+    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s.
+    - `keys`: for each entry of the manifold its first key, such as a key of a dictionary.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
         [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
     """
 
-    residual: Joined
-    magnitude: Vector
-    weights: Y
+    equations: Equations
     t: RealScalarLike
     args: Args
     values: Values
     like: Any
-    anchor: Y | None = None
+    keys: tuple[Any, ...] = eqx.field(static=True)
     step: Step | None = None
 
-    def state(self, y: Y) -> Any:
-        """Converts a candidate to a state of the solve, with its complex leaves.
+    def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
+        """The residuals at a state, in the order in which the manifold is flattened."""
+        return self.equations.residual(y)
 
-        **Arguments:**
+    def state(self, y: Float[Array, " n"]) -> Y:
+        """The state of the solve whose numbers are `y`."""
+        return unravel(y, self.like)
 
-        - `y`: a candidate.
-
-        **Returns:**
-
-        The state, complex where the state of the solve is.
-        """
-        return from_view(y, self.like)
+    def tolerating(self, rtol: float | Array | None, atol: float | Array | None) -> Equations:
+        """The equations with these tolerances."""
+        return dataclasses.replace(self.equations, rtol=rtol, atol=atol)
 
     def judge(
         self,
-        candidate: Y,
-        y: Y,
+        candidate: Float[Array, " n"],
+        y: Float[Array, " n"],
         num_steps: IntScalarLike = 1,
         *,
         rtol: float | Array | None = None,
         atol: float | Array | None = None,
-    ) -> "ProjectionInfo":
+        ok: Bool[Array, ""] | None = None,
+    ) -> ProjectionInfo:
         """The report on a projection from `candidate` to `y`, as `solve` must return it.
 
         **Arguments:**
@@ -79,26 +123,31 @@ class Problem(eqx.Module):
         - `candidate`, `y`: the states before and after.
         - `num_steps`: the number of iterations.
         - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
+        - `ok`: the verdict, if it is known. By default it is given here.
 
         **Returns:**
 
         A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
         """
-        # The verdict has no derivative, and the derivative of a given Jacobian may not exist.
-        equations = self.equations(candidate, Tolerance(rtol, atol))
-        equations, y = tree_stop_gradient((equations, y))
-        before, jacobian = linearise(equations.residual, equations.candidate)
-        rank = equations.gram_solver(jacobian).rank
-        return equations.report(y, before, equations.measure(y), jnp.asarray(num_steps), rank)
-
-    def equations(self, candidate: Y, tolerance: Tolerance, linear_solver: Any = None) -> Equations:
-        weights, magnitude = self.weights, self.magnitude
-        return Equations(self.residual, candidate, weights, magnitude, tolerance, linear_solver)
-
-
-def option(default: Any, **kwargs: Any) -> Any:
-    """An optional, keyword-only field."""
-    return eqx.field(default=default, kw_only=True, **kwargs)
+        # The verdict has no derivative.
+        given = self.tolerating(rtol, atol), candidate, y
+        equations, candidate, y = tree_stop_gradient(given)
+        after, jacobian = equations.linearise(y)
+        scale = equations.scale(jacobian, y)
+        sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
+        if ok is None:
+            ok = within(after, equations.tolerance(scale))
+        # The smaller of both, so that none is blamed for an iteration that diverged.
+        least = jnp.minimum(*(jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes))
+        return ProjectionInfo(
+            ok=ok,
+            num_steps=jnp.asarray(num_steps),
+            residual_before=jnp.max(sizes[0]),
+            residual_after=jnp.max(sizes[1]),
+            correction=jnp.linalg.norm(y - candidate),
+            roundoff=jnp.max(relative(equations.sampled, scale)),
+            worst=jnp.where(ok, 0, jnp.argmax(least)),
+        )
 
 
 class AbstractProjection(eqx.Module):
@@ -114,11 +163,18 @@ class AbstractProjection(eqx.Module):
     sees_step: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        """The state on the manifold that belongs to `candidate`, shaped like it.
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        """The state on the manifold that belongs to `candidate`, and the report on it.
 
-        Never raises at run time; `info.result` is successful only if every residual is small.
+        Never raises at run time; `info.ok` is true only if every residual is small.
         """
+
+
+def option(default: Any, **kwargs: Any) -> Any:
+    """An optional, keyword-only field."""
+    return eqx.field(default=default, kw_only=True, **kwargs)
 
 
 def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
@@ -142,12 +198,6 @@ def check_options(projection: Any) -> None:
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):
         check_count("max_steps", projection.max_steps)
-    solver = getattr(projection, "linear_solver", None)
-    if solver is not None and not isinstance(solver, lx.AbstractLinearSolver):
-        raise TypeError(
-            f"`linear_solver` is {solver!r}, but it must be a solver of lineax, such as "
-            "`lineax.Cholesky()`, or `None`."
-        )
     for name in ("lower", "upper"):
         check_numbers(name, getattr(projection, name, None), least=-np.inf)
 
@@ -167,10 +217,9 @@ NEWTON_OPTIONS = r"""**Arguments:**
 - `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
     state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
     every projection ends well below it.
-- `atol`: an absolute tolerance, added to the relative one. Default: 0. Set it where the functions
-    of the manifold are less accurate than roundoff.
-- `max_steps`: the largest number of iterations (in `Newton`, of each phase). A projection that is
-    not within its tolerance by then has failed.
+- `atol`: an absolute tolerance, added to the relative one. Default: 0.
+- `max_steps`: the largest number of iterations. A projection that is not within its tolerance by
+    then has failed.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.
@@ -180,18 +229,12 @@ NEWTON_OPTIONS = r"""**Arguments:**
     linear constraints is the nearest such point of the manifold. If there is no such point, the
     projection fails. In derivatives, components at a bound are constant. For a complex component
     the bounds apply to both parts. Default: none.
-- `linear_solver`: a solver of lineax for the systems of the iterations with the matrix
-    $G M^{-1} G^\top$: `lineax.Cholesky()`, `lineax.CG(...)` or `lineax.SVD()`. It is positive
-    definite even if constraints depend on each other, because $\varepsilon^{3/4}$ of its diagonal
-    is added to it. The systems of derivatives and those with two different Jacobians are solved as
-    by default: by an elimination that leaves out dependent constraints, and with more than 128
-    constraints by conjugate gradients.
 
 **Raises:**
 
-`TypeError` if an option is not a number, or `linear_solver` is not a solver of lineax; `ValueError`
-if a tolerance is negative, `max_steps` is less than 1, a weight is not positive, a lower bound is
-above its upper bound, or, when the projection is used, the bounds are not shaped like the state.
+`TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
+less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
+projection is used, the bounds are not shaped like the state.
 """
 
 

@@ -6,11 +6,11 @@ from typing import Any, ClassVar, final
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from .._custom_types import RealScalarLike, Values, Y
+from .._custom_types import RealScalarLike, Values
 from .._options import check_function
-from .._tree import real_view
+from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
 
 
@@ -51,11 +51,13 @@ class ClosedForm(AbstractProjection):
         check_function("fn", "ClosedForm", self.fn, "t, y, args, values", "the projected state")
         check_options(self)
 
-    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
         y = self.fn(problem.t, state, problem.args, problem.values)
         _check_like(y, state)
-        y = real_view(y)
+        y = ravel(y)
         return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
 
 

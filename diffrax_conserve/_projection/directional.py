@@ -3,17 +3,12 @@
 from typing import ClassVar, final
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Real
+from jaxtyping import Array, Float
 
-from .._custom_types import Y
-from .._tree import tree_add, tree_dot, tree_max, tree_norm, tree_scale, tree_tangents
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
-from .equations import SAFELY
-from .linearise import Joined, linearise
-from .residual import Tolerance, within
+from .implicit import project_along
 
 
 @final
@@ -68,18 +63,13 @@ class Directional(AbstractProjection):
     def __check_init__(self):
         check_options(self)
 
-    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         direction = _direction(problem)
-        limit = Tolerance(self.rtol, self.atol)
-        length, count = _length(
-            problem.residual,
-            candidate,
-            direction,
-            (limit, problem.magnitude),
-            max_steps=self.max_steps,
-        )
-        y = tree_add(candidate, tree_scale(length, direction))
-        return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol)
+        equations = problem.tolerating(self.rtol, self.atol)
+        y, ok, count = project_along(equations, candidate, direction, max_steps=self.max_steps)
+        return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol, ok=ok)
 
 
 Directional.__init__.__doc__ = """**Arguments:**
@@ -95,10 +85,11 @@ solver that has no error estimate, or in [`diffrax_conserve.project`][], where t
 """
 
 
-def _direction(problem: Problem) -> Y:
-    if problem.magnitude.size != 1:
+def _direction(problem: Problem) -> Float[Array, "1 n"]:
+    size = problem.equations.magnitude.size
+    if size != 1:
         raise ValueError(
-            f"`Directional` moves along one direction, but `manifold` has {problem.magnitude.size} "
+            f"`Directional` moves along one direction, but `manifold` has {size} "
             "scalar constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
         )
     if problem.step is None:
@@ -114,61 +105,5 @@ def _direction(problem: Problem) -> Y:
         )
     # Normalised: the result does not depend on the length, and products with the gradient do not
     # overflow or underflow.
-    size = lax.stop_gradient(tree_max(problem.step.error))
-    return tree_scale(1 / jnp.where(size > 0, size, 1), problem.step.error)
-
-
-@eqx.filter_custom_jvp
-def _length(
-    residual: Joined,
-    candidate: Y,
-    direction: Y,
-    accuracy: tuple[Tolerance, Real[Array, " 1"]],
-    *,
-    max_steps: int,
-) -> tuple[Real[Array, ""], Int[Array, ""]]:
-    """The last iterate of `λ`, converged or not, and the number of iterations."""
-    limit, magnitude = accuracy
-    _, jacobian = linearise(residual, candidate)
-    enough = SAFELY * limit(magnitude + jacobian.scale(candidate))[0]
-
-    def along(length: Array) -> Array:
-        return residual(tree_add(candidate, tree_scale(length, direction)))[0]
-
-    def body(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        _, last, length, num_steps = carry
-        g, slope = jax.jvp(along, (length,), (jnp.ones_like(length),))
-        size = jnp.abs(g)
-        # Ends when the residual stops decreasing; `Problem.judge` decides on success.
-        unfinished = (size > enough) & (size < 0.9 * last) & (num_steps < max_steps) & (slope != 0)
-        step = jnp.where(unfinished, g / jnp.where(slope == 0, 1, slope), 0)
-        return unfinished, size, length - step, num_steps + unfinished.astype(int)
-
-    zero = jnp.zeros((), magnitude.dtype)
-    start = jnp.asarray(True), jnp.full_like(zero, jnp.inf), zero, jnp.asarray(0)
-    _, _, length, count = lax.while_loop(lambda carry: carry[0], body, start)
-    return length, count
-
-
-@_length.def_jvp
-def _length_jvp(primals, tangents, *, max_steps):
-    """From `g(ŷ + λ w) = 0`: with `ġ` at a fixed `λ`, `λ̇ = -ġ / (∂g/∂y · w)`."""
-    residual, candidate, direction, (limit, magnitude) = primals
-    length, count = _length(*primals, max_steps=max_steps)
-
-    def displaced(residual: Joined, candidate: Y, direction: Y) -> Array:
-        return residual(tree_add(candidate, tree_scale(length, direction)))[0]
-
-    g, t_g = eqx.filter_jvp(displaced, tuple(primals[:3]), tuple(tangents[:3]))
-    t_g = tree_tangents(g, t_g)
-    y = tree_add(candidate, tree_scale(length, direction))
-    _, jacobian = linearise(residual, y)
-    gradient = jacobian.pullback(jnp.ones_like(magnitude))
-    slope = tree_dot(gradient, direction, g.dtype)
-    sine = jnp.abs(slope) / (tree_norm(gradient) * tree_norm(direction))
-    certain = (sine > float(jnp.finfo(g.dtype).eps) ** (1 / 3)) | (tree_max(direction) == 0)
-    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
-    failed = ~within(g, limit(magnitude + jacobian.scale(y))[0])
-    t_length = -t_g / jnp.where(slope == 0, 1, slope)
-    factor = lax.stop_gradient(jnp.where(certain | failed, 1.0, jnp.nan).astype(g.dtype))
-    return (length, count), (factor * t_length, None)
+    size = lax.stop_gradient(jnp.max(jnp.abs(problem.step.error)))
+    return problem.step.error[None] / jnp.where(size > 0, size, 1)

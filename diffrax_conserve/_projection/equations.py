@@ -1,191 +1,164 @@
-"""The equations of a projection, and the report on a state that should solve them."""
+"""A manifold at one time, as equations `g(y) = 0` for a state in one real vector.
 
-import functools as ft
+For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The *scale* of a
+residual at `y` is the size of the terms that cancel in it: `|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what is
+inside `fn` but not in its gradient, which its measured roundoff shows. Roundoff is proportional to
+the scale, so success is judged relative to the scale at the state that is returned.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import lineax as lx
-import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Y
-from .._printing import is_traced, printed
-from .._tree import tree_all_finite, tree_mul, tree_norm, tree_scale, tree_sub
-from .elimination import GramSolver, Vector
-from .jacobian import AbstractJacobian, lineax_solver
-from .linearise import Elements, Joined, linearise
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, largest, relative, within
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._manifold import evaluate, is_entry
+from .._tree import ravel, unflatten, unravel
 
-# An iteration ends at this fraction of the tolerance, or where it no longer halves the residual.
-SAFELY = 0.25
+# The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
+# residual contribute about one unit each.
+ROUNDOFF_MULTIPLE = 16
+# The measured roundoff of a function counts this many times, because it is a sample: of so many
+# displacements, of each of so many lengths.
+_SAMPLED, _SAMPLES, _LENGTHS = 8, 6, 8
 
-
-class ProjectionInfo(eqx.Module):
-    """The report on a projection.
-
-    **Attributes:**
-
-    - `result`: an `optimistix.RESULTS`; `optimistix.RESULTS.successful` if and only if every
-        residual is within its tolerance at the state that is returned.
-    - `num_steps`: the number of iterations (of `Newton`: of both phases).
-    - `residual_before`, `residual_after`: the largest residual of the candidate and of the
-        projected state, each relative to the scale of its own constraint at the projected state,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$. With more than
-        128 constraints the sum is estimated, mostly from below, so that residuals may be reported
-        too large.
-    - `correction`: the Euclidean norm of the projected state minus the candidate.
-    - `rank`: the numerical rank of the Gram matrix of the constraints at the candidate (for
-        `Newton`: at the result). With more than 128 constraints the matrix is not formed, and this
-        is their number.
-    - `worst`: if the projection failed, the position of the scalar constraint with the largest
-        relative residual (the smaller of its residuals before and after), in the order in which the
-        manifold is flattened; otherwise 0.
-    """
-
-    result: optx.RESULTS
-    num_steps: Int[Array, ""]
-    residual_before: Float[Array, ""]
-    residual_after: Float[Array, ""]
-    correction: Float[Array, ""]
-    rank: Int[Array, ""]
-    worst: Int[Array, ""]
-
-    @property
-    def ok(self) -> Bool[Array, "..."]:
-        """Whether the projection succeeded."""
-        return self.result == optx.RESULTS.successful
-
-    def __str__(self) -> str:
-        if is_traced(self):
-            return repr(self)
-        ok = np.asarray(self.ok)
-        if ok.ndim > 0:
-            title = f"{ok.sum()} of {ok.size} projections succeeded"
-        else:
-            title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
-        names = ("num_steps", "residual_before", "residual_after", "correction", "rank")
-        rows = {name: getattr(self, name) for name in names}
-        return printed(title, rows if ok.all() else rows | {"worst": self.worst})
-
-
-class Outcome(eqx.Module):
-    """The verdict on the state that a projection returns: the result and the worst constraint.
-
-    It consists of two integers, to keep the state that a solve carries small.
-    """
-
-    result: optx.RESULTS
-    worst: Int[Array, ""]
-
-    @classmethod
-    def success(cls) -> "Outcome":
-        # With an array as its value, as `RESULTS.where` returns it.
-        ok = optx.RESULTS.successful
-        return cls(optx.RESULTS.where(jnp.asarray(True), ok, ok), jnp.asarray(0, jnp.int32))
-
-    @classmethod
-    def of(cls, before: Vector, after: Vector, scale: Vector, tolerance: Tolerance) -> "Outcome":
-        """The verdict on a state with residuals `after` and their scales `scale`, from a candidate
-        with residuals `before`: `nonfinite` if `before` is not finite, divergence if only `after`
-        is not."""
-        kinds = optx.RESULTS
-        success = within(after, tolerance(scale))
-        result = kinds.where(
-            tree_all_finite((after, scale)),
-            kinds.nonlinear_max_steps_reached,
-            kinds.nonlinear_divergence,
-        )
-        result = kinds.where(tree_all_finite(before), result, kinds.nonfinite)
-        result = kinds.where(success, kinds.successful, result)
-
-        def sizes(residual: Vector) -> Array:
-            ratios = jtu.tree_leaves(relative(residual, scale))
-            size = jnp.abs(jnp.concatenate([jnp.atleast_1d(x) for x in ratios]))
-            return jnp.where(jnp.isnan(size), jnp.inf, size)
-
-        # The smaller of both, so that none is blamed for an iteration that diverged.
-        worst = jnp.argmax(jnp.minimum(sizes(before), sizes(after))).astype(jnp.int32)
-        return cls(result, jnp.where(success, 0, worst))
+Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
 
 class Equations(eqx.Module):
-    """`g(y) = 0` for `y = ŷ + M⁻¹ Gᵀ λ`, from the candidate `ŷ`."""
+    """The residuals of a manifold, in the order in which it is flattened.
 
-    residual: Joined | Elements
-    candidate: Y
-    weights: Y
-    magnitude: Vector
-    tolerance: Tolerance
-    linear_solver: lx.AbstractLinearSolver | None = eqx.field(static=True)
+    - `parts`: the residual of each entry.
+    - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + sampled`.
+    - `sampled`: what the measured roundoff of the functions adds to it.
+    - `weights`: `M⁻¹`, the inverse of the metric; `None` if it is one.
+    - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
+    """
 
-    def gram_solver(
-        self,
-        jacobian: AbstractJacobian,
-        other: AbstractJacobian | None = None,
-        damping: Array | float = 0.0,
-        weights: Y | None = None,
-    ) -> GramSolver:
-        """Solves with `G M⁻¹ Hᵀ`; see `AbstractJacobian.gram_solver`. With a `linear_solver` these
-        are approximate, which the next iteration corrects."""
-        weights = self.weights if weights is None else weights
-        if self.linear_solver is None:
-            return jacobian.gram_solver(weights, other, damping)
-        return lineax_solver(self.linear_solver, jacobian, weights, other, damping)
+    parts: tuple[Part, ...]
+    magnitude: Float[Array, " m"]
+    sampled: Float[Array, " m"]
+    weights: Float[Array, " n"] | None = None
+    rtol: float | Array | None = None
+    atol: float | Array | None = None
 
-    def correction(self, jacobian: AbstractJacobian, multiplier: Vector) -> Y:
-        """`M⁻¹ Gᵀ λ`."""
-        return tree_mul(jacobian.pullback(multiplier), self.weights)
+    def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
+        return jnp.concatenate([part(y) for part in self.parts])
 
-    def as_vector(self, x: Array) -> Vector:
-        """`x` in the form of the residual, one array or a tuple of scalars."""
-        return tuple(x) if isinstance(self.residual, Elements) else x
+    def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """`g(y)` and the constraint Jacobian `G(y)`. Entry by entry, so that the rows of one do not
+        contain the gradients of the others."""
+        values, rows = [], []
+        for part in self.parts:
+            value, vjp = jax.vjp(part, y)
+            values.append(value)
+            rows.append(jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))[0])
+        return jnp.concatenate(values), jnp.concatenate(rows)
 
-    def scale(self, jacobian: AbstractJacobian, y: Y) -> Vector:
-        """The scale of the residual at `y`, to which its roundoff is proportional; `jacobian` is
-        that at `y`."""
-        return jtu.tree_map(jnp.add, self.magnitude, jacobian.scale(y))
+    def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1)
 
-    def merit(self, g: Vector, scale: Vector) -> Array:
-        """The sum of squares of the residuals, relative to their scales, which are enlarged to
-        allow for `atol`."""
-        atol = 0.0 if self.tolerance.atol is None else self.tolerance.atol
+    def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The largest residual that counts as zero; NaN, which none satisfies, where a residual of
+        that size would underflow."""
+        info = jnp.finfo(scale.dtype)
+        rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
+        limit = jnp.asarray(rtol, scale.dtype) * scale
+        limit = limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
+        return jnp.where((scale > 0) & (limit < float(info.tiny)), jnp.nan, limit)
 
-        def square(g: Array, scale: Array) -> Array:
-            roundoff = ROUNDOFF_MULTIPLE * jnp.finfo(scale.dtype).eps
-            size = scale + jnp.asarray(atol, scale.dtype) / roundoff
-            return jnp.sum(jnp.square(relative(g, size)))
+    def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether `y` is on the manifold."""
+        g, jacobian = self.linearise(y)
+        return within(g, self.tolerance(self.scale(jacobian, y)))
 
-        return ft.reduce(jnp.add, jtu.tree_leaves(jtu.tree_map(square, g, scale)))
+    def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
+        """The rows of `G M⁻¹`."""
+        return rows if self.weights is None else rows * self.weights
 
-    def safely_satisfied(self, g: Vector, scale: Vector) -> Bool[Array, ""]:
-        return within(g, tree_scale(SAFELY, self.tolerance(scale)))
 
-    def measure(self, y: Y) -> tuple[Vector, Vector]:
-        """The residual at `y`, and its scale there."""
-        g, jacobian = linearise(self.residual, y)
-        return g, self.scale(jacobian, y)
+def within(residual: Float[Array, " m"], tolerance: Float[Array, " m"]) -> Bool[Array, ""]:
+    """Whether every residual is within its tolerance. NaN and infinity never are."""
+    return jnp.all((jnp.abs(residual) <= tolerance) & (tolerance < jnp.inf))
 
-    def report(
-        self,
-        y: Y,
-        before: Vector,
-        measured: tuple[Vector, Vector],
-        count: Array,
-        rank: Array,
-        outcome: Outcome | None = None,
-    ) -> ProjectionInfo:
-        """The report on a projection to `y`, from a candidate with the residual `before`;
-        `measured` is the residual at `y` and its scale."""
-        after, scale = measured
-        outcome = Outcome.of(before, after, scale, self.tolerance) if outcome is None else outcome
-        return ProjectionInfo(
-            result=outcome.result,
-            num_steps=count,
-            residual_before=largest(relative(before, scale)),
-            residual_after=largest(relative(after, scale)),
-            correction=tree_norm(tree_sub(y, self.candidate)),
-            rank=rank,
-            worst=outcome.worst,
-        )
+
+def relative(residual: Any, scale: Any) -> Any:
+    """Residuals relative to their scales; a scale of zero counts as one."""
+    return jtu.tree_map(lambda g, s: g / jnp.where(s > 0, s, jnp.ones_like(s)), residual, scale)
+
+
+def measure(
+    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Values, Values]:
+    """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
+    vector = ravel(y)
+    numbers = ravel(values).astype(vector.dtype)
+    equations = equations_of(manifold, numbers, jnp.zeros_like(numbers), t, y, args)
+    g, jacobian = equations.linearise(vector)
+    like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
+    return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
+
+
+def equations_of(
+    manifold: Manifold,
+    values: Float[Array, " m"],
+    sampled: Float[Array, " m"],
+    t: RealScalarLike,
+    like: Y,
+    args: Args,
+) -> Equations:
+    """The equations of a manifold with the conserved `values`, for states like `like`; `sampled` is
+    the measured part of the scales."""
+    like = jax.eval_shape(lambda: like)
+    vector, parts, start = jax.eval_shape(ravel, like), [], 0
+    for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
+
+        def part(y: Array, entry=entry, start=start) -> Array:
+            out = ravel(entry.fn(t, unravel(y, like), args)).astype(y.dtype)
+            return out - values[start : start + out.size]
+
+        # Arrays over which `fn` closes become leaves, and can be differentiated.
+        parts.append(eqx.filter_closure_convert(part, vector))
+        start += jax.eval_shape(part, vector).size
+    magnitude = lax.stop_gradient(jnp.abs(values) + sampled)
+    return Equations(tuple(parts), magnitude, sampled)
+
+
+def measured_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """The size of the terms inside each function that its gradient at `y` does not show, such as
+    the 1 in `1 - cos(q)` near zero or the hidden layers of a network.
+
+    Their roundoff shows them: `g(y + δ) - g(y) - G δ`, for displacements `δ` so small that the rest
+    of it is below roundoff. Where these are too small to change the function at all, larger ones
+    are taken.
+    """
+    eps = float(jnp.finfo(y.dtype).eps)
+    value, jacobian = equations.linearise(y)
+    size = jnp.abs(y) + jnp.max(jnp.abs(y), initial=0)
+    phases = jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2
+
+    def sample(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, settled, largest = carry
+        index = count // _SAMPLES
+        length = eps ** (0.55 * (1 - index / _LENGTHS))
+        there = y + (length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size
+        change = equations.residual(there) - value
+        error = jnp.abs(change - jnp.sum(jacobian * (there - y), axis=1))
+        # A function is settled by the first length that changes it.
+        error = jnp.where((settled >= index) & (error < jnp.inf), error, 0)
+        settled = jnp.where(change != 0, jnp.minimum(settled, index), settled)
+        return count + 1, settled, jnp.maximum(largest, error)
+
+    def unsettled(carry: tuple[Array, Array, Array]) -> Array:
+        count, settled, _ = carry
+        more = jnp.any(settled >= count // _SAMPLES) | (count % _SAMPLES > 0)
+        return more & (count < _SAMPLES * _LENGTHS)
+
+    start = jnp.asarray(0), jnp.full(value.shape, _LENGTHS), jnp.zeros_like(value)
+    _, _, found = lax.while_loop(unsettled, sample, start)
+    return _SAMPLED / (ROUNDOFF_MULTIPLE * eps) * found

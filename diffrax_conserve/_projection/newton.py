@@ -1,38 +1,30 @@
 """Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
 
-import functools as ft
 from typing import Any, ClassVar, final
 
 import equinox as eqx
-import jax.flatten_util as jfu
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-import lineax as lx
-import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from .._custom_types import Y
-from .._tree import (
-    tree_mul,
-    tree_size,
-    tree_sub,
-    working_dtype,
-)
 from .base import (
     NEWTON_OPTIONS,
     AbstractProjection,
     Problem,
+    ProjectionInfo,
     check_options,
     option,
     positive_weights,
 )
-from .bounded import box_of, check_bounds, project_into
-from .elimination import Vector
-from .equations import Equations, ProjectionInfo
-from .implicit import SYSTEM_DENSE_MAX, differentiated, finite_or_nan, optimality, units
-from .iteration import iterate
-from .linearise import linearise
-from .residual import ROUNDOFF_MULTIPLE, Tolerance, within
+from .bounded import Box, box_of, check_bounds
+from .equations import Equations
+from .gram import gram_matrix, gram_solve
+from .implicit import certain
+from .loop import solve
+
+# The largest number of unknowns and constraints for which the nearest point is sought.
+_NEAREST_MAX = 512
 
 
 @final
@@ -46,11 +38,11 @@ class Newton(AbstractProjection):
     in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
     $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: the
     iteration can pass near points where gradients are parallel, and converges quadratically
-    elsewhere. Then Newton's method on both equations moves along the manifold to the point nearest
-    to the candidate. If that fails, the result of the first phase is returned: it is on the
-    manifold, but not the nearest point, and its derivative is NaN. The second phase needs second
-    derivatives of the constraint functions and linear solves with all unknowns, so for the close
-    candidates of an integrator use [`diffrax_conserve.SimplifiedNewton`][].
+    elsewhere. Then the same iteration on both equations moves along the manifold to the point
+    nearest to the candidate. If that fails, or if there are more than 512 unknowns and constraints,
+    the result of the first phase is returned: it is on the manifold, but not the nearest point, and
+    its derivative is NaN. For the close candidates of an integrator use
+    [`diffrax_conserve.SimplifiedNewton`][].
 
     Success is judged at the returned state, relative to the scale of the constraints there. The
     result is differentiated by the implicit function theorem for both equations. The derivative is
@@ -79,121 +71,120 @@ class Newton(AbstractProjection):
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
-    linear_solver: lx.AbstractLinearSolver | None = option(None, static=True)
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
         check_options(self)
         check_bounds(self.lower, self.upper)
 
-    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        if jnp.finfo(working_dtype(candidate)).bits < 32:
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        if jnp.finfo(candidate.dtype).bits < 32:
             raise TypeError(
-                f"`Newton` was given a state of dtype {working_dtype(candidate)}, in which its "
-                "linear solves cannot be done. Convert the state to float32, or pass "
+                f"`Newton` was given a state of dtype {candidate.dtype}, in which its linear "
+                "solves cannot be done. Convert the state to float32, or pass "
                 "`projection=SimplifiedNewton()`."
             )
-        if len({x.dtype for x in jtu.tree_leaves(candidate)}) > 1:
-            raise TypeError(
-                "`Newton` was given a state with leaves of several dtypes. Convert them to one, or "
-                "pass `projection=SimplifiedNewton()`."
-            )
-        tolerance = Tolerance(self.rtol, self.atol)
-        equations = problem.equations(candidate, tolerance, self.linear_solver)
-        box = box_of(self.lower, self.upper, candidate)
-        steps = self.max_steps
-        unbounded = ft.partial(_project, max_steps=steps)
-        if box is None:
-            y, _, info = unbounded(equations)
-        else:
-            y, _, info = project_into(
-                equations, box, unbounded=unbounded, frozen=False, max_steps=steps
-            )
-        return y, info
+        equations = problem.tolerating(self.rtol, self.atol)
+        box = box_of(self.lower, self.upper, problem.like)
+        y, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
+        return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS
 
 
+class _Optimality(eqx.Module):
+    """`y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and `λ` in one vector."""
+
+    equations: Equations
+    candidate: Float[Array, " n"]
+    box: Box | None
+
+    def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
+        y, multiplier = jnp.split(unknowns, [self.candidate.size])
+        g, vjp = jax.vjp(self.equations.residual, y)  # by one reverse pass, not row by row
+        z = self.candidate + self.equations.weighted(vjp(multiplier)[0][None])[0]
+        return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
+
+
+# The state, the multipliers, whether they are those of the nearest point, the number of iterations.
+_Nearest = tuple[Float[Array, " n"], Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]
+
+
 @eqx.filter_custom_jvp
-def _project(equations: Equations, *, max_steps: int) -> tuple[Y, Vector, ProjectionInfo]:
-    before, reached = iterate(equations, frozen=False, max_steps=max_steps)
-    nearest, multiplier, num_steps, arrived = _nearest(equations, reached.y, max_steps)
-
-    g, scale = equations.measure(nearest)
-    found = within(g, equations.tolerance(scale)) & arrived
-    y = jtu.tree_map(lambda a, b: jnp.where(found, a, b), nearest, reached.y)
-    g, jacobian = linearise(equations.residual, y)
-    measured = g, equations.scale(jacobian, y)
-    rank = jacobian.gram_solver(equations.weights).rank
-    info = equations.report(y, before, measured, reached.num_steps + num_steps, rank)
-    # Only the multipliers of the nearest point have a derivative.
-    return y, jnp.where(info.ok & ~found, jnp.nan, multiplier), info
-
-
-class _SVD(lx.SVD):
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        return super().init(lx.MatrixLinearOperator(finite_or_nan(operator.as_matrix())), options)
-
-
 def _nearest(
-    equations: Equations, start: Y, max_steps: int
-) -> tuple[Y, Vector, Int[Array, ""], Bool[Array, ""]]:
-    """Newton's method on the optimality system, from a point of the manifold and its least-squares
-    multipliers. Returns the state, its multipliers, the number of steps, and whether it
-    converged."""
-    residual, candidate, weights = equations.residual, equations.candidate, equations.weights
-    _, jacobian = linearise(residual, start)
-    offset = jacobian.pushforward(tree_sub(start, candidate))
-    # Scaled, so that a linear solver finds the right rank of the system.
-    roots, norms = units(jacobian, weights)
-    multiplier = equations.gram_solver(jacobian).solve(offset) * norms
-
-    def scaled(unknowns: tuple[Y, Vector], parameters: Any) -> tuple[Y, Vector]:
-        (y, multiplier), (residual, candidate, weights, roots, norms) = unknowns, parameters
-        given = (lambda y: residual(y) / norms), candidate, weights, None
-        off, g = optimality((tree_mul(y, roots), multiplier), given)
-        return jtu.tree_map(jnp.divide, off, roots), g
-
-    def tolerance(y: Y, multiplier: Vector) -> Array:
-        """The tolerance for the optimality condition. It allows for the roundoff of the
-        multipliers, which are large and cancel where gradients are nearly parallel."""
-        free = jtu.tree_map(lambda x, w: jnp.where(w > 0, x, 0), y, weights)
-        return rtol * optx.max_norm(free) + ROUNDOFF_MULTIPLE * eps * optx.max_norm(multiplier)
-
-    eps = float(jnp.finfo(working_dtype(candidate)).eps)
-    rtol = eps ** (2 / 3)
-    if tree_size((candidate, multiplier)) <= SYSTEM_DENSE_MAX:
-        # Dependent constraints make the system singular but consistent.
-        linear_solver = _SVD()
-    else:
-        linear_solver = lx.GMRES(rtol=rtol, atol=rtol)
-    y = jtu.tree_map(jnp.divide, start, roots)
-    atol: Any = tolerance(y, multiplier)
-    parameters = residual, candidate, weights, roots, norms
-    unknowns, unravel = jfu.ravel_pytree((y, multiplier))
-
-    def state_norm(x: Array) -> Array:
-        # Where gradients are nearly parallel, only the state is well determined, not the
-        # multipliers.
-        return optx.max_norm(unravel(x)[0])
-
-    solution = optx.root_find(
-        lambda x, parameters: jfu.ravel_pytree(scaled(unravel(x), parameters))[0],
-        optx.Newton(rtol=rtol, atol=atol, norm=state_norm, linear_solver=linear_solver),
-        unknowns,
-        parameters,
-        max_steps=max_steps,
-        throw=False,
+    equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
+) -> _Nearest:
+    bounded = equations if box is None else box.compose(equations)
+    y, ok, count = solve(bounded, candidate, max_steps=max_steps, fresh=True)
+    y = y if box is None else box.clip(y)
+    multiplier = jnp.zeros_like(equations.magnitude)
+    n, unknowns = y.size, y.size + multiplier.size
+    if unknowns > _NEAREST_MAX:
+        return y, multiplier, jnp.asarray(False), count
+    _, jacobian = equations.linearise(y)
+    rows = equations.weighted(jacobian)
+    gram = gram_matrix(jacobian, rows)
+    multiplier = gram_solve(gram, jacobian @ (y - candidate))
+    # In these units the condition number does not depend on the user's.
+    lengths = jnp.diagonal(gram)
+    units = [jnp.ones(n, y.dtype) if equations.weights is None else equations.weights]
+    units += [1 / jnp.where(lengths > 0, lengths, 1)]
+    sampled = jnp.concatenate([jnp.zeros_like(y), equations.sampled])
+    magnitude = jnp.concatenate([jnp.abs(candidate), equations.magnitude])
+    optimality = Equations(
+        (_Optimality(equations, candidate, box),),
+        magnitude,
+        sampled,
+        jnp.concatenate(units),
+        equations.rtol,
+        equations.atol,
     )
-    y, multiplier = unravel(solution.value)
-    # Judged with the tolerance at the end, because multipliers may be much smaller at the start.
-    off, _ = scaled((y, multiplier), parameters)
-    arrived = optx.max_norm(off) <= tolerance(y, multiplier)
-    return tree_mul(y, roots), multiplier / norms, solution.stats["num_steps"], arrived
+    start = jnp.concatenate([y, multiplier])
+    end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
+    found = found & ok
+    nearest = jnp.where(found, end, start)
+    return nearest[:n], nearest[n:], found, count + more
 
 
-@_project.def_jvp
-def _project_jvp(primals, tangents, *, max_steps):
-    solution = _project(*primals, max_steps=max_steps)
-    return differentiated(solution, (*primals, None), (*tangents, None), frozen=False)
+@_nearest.def_jvp
+def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
+    """From `F(y, λ) = 0`, the optimality system: its tangent at constant `y` and `λ` is cancelled
+    by theirs."""
+    equations, candidate, box = primals
+    y, multiplier, found, count = _nearest(*primals, max_steps=max_steps)
+    unknowns = jnp.concatenate([y, multiplier])
+    if unknowns.size > _NEAREST_MAX:
+        t_y = jnp.full_like(y, jnp.nan)
+        return (y, multiplier, found, count), (t_y, jnp.zeros_like(multiplier), None, None)
+    _, right = eqx.filter_jvp(lambda *p: _Optimality(*p)(unknowns), primals, tangents)
+    right = jnp.zeros_like(unknowns) if right is None else right
+    _, jacobian = equations.linearise(y)
+    lengths = jnp.diagonal(gram_matrix(jacobian, equations.weighted(jacobian)))
+    roots = jnp.ones_like(y) if equations.weights is None else jnp.sqrt(equations.weights)
+    norms = jnp.sqrt(jnp.where(lengths > 0, lengths, 1))
+    rows = jnp.concatenate([jnp.where(roots > 0, roots, 1), norms])
+    columns = jnp.concatenate([jnp.where(roots > 0, roots, 1), 1 / norms])
+    matrix = jax.jacfwd(_Optimality(*primals))(unknowns) / rows[:, None] * columns
+    tangent = -columns * _shortest(matrix, right / rows)
+    # Only the nearest point has a derivative; that of a failed projection is not used.
+    judged = equations.judged(y)
+    doubt = jnp.where(found, certain(equations, candidate, y, jacobian), jnp.nan)
+    tangent = lax.stop_gradient(jnp.where(judged, doubt, 1)) * tangent
+    return (y, multiplier, found, count), (tangent[: y.size], tangent[y.size :], None, None)
+
+
+def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
+    """The minimum-norm solution by singular values, because dependent constraints make the system
+    singular but consistent. NaN if `matrix` is not finite: LAPACK never returns from infinity."""
+    fixed = lax.stop_gradient(jnp.where(jnp.isfinite(matrix), matrix, jnp.nan))
+    u, s, vt = jnp.linalg.svd(fixed)
+    inverse = jnp.where(s > 64 * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)
+    return lax.custom_linear_solve(
+        lambda x: matrix @ x,
+        b,
+        lambda _, b: vt.T @ (inverse * (u.T @ b)),
+        lambda _, b: u @ (inverse * (vt @ b)),
+    )

@@ -1,12 +1,13 @@
-"""`project`, and the function below it that the solver and the interpolation call."""
+"""`project`, and the problem that the solver and the interpolation pose too."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
@@ -16,16 +17,15 @@ from .._manifold import (
     check_outputs,
     check_values,
     conserved_values,
+    evaluate,
     is_entry,
     named_entries,
 )
 from .._options import dtype_of
-from .._tree import from_view, real_view, tree_mul, tree_sub
+from .._tree import ravel, real_view, tree_stop_gradient, unflatten, unravel
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
-from .certainty import if_certain
-from .linearise import linearise
+from .equations import equations_of, measured_scale
 from .newton import Newton
-from .residual import residual_of
 from .step import Step
 
 
@@ -55,7 +55,7 @@ def project(
     **Returns:**
 
     The state on the manifold, shaped like `y`, and a
-    [`diffrax_conserve.ProjectionInfo`][]. `info.result` tells whether it succeeded: nothing is
+    [`diffrax_conserve.ProjectionInfo`][]. `info.ok` tells whether it succeeded: nothing is
     raised at run time.
 
     **Raises:**
@@ -77,11 +77,18 @@ def project(
     check_projection(projection)
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
+    vector = ravel(y)
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
-    values = given_values(manifold, value, t, y, args)
-    projected, info = apply(projection, manifold, values, t, y, args)
-    return if_certain(projected, manifold, values, t, projected, args), info
+    values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
+    problem = problem_of(projection, manifold, values, jnp.zeros_like(values), t, y, args)
+    equations = problem.equations
+    sampled = measured_scale(*tree_stop_gradient((equations, vector)))
+    equations = dataclasses.replace(
+        equations, magnitude=equations.magnitude + sampled, sampled=sampled
+    )
+    projected, info = projection.solve(dataclasses.replace(problem, equations=equations), vector)
+    return unravel(projected, problem.like), info
 
 
 def given_values(
@@ -107,46 +114,40 @@ def given_values(
     return values
 
 
-def apply(
+def problem_of(
     projection: AbstractProjection,
     manifold: Manifold,
-    values: Values,
+    values: Float[Array, " m"],
+    sampled: Float[Array, " m"],
     t: RealScalarLike,
-    candidate: Y,
+    like: Y,
     args: Args,
-    anchor: Y | None = None,
     step: Step | None = None,
-) -> tuple[Y, ProjectionInfo]:
-    """`project` without its checks."""
-    residual, magnitude = residual_of(manifold, values, t, candidate, args)
-    weights = inverse_metric(projection.metric, real_view(candidate))
-    like = jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), candidate)
-    problem = Problem(residual, magnitude, weights, t, args, values, like, real_view(anchor), step)
-    y, info = projection.solve(problem, real_view(candidate))
-    return from_view(y, candidate), info
+) -> Problem:
+    """The problem of a projection at a time, for states like `like`."""
+    like = jax.eval_shape(lambda: like)
+    equations = equations_of(manifold, values, sampled, t, like, args)
+    weights = inverse_metric(projection.metric, like)
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+    keys = tuple(_key(path[0]) if path else None for path, _ in flat)
+    shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
+    equations = dataclasses.replace(equations, weights=weights)
+    return Problem(equations, t, args, shaped, like, keys, step)
 
 
-def tangential(
-    projection: AbstractProjection,
-    manifold: Manifold,
-    values: Values,
-    t: RealScalarLike,
-    y: Y,
-    args: Args,
-    vector: Y,
-) -> Y:
-    """The part of `vector` that is tangent to the manifold at `y`, `v - M⁻¹Gᵀ(GM⁻¹Gᵀ)⁻¹G v`."""
-    residual, _ = residual_of(manifold, values, t, y, args)
-    weights = inverse_metric(projection.metric, real_view(y))
-    _, jacobian = linearise(residual, real_view(y))
-    gram_solver = jacobian.gram_solver(weights)
-    normal = jacobian.pullback(gram_solver.solve(jacobian.pushforward(real_view(vector))))
-    return tree_sub(vector, from_view(tree_mul(normal, weights), vector))
+def _key(entry: Any) -> Any:
+    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
     """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
-    for leaf in jtu.tree_leaves(y):
+    leaves = jtu.tree_leaves(y)
+    if len({jnp.finfo(dtype_of(x)).dtype for x in leaves if jnp.issubdtype(dtype_of(x), kind)}) > 1:
+        raise TypeError(
+            f"The state has leaves of the dtypes {', '.join(str(dtype_of(x)) for x in leaves)}, but "
+            f"{user} needs a single precision. Convert them to one."
+        )
+    for leaf in leaves:
         dtype = dtype_of(leaf)
         if not jnp.issubdtype(dtype, kind):
             remedy = (
@@ -168,12 +169,15 @@ def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
     check_like("metric", metric, y, remedy)
 
 
-def inverse_metric(metric: PyTree[ArrayLike] | None, y: Y) -> Y:
-    """`M⁻¹`, shaped like `y`; an infinite weight freezes its component."""
+def inverse_metric(metric: PyTree[ArrayLike] | None, like: Y) -> Float[Array, " n"] | None:
+    """`M⁻¹` as a vector; an infinite weight freezes its component."""
     if metric is None:
-        return jtu.tree_map(jnp.ones_like, y)
-    return jtu.tree_map(
-        lambda weight, leaf: jnp.broadcast_to(1 / jnp.asarray(weight, leaf.dtype), leaf.shape),
-        metric,
-        y,
+        return None
+    view = jax.eval_shape(real_view, like)
+    return ravel(
+        jtu.tree_map(
+            lambda weight, x: jnp.broadcast_to(1 / jnp.asarray(weight, x.dtype), x.shape),
+            metric,
+            view,
+        )
     )

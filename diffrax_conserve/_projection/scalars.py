@@ -1,9 +1,9 @@
-"""Functions of small states, written out in scalars.
+"""Functions of small arrays, written out in scalars.
 
-XLA does not fuse across a sum or a stack of components: with a small state nearly every operation
-of a projection becomes a separate loop, whose overhead exceeds its arithmetic. In scalars
-everything is elementwise arithmetic, which XLA fuses, also in a batch. The functions are the
-user's, so their jaxprs are rewritten.
+XLA does not fuse across a sum or a stack of components: in a batch of small systems nearly every
+operation becomes a separate loop, whose overhead exceeds its arithmetic. In scalars everything is
+elementwise arithmetic, which XLA fuses. The functions call those of the user, so their jaxprs are
+rewritten.
 """
 
 import functools as ft
@@ -21,76 +21,69 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._custom_types import Y
+# An array as a tuple of its elements.
+Scalars = tuple[Any, ...]
 
-Scalars = tuple[Array, ...]
-
-# Compile time grows with the number of scalar operations, and gradients multiply that number.
+# Compile time grows with the number of scalar operations.
 MAX_SCALARS = 32
-MAX_OPERATIONS = 512
+MAX_OPERATIONS = 1024
 
 
-def written_out(fn: Callable[[Y], PyTree[Array]], y: Y) -> PyTree[Array]:
+def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     """`fn(y)`, computed in scalars where that is possible and `fn` is small. The limit allows for
     XLA's tendency to repeat the whole computation for each element of the result."""
-    closed, out = jax.make_jaxpr(fn, return_shape=True)(y)
-    leaves, treedef = jtu.tree_flatten(out)
-    limit = MAX_OPERATIONS // max(1, sum(x.size for x in leaves))
-    try:
-        scalars = _WriteOut(closed, y, limit)(*_components(jtu.tree_leaves(y)))
-    except _NotWrittenOut:
+    out = jax.eval_shape(fn, y)
+    size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
+    written = in_scalars(fn, y, limit=512 // size)
+    if written is None:
         return fn(y)
-    return jtu.tree_unflatten(treedef, _stacked(scalars, [x.shape for x in leaves]))
+    return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
 
 
-def elements_in_scalars(
-    fn: Callable[[Y], Array], y: Y
-) -> tuple[list[Callable[[Scalars], Array]], Callable[[Y], Scalars], Callable[[Scalars], Y]] | None:
-    """Each element of `fn`, whose values have shape `(m,)`, as a function of a tuple of scalars;
-    and the maps from states to such tuples and back.
-
-    `None` if the function is too large or uses a primitive that is not supported here.
-    """
-    leaves, treedef = jtu.tree_flatten(y)
+def in_scalars(
+    fn: Callable[..., Any], *like: Any, limit: int = MAX_OPERATIONS
+) -> Callable[..., Any] | None:
+    """`fn` with each array that it takes and returns replaced by the tuple of its elements; `None`
+    if it is too large or uses a primitive that is not supported here."""
+    leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
+    if sum(map(prod, shapes)) > MAX_SCALARS:
+        return None
+    closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
+    outs, out_treedef = jtu.tree_flatten(out)
 
-    def split(y: Y) -> Scalars:
-        return _components(jtu.tree_leaves(y))
+    def write_out(*scalars: Any) -> list[Array]:
+        rest = iter(scalars)
+        given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
+        return _WriteOut(limit)(closed, shapes, given)
 
-    def join(scalars: Scalars) -> Y:
-        return jtu.tree_unflatten(treedef, _stacked(scalars, shapes))
-
+    flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(jnp.size(x))]
     try:
-        closed = jax.make_jaxpr(_WriteOut(jax.make_jaxpr(fn)(y), y))(*split(y))
+        evaluate = jex.jaxpr_as_fun(jax.make_jaxpr(write_out)(*flat))
     except _NotWrittenOut:
         return None
-    return [_element(closed, i) for i in range(len(closed.out_avals))], split, join
+
+    def written(*args: Any) -> Any:
+        given = treedef.flatten_up_to(args)
+        rest = iter(evaluate(*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))))
+        results = (tuple(it.islice(rest, x.size)) if x.ndim else next(rest) for x in outs)
+        return out_treedef.unflatten(results)
+
+    return written
 
 
-def _element(closed: jex.ClosedJaxpr, i: int) -> Callable[[Scalars], Array]:
-    """The `i`-th output as a function, with only the equations that it needs, so that its gradient
-    involves no others."""
-    output = closed.jaxpr.outvars[i]
-    needed, eqns = {output}, []
-    for eqn in reversed(closed.jaxpr.eqns):
-        if needed.intersection(eqn.outvars):
-            needed.update(var for var in eqn.invars if not isinstance(var, jex.Literal))
-            eqns.insert(0, eqn)
-    jaxpr = closed.jaxpr.replace(eqns=eqns, outvars=[output])
-    fn = jex.jaxpr_as_fun(jex.ClosedJaxpr(jaxpr, closed.consts))
-    return lambda scalars: fn(*scalars)[0]
+def components(x: Array) -> Any:
+    """The elements of an array; a scalar remains what it is."""
+    if jnp.ndim(x) == 0:
+        return x
+    return tuple(jnp.unstack(jnp.reshape(x, -1))) if jnp.size(x) else ()
 
 
-def _stacked(scalars: Iterable[Array], shapes: list[tuple[int, ...]]) -> list[Array]:
-    rest = iter(scalars)
-    return [
-        jnp.stack([*it.islice(rest, prod(s))]).reshape(s) if prod(s) else jnp.zeros(s)
-        for s in shapes
-    ]
-
-
-def _components(leaves: list[Array]) -> Scalars:
-    return tuple(x for leaf in leaves for x in jnp.unstack(jnp.reshape(leaf, -1)))
+def joined(like: Any, scalars: Any) -> Array:
+    """The array shaped like `like` with these elements."""
+    if not isinstance(scalars, tuple):
+        return scalars
+    return jnp.stack(scalars).reshape(like.shape) if scalars else jnp.zeros(like.shape, like.dtype)
 
 
 _Places = np.ndarray  # of integers
@@ -110,10 +103,10 @@ class _NotWrittenOut(Exception):
 
 
 _ELEMENTWISE_NAMES = """
-abs acos acosh add and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy cos
-cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p
-logistic lt max min mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt
-square stop_gradient sub tan tanh xor
+abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy
+cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log
+log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh
+sqrt square stop_gradient sub tan tanh xor
 """
 _ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 _REDUCTIONS = {
@@ -121,6 +114,8 @@ _REDUCTIONS = {
     "reduce_prod": lax.mul,
     "reduce_max": lax.max,
     "reduce_min": lax.min,
+    "reduce_and": lax.bitwise_and,
+    "reduce_or": lax.bitwise_or,
 }
 _STRUCTURAL: dict[str, Callable[..., _Places]] = {
     "broadcast_in_dim": _broadcast,
@@ -172,31 +167,44 @@ def _one(x: Array) -> Array:
 
 _sin.defjvps(lambda t, _, x: t * _cos(x))
 _cos.defjvps(lambda t, _, x: -t * _sin(x))
-_KEPT = {"sin": _sin, "cos": _cos}
+
+
+def _product(x: Any, y: Any) -> Any:
+    """Without the products by 0 and 1 that the gradients of several functions consist of."""
+    for a, b in ((x, y), (y, x)):
+        if isinstance(a, np.generic) and a in (0, 1):
+            return a if a == 0 else b
+    return lax.mul(x, y)
+
+
+def _sum(x: Any, y: Any) -> Any:
+    for a, b in ((x, y), (y, x)):
+        if isinstance(a, np.generic) and a == 0:
+            return b
+    return lax.add(x, y)
+
+
+_INSTEAD = {"sin": _sin, "cos": _cos, "mul": _product, "add": _sum, "add_any": _sum}
 
 
 class _WriteOut:
     """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
 
-    def __init__(self, closed: Any, y: Y, limit: int = MAX_OPERATIONS):
+    def __init__(self, limit: int):
         self.limit = limit
-        self.closed = closed
-        self.shapes = [jnp.shape(x) for x in jtu.tree_leaves(y)]
-        if sum(map(prod, self.shapes)) > MAX_SCALARS:
-            raise _NotWrittenOut
         self.scalars: list[Any] = []
         self.num_operations = 0
 
-    def __call__(self, *scalars: Array) -> list[Array]:
-        """The elements of the outputs, given those of the inputs."""
-        rest = iter(scalars)
-        inputs = [self._add(it.islice(rest, prod(shape)), shape) for shape in self.shapes]
+    def __call__(
+        self, closed: Any, shapes: list[tuple[int, ...]], inputs: Iterable[Scalars]
+    ) -> list[Array]:
+        places = [self._add(x, shape) for x, shape in zip(inputs, shapes, strict=True)]
         try:
-            outputs = self._jaxpr(self.closed.jaxpr, self.closed.consts, inputs)
+            outputs = self._jaxpr(closed.jaxpr, closed.consts, places)
         except (KeyError, TypeError) as error:
             # In another version of jax a parameter may have been renamed or added.
             raise _NotWrittenOut from error
-        return [jnp.asarray(self.scalars[i]) for places in outputs for i in places.flat]
+        return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
 
     def _jaxpr(self, jaxpr: Any, consts: list[Any], inputs: list[_Places]) -> list[_Places]:
         env: dict[Any, _Places] = {}
@@ -225,17 +233,19 @@ class _WriteOut:
             return [np.asarray(x) for x in np.moveaxis(inputs[0], params["axis"], 0)]
         if name in _STRUCTURAL:
             return [_STRUCTURAL[name](*inputs, **given)]
+        if name == "pad" and all(low >= 0 <= high for low, high, _ in given["padding_config"]):
+            return [self._pad(*inputs, given["padding_config"])]
         if all(self._is_known(places) for places in inputs):
             return self._fold(eqn, inputs)
         if name in _ELEMENTWISE:
-            fn = _KEPT.get(name, ft.partial(eqn.primitive.bind, **params))
+            fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
             return [self._elementwise(fn, inputs)]
-        if name in _REDUCTIONS and given.keys() == {"axes"}:
+        if name in _REDUCTIONS and given.keys() <= {"axes", "out_sharding"}:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
         same_type = _dtype(eqn.invars[0]) == _dtype(eqn.outvars[0])
         if name == "dot_general" and given.keys() <= _DOT and same_type:
             return [self._dot(inputs, params["dimension_numbers"])]
-        raise _NotWrittenOut
+        raise _NotWrittenOut(name)
 
     def _is_known(self, places: _Places) -> bool:
         return all(isinstance(self.scalars[i], np.generic) for i in places.flat)
@@ -264,6 +274,7 @@ class _WriteOut:
     def _reduce(
         self, fn: Callable[[Array, Array], Array], places: _Places, axes: tuple[int, ...]
     ) -> _Places:
+        fn = _sum if fn is lax.add else fn
         self._count(places.size)
         places = np.moveaxis(places, axes, range(-len(axes), 0))
         shape = places.shape[: places.ndim - len(axes)]
@@ -271,25 +282,38 @@ class _WriteOut:
         return self._add((ft.reduce(fn, [self.scalars[i] for i in row]) for row in rows), shape)
 
     def _dot(self, inputs: list[_Places], dimensions: Any) -> _Places:
-        contracted, (batch, _) = dimensions
-        if batch:
-            raise _NotWrittenOut
-        a, b = (
-            np.moveaxis(x, axes, range(-len(axes), 0))
-            for x, axes in zip(inputs, contracted, strict=True)
-        )
-        rank = len(contracted[0])
-        free = a.ndim - rank, b.ndim - rank
-        a = a.reshape(*a.shape[: free[0]], *[1] * free[1], *a.shape[free[0] :])
-        product = self._elementwise(lax.mul, [a, b])
-        return self._reduce(lax.add, product, tuple(range(sum(free), product.ndim)))
+        """Products of the elements, with the axes in the order batch, free, contracted."""
+        contracted, batch = dimensions
+        order = [
+            [*some, *(i for i in range(x.ndim) if i not in (*some, *summed)), *summed]
+            for x, some, summed in zip(inputs, batch, contracted, strict=True)
+        ]
+        a, b = (x.transpose(axes) for x, axes in zip(inputs, order, strict=True))
+        first, last = len(batch[0]), len(contracted[0])
+        free = a.ndim - first - last, b.ndim - first - last
+        middle = first + free[0]
+        a = a.reshape(*a.shape[:middle], *[1] * free[1], *a.shape[middle:])
+        b = b.reshape(*b.shape[:first], *[1] * free[0], *b.shape[first:])
+        product = self._elementwise(_product, [a, b])
+        return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
+
+    def _pad(self, places: _Places, value: _Places, config: Any) -> _Places:
+        shape = [
+            n + low + high + max(n - 1, 0) * i for n, (low, high, i) in zip(places.shape, config)
+        ]
+        out = np.full(shape, value.item())
+        inside = [
+            slice(low, low + n * (1 + i), 1 + i) for n, (low, _, i) in zip(places.shape, config)
+        ]
+        out[tuple(inside)] = places
+        return out
 
     def _constant(self, x: Any) -> _Places:
         self._count(np.size(x))
         if jnp.issubdtype(x.dtype, jax.dtypes.extended):  # a random key
             raise _NotWrittenOut
         if isinstance(x, jax.core.Tracer):
-            return self._add(_components([x]), x.shape)
+            return self._add(components(jnp.atleast_1d(x)), x.shape)
         return self._add(np.asarray(x).flat, np.shape(x))
 
     def _add(self, scalars: Iterable[Any], shape: tuple[int, ...]) -> _Places:

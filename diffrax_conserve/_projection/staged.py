@@ -4,13 +4,14 @@ import dataclasses
 from typing import Any, ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Float
 
-from .._custom_types import Y
+from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .linearise import Joined
+from .equations import Equations
 from .project import check_metric, inverse_metric
 
 
@@ -72,26 +73,22 @@ class Staged(AbstractProjection):
         self.names = tuple(name for name, _ in stages)
         self.projections = tuple(projection for _, projection in stages)
 
-    def solve(self, problem: Problem, candidate: Y) -> tuple[Y, ProjectionInfo]:
-        owners = _owners(problem)
-        if len({*self.names}) != len(self.names) or {*self.names} != {*owners}:
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        if len({*self.names}) != len(self.names) or {*self.names} != {*problem.keys}:
             raise ValueError(
                 f"The stages of `Staged` are {self.names}, but the entries of `manifold` are "
-                f"{tuple(dict.fromkeys(owners))}. Give each entry one stage."
+                f"{tuple(dict.fromkeys(problem.keys))}. Give each entry one stage."
             )
-        y, count, infos = candidate, jnp.asarray(0), []
+        y, count, last = candidate, jnp.asarray(0), None
         for number, projection in enumerate(self.projections, start=1):
             check_metric(projection.metric, problem.state(candidate))
-            part = _part(problem, [owner in self.names[:number] for owner in owners])
-            weights = inverse_metric(projection.metric, candidate)
-            y, info = projection.solve(dataclasses.replace(part, weights=weights), y)
-            count = count + info.num_steps
-            infos.append(info)
-        judged = problem.judge(candidate, y, count)
+            part = _restricted(problem, self.names[:number], projection)
+            y, last = projection.solve(part, y)
+            count = count + last.num_steps
         # The last stage has judged all parts, by its own tolerances.
-        last = infos[-1]
-        worst = jnp.where(last.ok, 0, judged.worst)
-        return y, eqx.tree_at(lambda x: (x.result, x.worst), judged, (last.result, worst))
+        return y, problem.judge(candidate, y, count, ok=None if last is None else last.ok)
 
 
 Staged.__init__.__doc__ = r"""**Arguments:**
@@ -106,28 +103,17 @@ the keys are not those of the manifold.
 """
 
 
-def _owners(problem: Problem) -> list[Any]:
-    """For each leaf of the values, the key of the manifold to which it belongs."""
-    leaves = jtu.tree_flatten_with_path(problem.values)[0]
-    return [_key(path[0]) if path else None for path, _ in leaves]
-
-
-def _key(entry: Any) -> Any:
-    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
-
-
-def _part(problem: Problem, wanted: list[bool]) -> Problem:
-    """The problem restricted to the wanted leaves of its values."""
-    sizes = [jnp.size(x) for x in jtu.tree_leaves(problem.values)]
-    rows = [i for size, want in zip(sizes, wanted, strict=True) for i in [want] * size]
-    parts = _Chosen(problem.residual.parts, tuple(wanted))
-    magnitude = problem.magnitude[jnp.asarray([i for i, want in enumerate(rows) if want])]
-    return dataclasses.replace(problem, residual=Joined(parts), magnitude=magnitude)
-
-
-class _Chosen(eqx.Module):
-    parts: Any
-    wanted: tuple[bool, ...] = eqx.field(static=True)
-
-    def __call__(self, y: Y) -> list[Array]:
-        return [x for x, want in zip(self.parts(y), self.wanted, strict=True) if want]
+def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractProjection) -> Problem:
+    """The problem restricted to the entries with these keys, in the metric of the projection."""
+    y = jax.eval_shape(ravel, problem.like)
+    wanted = [key in keys for key in problem.keys]
+    parts = [(part, want) for part, want in zip(problem.equations.parts, wanted, strict=True)]
+    sizes = [eqx.filter_eval_shape(part, y).size for part, _ in parts]
+    rows = np.flatnonzero(np.repeat(wanted, sizes))
+    equations = Equations(
+        tuple(part for part, want in parts if want),
+        problem.equations.magnitude[rows],
+        problem.equations.sampled[rows],
+        inverse_metric(projection.metric, problem.like),
+    )
+    return dataclasses.replace(problem, equations=equations)

@@ -1,12 +1,13 @@
 """The step whose candidate is projected, as far as a projection may use it."""
 
-from typing import Any, final
+from typing import final
 
 import diffrax as dfx
 import equinox as eqx
+from jaxtyping import Array, Float
 
-from .._custom_types import RealScalarLike, Y
-from .._tree import real_view
+from .._custom_types import RealScalarLike
+from .._tree import ravel
 
 
 @final
@@ -19,20 +20,21 @@ class Step(eqx.Module):
 
     **Attributes:**
 
+    States are real vectors, as in [`diffrax_conserve.Problem`][].
+
     - `t0`, `t1`: where the step starts, and where it ends; the step size is `t1 - t0`.
     - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
-    - `error`: the error estimate of the wrapped solver at `t1`, shaped like the state, or `None` if
-        the solver has none.
+    - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
     """
 
     t0: RealScalarLike
     t1: RealScalarLike
-    y0: Y
-    error: Y | None
+    y0: Float[Array, " n"]
+    error: Float[Array, " n"] | None
     path: dfx.AbstractLocalInterpolation
     direction: RealScalarLike
 
-    def evaluate(self, t: RealScalarLike) -> Any:
+    def evaluate(self, t: RealScalarLike) -> Float[Array, " n"]:
         """The dense output of the wrapped solver, before any projection.
 
         **Arguments:**
@@ -43,4 +45,4 @@ class Step(eqx.Module):
 
         The state at `t`, a candidate.
         """
-        return real_view(self.path.evaluate(t * self.direction))
+        return ravel(self.path.evaluate(t * self.direction))

@@ -24,11 +24,12 @@ from .._manifold import (
     rate_of,
 )
 from .._options import check_number, check_vector_field
-from .._tree import from_view, real_view, tree_add, tree_mul, unflatten
+from .._tree import ravel, tree_add, unflatten, unravel
 from .base import positive_weights
-from .linearise import as_array, linearise, written_out
+from .equations import equations_of
+from .gram import combined, gram_matrix, gram_solve
 from .project import check_metric, check_state, inverse_metric
-from .residual import residual_of
+from .scalars import written_out
 
 
 def tangent(
@@ -161,18 +162,24 @@ class TangentField(eqx.Module):
         values = conserved_values(self.manifold, t, y, args)
         check_values(self.manifold, values, t, y, args)
         wrong = self._wrong_rates(t, y, args, slope, values)
-        residual, _ = residual_of(self.manifold, values, t, y, args)
-        view = real_view(y)
-        inline, split, join = written_out(residual, view)
-        g, jacobian = linearise(inline, split(view))
-        weights = split(inverse_metric(self.metric, view))
-        wrong = tuple(wrong) if isinstance(g, tuple) else wrong
-        # The result is not checked, so no product may overflow or underflow.
-        rows, sizes = jacobian.unit_rows()
-        solution = rows.gram_solver(weights).solve(jtu.tree_map(jnp.divide, wrong, sizes))
-        correction = from_view(join(tree_mul(rows.pullback(solution), weights)), y)
-        multiplier = jtu.tree_map(jnp.divide, solution, sizes)
-        return slope, correction, unflatten(as_array(multiplier), values)
+        vector = ravel(y)
+        numbers = ravel(values).astype(vector.dtype)
+        equations = equations_of(self.manifold, numbers, jnp.zeros_like(numbers), t, y, args)
+        weights = inverse_metric(self.metric, y)
+
+        def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
+            vector, wrong = given
+            _, jacobian = equations.linearise(vector)
+            # The result is not checked, so no product may overflow or underflow.
+            sizes = jnp.max(jnp.abs(jacobian), axis=1)
+            sizes = jnp.where(sizes > 0, sizes, 1)
+            unit = jacobian / sizes[:, None]
+            rows = unit if weights is None else unit * weights
+            multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
+            return combined(multiplier, rows), multiplier / sizes
+
+        correction, multiplier = written_out(solved, (vector, wrong.astype(vector.dtype)))
+        return slope, unravel(correction, y), unflatten(multiplier, values)
 
     def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
         """`rate - (∂g/∂t + G f + gain g)`, where `rate` is that of a balance law and otherwise

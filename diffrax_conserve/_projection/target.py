@@ -7,19 +7,15 @@ import diffrax as dfx
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Real
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Real
 
 from .._balance import integrated_rates
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._tree import real_view, tree_add, tree_all_finite, tree_stop_gradient, working_dtype
-from .base import AbstractProjection
-from .equations import Outcome, ProjectionInfo
-from .project import apply
-from .residual import largest, measure, relative
+from .._custom_types import Args, Manifold, RealScalarLike, Y
+from .._tree import ravel, tree_all_finite, unravel
+from .base import AbstractProjection, ProjectionInfo
+from .project import problem_of
 from .step import Step
-
-# diffrax traces a step three times; a jitted function is traced only once.
-_apply = eqx.filter_jit(apply)
 
 
 class Target(eqx.Module):
@@ -27,27 +23,19 @@ class Target(eqx.Module):
 
     **Attributes:**
 
+    - `values`: the conserved values at the start of the solve.
+    - `sampled`: the measured part of the scales.
     - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
     - `gained`: the integrals of the rates of the manifold since the start of the solve.
-    - `limit`: a larger correction is a failure.
-    - `threshold`: a candidate whose relative residual is at most this is not projected.
-    - `due`: if false, no finite candidate is projected.
     """
 
     projection: AbstractProjection
     manifold: Manifold
-    values: Values
+    values: Float[Array, " m"]
+    sampled: Float[Array, " m"]
     args: Args
     direction: Real[Array, ""]
-    gained: Values | None = None
-    limit: Real[Array, ""] | None = None
-    threshold: RealScalarLike | None = None
-    due: Bool[Array, ""] | None = None
-
-    @property
-    def now(self) -> Values:
-        """The current conserved values."""
-        return self.values if self.gained is None else tree_add(self.values, self.gained)
+    gained: Float[Array, " m"] | None = None
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
@@ -57,7 +45,8 @@ class Target(eqx.Module):
         if self.gained is None:
             return self
         gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
-        return dataclasses.replace(self, gained=tree_add(self.gained, gained))
+        gained = self.gained + ravel(gained).astype(self.gained.dtype)
+        return dataclasses.replace(self, gained=gained)
 
     def step(
         self,
@@ -71,48 +60,34 @@ class Target(eqx.Module):
         if not self.projection.sees_step:
             return None
         start, end = start * self.direction, end * self.direction
-        return Step(start, end, real_view(y0), real_view(error), path(), self.direction)
+        error = None if error is None else ravel(error)
+        return Step(start, end, ravel(y0), error, path(), self.direction)
 
     def project(
-        self,
-        t: RealScalarLike,
-        candidate: Y,
-        anchor: Y | None = None,
-        step: Step | None = None,
+        self, t: RealScalarLike, candidate: Y, step: Step | None = None
     ) -> tuple[Y, ProjectionInfo]:
-        t, now = t * self.direction, self.now
+        return _project(self, t * self.direction, candidate, step)
 
-        def projected() -> tuple[Y, ProjectionInfo]:
-            return _apply(
-                self.projection, self.manifold, now, t, candidate, self.args, anchor, step
-            )
-
-        if self.threshold is None and self.due is None:
-            return projected()
-        given = tree_stop_gradient((self.manifold, now, t, candidate, self.args))
-        residual = largest(relative(*measure(*given)))
-        needed = jnp.asarray(True) if self.due is None else self.due
-        if self.threshold is not None:
-            needed = needed & ~(residual <= self.threshold)
-        needed = needed | ~tree_all_finite(candidate)
-        return lax.cond(needed, projected, lambda: (candidate, _untouched(candidate, residual)))
-
-    def too_far(self, info: ProjectionInfo) -> Bool[Array, ""]:
-        """Whether a successful projection moved the state by more than `limit`."""
-        if self.limit is None:
-            return jnp.asarray(False)
-        return info.ok & ~(info.correction <= self.limit)
+    def project_if(
+        self, due: Bool[Array, ""] | None, t: RealScalarLike, candidate: Y, step: Step | None = None
+    ) -> tuple[Y, ProjectionInfo]:
+        """As `project` where a projection is `due`; otherwise the candidate, if it is finite."""
+        if due is None:
+            return self.project(t, candidate, step)
+        needed = due | ~tree_all_finite(candidate)
+        like = eqx.filter_eval_shape(self.project, t, candidate, step)[1]
+        idle = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        idle = dataclasses.replace(idle, ok=jnp.asarray(True))
+        return lax.cond(needed, lambda: self.project(t, candidate, step), lambda: (candidate, idle))
 
 
-def _untouched(candidate: Y, residual: Real[Array, ""]) -> ProjectionInfo:
-    zero, outcome = jnp.asarray(0), Outcome.success()
-    residual = residual.astype(working_dtype(candidate))
-    return ProjectionInfo(
-        outcome.result,
-        zero,
-        residual,
-        residual,
-        jnp.zeros_like(residual),
-        zero,
-        outcome.worst,
+@eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
+def _project(
+    target: Target, t: RealScalarLike, candidate: Y, step: Step | None
+) -> tuple[Y, ProjectionInfo]:
+    values = target.values if target.gained is None else target.values + target.gained
+    problem = problem_of(
+        target.projection, target.manifold, values, target.sampled, t, candidate, target.args, step
     )
+    y, info = target.projection.solve(problem, ravel(candidate))
+    return unravel(y, problem.like), info

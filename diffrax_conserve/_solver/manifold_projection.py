@@ -1,13 +1,12 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
 import functools as ft
-from collections.abc import Callable
 from typing import Any, final
 
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._balance import has_rates
 from .._custom_types import (
@@ -20,21 +19,24 @@ from .._custom_types import (
     Y,
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
-from .._manifold import check_manifold, check_outputs, check_values, conserved_values
+from .._manifold import (
+    FirstIntegral,
+    check_manifold,
+    check_outputs,
+    check_values,
+    conserved_values,
+    named_entries,
+)
 from .._options import check_count, check_number
 from .._projection.base import AbstractProjection, check_projection, option
-from .._projection.certainty import if_certain
-from .._projection.project import check_metric, check_state, tangential
+from .._projection.project import check_metric, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
-from .._tree import tree_norm, tree_sub, working_dtype
 from .checks import check_direction, check_nested, innermost
-from .count_rejections import FAILED_PROJECTION
-from .failure import failure
-from .initial import FINE, Initial, judge
-from .state import State
+from .state import State, started
 from .statistics import ProjectionStatistics
-from .terms import is_backsolve, is_ode, slope_of, time_direction
+from .terms import is_backsolve, is_ode, time_direction
+from .verdict import member, verdict
 
 
 @final
@@ -50,24 +52,20 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     the solve, and carried in the solver state, so that the drift does not grow with the number of
     steps; a solve that continues from a `solver_state` keeps the original values.
 
-    The projected method has the order of the wrapped one. A wrapped solver that reuses its last
-    stage in the next step (Tsit5, Dopri5, Bosh3: "first same as last") reuses the stage at the
-    candidate. Evaluating it again at the projected state costs one more evaluation per step without
-    a clear gain: on five systems the errors were the same to within 20 % at tolerance 1e-8, and to
-    within a factor of 2.3 at 1e-5, some larger, some smaller
-    (`benchmarks/studies/first_same_as_last.py`).
+    The projected method has the order of the wrapped one. A wrapped solver that keeps its last
+    stage for the next step (Tsit5, Dopri5, Bosh3: "first same as last") evaluates it again at the
+    projected state. diffrax otherwise evaluates it for all lanes of a batch while any lane is in
+    its first step, so that lanes would depend on each other.
 
     A solve fails at its first step if the initial state violates a `Constraint` by more than the
     square root of roundoff, relative to the size of its terms (find a consistent state by
-    [`diffrax_conserve.project`][]), if a function is not finite there, or if the projection to a
-    `value` fails there.
+    [`diffrax_conserve.project`][]), or if a function is not finite there.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve rejects the step and tries a smaller one, until the candidate is very close to
-    the last state; then the solve ends. A solve with fixed steps ends at once. The message of the
-    `diffrax.RESULTS` gives the position of the entry with the largest residual;
-    [`diffrax_conserve.entry_name`][] returns its name. [`diffrax_conserve.statistics`][] summarises
-    the projections.
+    the last state; then the solve ends. A solve with fixed steps ends at once. The
+    `diffrax.RESULTS` tells the cause, and [`diffrax_conserve.statistics`][] the entry of the
+    manifold.
 
     !!! example
 
@@ -108,10 +106,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
     manifold: Manifold
     projection: AbstractProjection = option(SimplifiedNewton())
-    max_correction: RealScalarLike | None = option(None)
-    threshold: RealScalarLike | None = option(None)
+    max_correction: RealScalarLike | None = option(0.5)
     every: int = option(1, static=True)
-    project_error: bool = option(False, static=True)
 
     def __check_init__(self):
         if not isinstance(self.solver, dfx.AbstractSolver):
@@ -124,13 +120,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_projection(self.projection)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
-        check_number("threshold", self.threshold, above=0.0)
         check_count("every", self.every)
         bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
-        if bounds != [None, None] and (self.threshold is not None or self.every > 1):
+        if bounds != [None, None] and self.every > 1:
             raise ValueError(
                 "`projection` has bounds, which a step that is not projected does not keep. Leave "
-                "out `threshold` and `every`, or `lower` and `upper`."
+                "out `every`, or `lower` and `upper`."
             )
 
     # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
@@ -188,30 +183,22 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 "solver for them, `BacksolveAdjoint(solver=inner)` with the wrapped solver, or use "
                 "`diffrax.RecursiveCheckpointAdjoint()`."
             )
-        direction = time_direction(terms, t0)
-        t = t0 * direction
+        t = t0 * time_direction(terms, t0)
         check_state(y0, kind=jnp.inexact)
         check_metric(self.projection.metric, y0)
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
-        num_constraints = sum(jnp.size(value) for value in jtu.tree_leaves(values))
+        values, sampled = started(self.manifold, values, t, y0, args)
+        given = any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold))
         return State(
             self.solver.init(terms, t0, t1, y0, args),
-            if_certain(values, self.manifold, values, t, y0, args),
-            jtu.tree_map(jnp.zeros_like, values) if has_rates(self.manifold) else None,
+            values,
+            sampled,
+            jnp.zeros_like(values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
-            ProjectionStatistics.zero(working_dtype(y0), num_constraints),
-            judge(
-                self.projection,
-                self.manifold,
-                values,
-                t,
-                y0,
-                args,
-                self._vector_field(terms, y0, args, direction),
-                (t1 - t0) * direction,
-            ),
+            jnp.asarray(True) if given and self._is_limited(terms) else None,
+            ProjectionStatistics.zero(values.dtype),
         )
 
     def step(
@@ -224,95 +211,51 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         solver_state: State,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
+        del made_jump  # always: the inner state does not know of the projection
+        state = solver_state
         candidate, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state.inner, made_jump
+            terms, t0, t1, y0, args, state.inner, True
         )
-        start = self._target(terms, t1, y0, candidate, args, solver_state)
+        start = Target(
+            self.projection,
+            self.manifold,
+            state.values,
+            state.sampled,
+            args,
+            time_direction(terms, t1),
+            state.gained,
+        )
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, y0, error, path)
-        y1, info = target.project(t1, candidate, step=step)
-        too_far = target.too_far(info)
-        success = info.ok & ~too_far & (solver_state.initial.cause == FINE)
-        shown = None if step is None else error
-        error = self._error(error, target, t1, y1)
-        hopeless = _is_hopeless(solver_state.initial, t0, t1, y0, candidate)
-        error = _judged(error, success, hopeless)
-        failed = failure(info, too_far, solver_state.initial, self.manifold, solver_state.values)
-        result = dfx.RESULTS.where(success | (result != dfx.RESULTS.successful), result, failed)
-        dense_info = dict(inner=dense_info, ends=(y0, y1), error=shown, target=PackedTarget(start))
-        return y1, error, dense_info, solver_state.next(inner, target.gained, info), result
-
-    def _target(
-        self,
-        terms: PyTree[dfx.AbstractTerm],
-        t1: RealScalarLike,
-        y0: Y,
-        candidate: Y,
-        args: Args,
-        state: State,
-    ) -> Target:
-        return Target(
-            self.projection,
-            self.manifold,
-            state.values,
-            args,
-            time_direction(terms, t1),
-            gained=state.gained,
-            limit=self._limit(y0, candidate, state.initial.offset) if is_ode(terms) else None,
-            threshold=self.threshold,
-            due=None if state.num_steps is None else (state.num_steps + 1) % self.every == 0,
+        due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
+        y1, info = target.project_if(due, t1, candidate, step)
+        limit = self.max_correction if self._is_limited(terms) else None
+        failed, hopeless = verdict(info.ok, state, (t0, t1), (y0, candidate, y1), limit, self.every)
+        dense_info = dict(
+            inner=dense_info,
+            ends=(y0, y1),
+            error=None if step is None else error,
+            target=PackedTarget(start),
+            due=due,
         )
+        # An infinite error makes an adaptive solve try a smaller step; if that is hopeless, the
+        # step is accepted and its result ends the solve.
+        shown = jnp.where(hopeless, 0, jnp.inf)
+        error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
+        result = dfx.RESULTS.where(
+            (failed == 0) | (result != dfx.RESULTS.successful), result, member(failed)
+        )
+        return y1, error, dense_info, state.next(inner, target.gained, info), result
 
-    def _limit(self, y0: Y, candidate: Y, offset: Array) -> Array | None:
-        """The largest allowed correction in a step from `y0` to `candidate`."""
-        if self.max_correction is None:
-            return None
-        dtype = working_dtype(candidate)
-        moved, size = tree_norm(tree_sub(candidate, y0)), tree_norm(candidate)
-        # A correction this small is allowed however short the step.
-        harmless = jnp.finfo(dtype).eps ** 0.5 * size
-        allowed = jnp.asarray(self.max_correction, dtype) * self.every
-        return jnp.where(jnp.isinf(allowed), jnp.inf, allowed * moved + harmless + 2 * offset)
-
-    def _vector_field(
-        self, terms: PyTree[dfx.AbstractTerm], y0: Y, args: Args, direction: Array
-    ) -> Callable[[RealScalarLike, Y], Y] | None:
-        """The vector field `(t, y) -> f`, along which first integrals must not change."""
-        # A learned solver does not evaluate the vector field, which may be expensive.
+    def _is_limited(self, terms: PyTree[dfx.AbstractTerm]) -> bool:
+        """Whether `max_correction` applies: not to constraints, whose correction may do all the
+        work of a step, nor to noise or a network, which may leave the manifold as fast as they
+        move."""
+        integrals = all(isinstance(x, FirstIntegral) for _, x in named_entries(self.manifold))
         evaluated = getattr(innermost(self.solver), "evaluates_vector_field", True)
-        exact = jnp.finfo(working_dtype(y0)).bits >= 32
-        if self.max_correction is not None or not (is_ode(terms) and evaluated and exact):
-            return None
-
-        return ft.partial(slope_of, self.solver, terms, args, direction)
-
-    def _error(self, error: Y | None, target: Target, t1: RealScalarLike, y1: Y) -> Y | None:
-        if error is None or not self.project_error:
-            return error
-        t1 = t1 * target.direction
-        return tangential(self.projection, self.manifold, target.now, t1, y1, target.args, error)
-
-
-def _is_hopeless(
-    initial: Initial, t0: RealScalarLike, t1: RealScalarLike, y0: Y, candidate: Y
-) -> Array:
-    """Whether a failed projection cannot succeed with smaller steps, because the candidate is
-    already very close to `y0`, the step is a roundoff of time, or the initial state is invalid."""
-    little = max(5e-4, 16 * float(jnp.finfo(working_dtype(candidate)).eps))
-    moved = tree_norm(tree_sub(candidate, y0))
-    near = moved <= little * tree_norm(candidate)
-    instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    return near | instant | (initial.cause != FINE)
-
-
-def _judged(error: Y | None, success: BoolScalarLike, hopeless: BoolScalarLike) -> Y | None:
-    """The error estimate of a step. If the projection failed it is infinite, so that an adaptive
-    solve tries a smaller step; if that is hopeless it is zero, so that the step is accepted and its
-    result ends the solve."""
-    failed = jnp.where(hopeless, 0.0, FAILED_PROJECTION)
-    return jtu.tree_map(lambda e: jnp.where(success, e, failed.astype(e.dtype)), error)
+        return self.max_correction is not None and integrals and evaluated and is_ode(terms)
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
@@ -321,27 +264,16 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
 - `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
     `Directional`, a `Staged`, or your own.
-- `max_correction`: a projection fails if it moves the candidate by more than this times the
-    distance covered by the step, $\|\hat y - y_n\|$ (plus $\sqrt\varepsilon \|\hat y\|$), in the
-    Euclidean norm. It protects against a jump to another component of the manifold, and against
-    quantities that are not conserved. 0.5 is a sensible value, because corrections are of the size
-    of the local error of the wrapped solver. Default: no limit, but a solve does not start if a
-    first integral changes along a short trajectory from the initial state, by more than 1e-4 of the
-    terms that should cancel. `jax.numpy.inf` allows that, for a vector field that conserves
-    nothing, for example a network before its training. The first projection may also move
-    the state to a `value` that is not that of the initial state. With `every`, the limit is
-    multiplied by it. Stochastic equations have no limit, because noise may move the state off the
-    manifold as fast as it moves the state.
-- `threshold`: do not project a step whose largest residual, relative to the scale of its
-    constraint, is at most this. Dense output is treated in the same way. Default: project every
-    step.
+- `max_correction`: a projection to first integrals fails if it moves the candidate by more than
+    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), both in
+    the largest component. Corrections are of the size of the local error of the wrapped solver: one
+    as long as half a step tells that the quantity is not conserved, or that the state jumped to
+    another part of the manifold. With `every`, the limit is multiplied by it. It does not apply
+    where the manifold has a `Constraint`, whose correction may do all the work of a step, to
+    stochastic equations, to learned solvers, and to the first projection to a given `value`.
+    `None` is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
-- `project_error`: project the error estimate to the tangent space of the manifold, so that the
-    step size is not limited by errors that the projection removes. With Tsit5 on the systems of
-    the catalogue it saved at most a fifth of the steps, at up to 70 times the error
-    (`benchmarks/studies/project_error.py`); it costs one more evaluation of the gradients.
-
 **Raises:**
 
 `TypeError` or `ValueError`, before compilation, if an argument is invalid, if the manifold is empty

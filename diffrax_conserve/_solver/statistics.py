@@ -7,12 +7,12 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._options import check_solution
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
-from .count_rejections import RejectionCount
 
 
 @final
@@ -28,9 +28,9 @@ class ProjectionStatistics(eqx.Module):
     - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.
-    - `rank`: the smallest numerical rank of the constraints.
-    - `num_rejected`: the number of steps rejected because their projection failed, if a
-        [`diffrax_conserve.CountRejections`][] counted them; otherwise `None`.
+    - `roundoff`: the largest measured share of a scale; see [`diffrax_conserve.ProjectionInfo`][].
+    - `worst`: the position of the scalar constraint that failed last, as
+        [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
     """
 
     num_projections: Int[Array, "..."]
@@ -39,20 +39,20 @@ class ProjectionStatistics(eqx.Module):
     residual_before: Float[Array, "..."]
     residual_after: Float[Array, "..."]
     correction: Float[Array, "..."]
-    rank: Int[Array, "..."]
-    num_rejected: Int[Array, "..."] | None = None
+    roundoff: Float[Array, "..."]
+    worst: Int[Array, "..."]
 
     @classmethod
-    def zero(cls, dtype: jnp.dtype, num_constraints: int) -> "ProjectionStatistics":
+    def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
         count, size = jnp.asarray(0), jnp.zeros((), dtype)
-        return cls(count, count, count, size, size, size, jnp.asarray(num_constraints))
+        return cls(count, count, count, size, size, size, size, jnp.asarray(-1))
 
     def __str__(self) -> str:
         if is_traced(self):
             return repr(self)
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        if self.num_rejected is None:
-            rows["num_rejected"] = "not counted; CountRejections counts them"
+        if np.all(np.asarray(self.worst) < 0):
+            del rows["worst"]
         return printed("projections of the accepted steps", rows)
 
     def add(self, info: ProjectionInfo) -> "ProjectionStatistics":
@@ -64,7 +64,8 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.residual_before, info.residual_before),
             jnp.maximum(self.residual_after, info.residual_after),
             jnp.maximum(self.correction, info.correction),
-            jnp.where(projected, jnp.minimum(self.rank, info.rank), self.rank),
+            jnp.maximum(self.roundoff, info.roundoff),
+            jnp.where(info.ok, self.worst, info.worst),
         )
 
 
@@ -75,9 +76,8 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
     `SaveAt(solver_state=True)`. Otherwise they are not computed.
 
     diffrax discards the solver state of a rejected step, so rejected steps appear only in
-    `sol.stats["num_rejected_steps"]`. To count those caused by a failed projection, wrap the
-    step-size controller in a [`diffrax_conserve.CountRejections`][] and pass
-    `SaveAt(controller_state=True)`.
+    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept: from `worst`,
+    `entry_name(manifold, int(statistics(sol).worst))` is the name of the entry that failed.
 
     **Arguments:**
 
@@ -122,19 +122,17 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
           residual_before  4.0e-08
           residual_after   4.0e-08
           correction       8.4e-08
-          rank             1
-          num_rejected     not counted; CountRejections counts them
+          roundoff         0.0e+00
         ```
     """
     check_solution(sol, "statistics")
     found = _instances(sol.solver_state, ProjectionStatistics)
-    counts = _instances(sol.controller_state, RejectionCount)
     if not found:
         raise ValueError(
             "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
             "and with `saveat=SaveAt(..., solver_state=True)`."
         )
-    return dataclasses.replace(found[0], num_rejected=counts[0].count if counts else None)
+    return found[0]
 
 
 def _instances(tree: Any, kind: type) -> list[Any]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._projection.closed_form import ClosedForm
-from .._projection.elimination import unrolled_solver
+from .._projection.gram import gram_solve
 from ._base import real
 
 State = Float[Array, " species"]
@@ -208,9 +208,8 @@ def _(rows: Rows, primals: Any, tangents: Any) -> Any:
 def _exponents(rows: Rows, y: State, left: Float[Array, " balances"]) -> State:
     """The `Wᵀ μ` that changes the balances of `y` by `left`, to first order."""
     weights = jnp.asarray(rows, y.dtype)
-    gram = [[jnp.sum(a * b * y) for b in weights] for a in weights]
-    multipliers = unrolled_solver(gram, 0.0).solve(tuple(left))
-    return sum((m * row for m, row in zip(multipliers, weights, strict=True)), jnp.zeros_like(y))
+    gram = jnp.sum(weights[:, None, :] * weights * y, axis=2)
+    return jnp.sum(gram_solve(gram, left)[:, None] * weights, axis=0)
 
 
 # The largest number of updates, and the largest exponent in one. Errors of ten per cent decrease as

@@ -22,8 +22,8 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
+from .._projection.equations import measure as residuals
 from .._projection.project import given_values
-from .._projection.residual import measure as residuals
 from .._tree import tree_all_finite
 from ._report import Sample, report_constraints, unsuccessful
 

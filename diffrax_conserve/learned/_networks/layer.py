@@ -1,5 +1,6 @@
 """The conservative layer: a few iterations towards the manifold, as the last layer of a network."""
 
+from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
@@ -12,18 +13,10 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
-from ..._projection.elimination import Vector
-from ..._projection.linearise import Elements, Residual, linearise, written_out
-from ..._projection.residual import relative, residual_of
-from ..._tree import (
-    tree_add,
-    tree_dot,
-    tree_scale,
-    tree_stop_gradient,
-    tree_sub,
-    tree_tangents,
-    working_dtype,
-)
+from ..._projection.equations import equations_of, relative
+from ..._projection.gram import combined, gram_matrix, gram_solve
+from ..._projection.scalars import written_out
+from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
 from .mlp import check_sizes
 
 
@@ -94,20 +87,25 @@ class ConservativeLayer(eqx.Module):
         The numbers `p` and `s` may be traced, so that a training with any schedule compiles once.
         Iterations beyond the `p`-th are not computed.
         """
-        dtype = working_dtype(candidate)
-
-        residual, magnitude = residual_of(self.manifold, values, t, candidate, self.args)
-        function, split, join = written_out(residual, candidate)
-        magnitude = tuple(magnitude) if isinstance(function, Elements) else magnitude
+        start = ravel(candidate)
+        dtype = start.dtype
+        numbers = ravel(values).astype(dtype)
+        equations = equations_of(
+            self.manifold, numbers, jnp.zeros_like(numbers), t, candidate, self.args
+        )
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
-        start = _stored(split(candidate), p)
+        start = _stored(start, p)
+
+        def residual(y: Float[Array, " n"]) -> Float[Array, " m"]:
+            return written_out(equations.residual, _stored(y, p))
+
         # Arrays over which the functions close become part of `residual`'s PyTree.
-        residual = eqx.filter_closure_convert(lambda y: function(_stored(y, p)), start)
-        fixed = lax.stop_gradient((magnitude, radius.astype(dtype), p, s.astype(dtype)))
-        y, _ = _conserve(residual, start, fixed, steps=self.steps)
-        return join(y)
+        converted = eqx.filter_closure_convert(residual, start)
+        fixed = lax.stop_gradient((equations.magnitude, radius.astype(dtype), p, s.astype(dtype)))
+        y, _ = _conserve(converted, start, fixed, steps=self.steps)
+        return unravel(y, candidate)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
@@ -122,35 +120,40 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 """
 
 # The magnitude of the conserved values, the radius, p and s.
-_Fixed = tuple[Vector, Array, Array, Array]
+_Fixed = tuple[Float[Array, " m"], Array, Array, Array]
+_Residual = Callable[[Float[Array, " n"]], Float[Array, " m"]]
+
+
+def _linearise(residual: _Residual, y: Float[Array, " n"]) -> tuple[Array, Array]:
+    g, vjp = jax.vjp(residual, y)
+    return g, jax.vmap(vjp)(jnp.eye(g.size, dtype=g.dtype))[0]
 
 
 @eqx.filter_custom_jvp
-def _conserve(residual: Residual, candidate: Y, fixed: _Fixed, *, steps: int) -> tuple[Y, Vector]:
+def _conserve(
+    residual: _Residual, candidate: Float[Array, " n"], fixed: _Fixed, *, steps: int
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """`ŷ + G(ŷ)ᵀ λ` with `λ = (1 - s) λ_{p-1} + s λ_p`, and `λ`."""
     magnitude, radius, p, s = fixed
-    before, at_candidate = linearise(residual, candidate)
-    weights = jtu.tree_map(jnp.ones_like, candidate)
-    dtype = working_dtype(candidate)
+    before, rows = _linearise(residual, candidate)
 
-    def improve(multipliers: Vector) -> Vector:
-        y = tree_add(candidate, at_candidate.pullback(multipliers))
-        g, at_y = linearise(residual, y)
-        scale = jtu.tree_map(jnp.add, magnitude, at_y.scale(y))
-        ratio = relative(g, scale)
-        damping = jnp.minimum(1e-2, tree_dot(ratio, ratio, dtype))
-        change = at_y.gram_solver(weights, at_candidate, damping).solve(g)
-        step = at_candidate.pullback(change)
-        shortening = lax.rsqrt(1 + tree_dot(step, step, dtype) / jnp.square(radius))
-        return tree_sub(multipliers, tree_scale(shortening, change))
+    def improve(multipliers: Array) -> Array:
+        y = candidate + combined(multipliers, rows)
+        g, jacobian = _linearise(residual, y)
+        ratio = relative(g, magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1))
+        damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
+        change = gram_solve(gram_matrix(jacobian, rows), g, damping)
+        step = combined(change, rows)
+        shortening = lax.rsqrt(1 + jnp.sum(step * step) / jnp.square(radius))
+        return multipliers - shortening * change
 
-    def iterate(carry: tuple[Vector, Vector], i: Array) -> tuple[tuple[Vector, Vector], None]:
+    def iterate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
         return lax.cond(i < p, lambda c: (c[1], improve(c[1])), lambda c: c, carry), None
 
-    zeros = jtu.tree_map(jnp.zeros_like, before)
+    zeros = jnp.zeros_like(before)
     (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
-    multipliers = jtu.tree_map(lambda a, b: a + s * (b - a), previous, last)
-    return tree_add(candidate, at_candidate.pullback(multipliers)), multipliers
+    multipliers = previous + s * (last - previous)
+    return candidate + combined(multipliers, rows), multipliers
 
 
 @_conserve.def_jvp
@@ -168,35 +171,34 @@ def _conserve_jvp(primals, tangents, *, steps):
     t_residual, t_candidate, _ = tangents
     y, multipliers = _conserve(residual, candidate, fixed, steps=steps)
 
-    def displaced(residual: Residual, candidate: Y) -> tuple[Y, Vector]:
+    def displaced(residual: _Residual, candidate: Array) -> tuple[Array, Array]:
         # `Gᵀ λ` by one reverse pass for all constraints.
         _, vjp = eqx.filter_vjp(residual, candidate)
-        (direction,) = vjp(multipliers)
-        state = tree_add(candidate, direction)
+        state = candidate + vjp(multipliers)[0]
         return state, residual(state)
 
     t_y, t_g = tree_tangents(
         *eqx.filter_jvp(displaced, (residual, candidate), (t_residual, t_candidate))
     )
-    _, at_candidate = linearise(*tree_stop_gradient((residual, candidate)))
-    _, at_y = linearise(*tree_stop_gradient((residual, y)))
-    weights = jtu.tree_map(jnp.ones_like, candidate)
+    fixed_residual, fixed_candidate, fixed_y = tree_stop_gradient((residual, candidate, y))
+    _, rows = _linearise(fixed_residual, fixed_candidate)
+    _, jacobian = _linearise(fixed_residual, fixed_y)
+    gram = gram_matrix(jacobian, rows)
     _, vjp = eqx.filter_vjp(residual, candidate)
 
-    def product(multipliers: Vector) -> Vector:
+    def product(multipliers: Array) -> Array:
         return jax.jvp(residual, (y,), vjp(multipliers))[1]
 
     t_multipliers = lax.custom_linear_solve(
         product,
         t_g,
-        solve=lambda _, b: at_y.gram_solver(weights, at_candidate).solve(b),
-        transpose_solve=lambda _, b: at_candidate.gram_solver(weights, at_y).solve(b),
+        solve=lambda _, b: gram_solve(gram, b),
+        transpose_solve=lambda _, b: gram_solve(gram.T, b),
     )
     _, _, p, s = fixed
     share = jnp.where(p == 0, 0, jnp.where(p == 1, s, 1))
-    t_multipliers = jtu.tree_map(lambda x: -share * x, t_multipliers)
-    (direction,) = vjp(t_multipliers)
-    return (y, multipliers), (tree_add(t_y, direction), t_multipliers)
+    t_multipliers = -share * t_multipliers
+    return (y, multipliers), (t_y + vjp(t_multipliers)[0], t_multipliers)
 
 
 def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:

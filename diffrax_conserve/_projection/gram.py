@@ -1,0 +1,96 @@
+"""Linear solves with Gram matrices `G M⁻¹ Hᵀ`, which are singular where constraints depend on each
+other.
+
+A pivot at the level of roundoff belongs to a constraint whose gradient depends linearly on the
+earlier ones; its multiplier is zero, which is exact for consistent constraints. Gradients that are
+only nearly parallel are all kept, because the correction needs the direction in which they differ.
+"""
+
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy as jsp
+from jaxtyping import Array, Float
+
+# Up to this many constraints a solve is written out, so that XLA fuses it with what is around it.
+WRITTEN_OUT_MAX = 3
+
+
+def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
+    """`rows othersᵀ`."""
+    if len(rows) > WRITTEN_OUT_MAX:
+        return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)
+    return jnp.sum(rows[:, None, :] * others, axis=2)
+
+
+def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """`rowsᵀ multiplier`."""
+    if len(rows) > WRITTEN_OUT_MAX:
+        return jnp.matmul(multiplier, rows, precision=lax.Precision.HIGHEST)
+    return jnp.sum(multiplier[:, None] * rows, axis=0)
+
+
+def gram_solve(
+    gram: Float[Array, "m m"], b: Float[Array, " m"], damping: Array | float = 0.0
+) -> Float[Array, " m"]:
+    """`gram⁻¹ b`, for a matrix that need not be symmetric; `damping` is relative to its diagonal."""
+    m, dtype = len(gram), gram.dtype
+    if m > WRITTEN_OUT_MAX:
+        unit = _unit(gram)
+        matrix = gram * unit[:, None] * unit + _added(m, dtype, damping) * jnp.eye(m, dtype=dtype)
+        working = jnp.promote_types(dtype, jnp.float32)
+        x = jnp.linalg.solve(matrix.astype(working), (b * unit).astype(working))
+        return x.astype(dtype) * unit
+    least = 4 * m * float(jnp.finfo(dtype).eps)
+    rows = [[gram[i, j] for j in range(m)] for i in range(m)]
+    x, pivots = [b[i] for i in range(m)], []
+    for k in range(m):
+        pivot = rows[k][k] + damping * gram[k, k]
+        pivots.append(jnp.where(jnp.abs(pivot) > least * jnp.abs(gram[k, k]), pivot, jnp.inf))
+        for i in range(k + 1, m):
+            share = rows[i][k] / pivots[k]
+            x[i] = x[i] - share * x[k]
+            for j in range(k + 1, m):
+                rows[i][j] = rows[i][j] - share * rows[k][j]
+    for k in reversed(range(m)):
+        for j in range(k + 1, m):
+            x[k] = x[k] - rows[k][j] * x[j]
+        x[k] = x[k] / pivots[k]
+    return jnp.stack(x)
+
+
+# The Cholesky factor of a matrix whose rows are scaled, and the factors of equations and multipliers.
+Factors = tuple[Float[Array, "m m"], Float[Array, " m"], Float[Array, " m"]]
+
+
+def factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Factors:
+    """The factors of a symmetric matrix, for right-hand sides to be divided by `sizes`."""
+    m, dtype = len(gram), gram.dtype
+    unit = _unit(gram)
+    matrix = gram * unit[:, None] * unit + _added(m, dtype) * jnp.eye(m, dtype=dtype)
+    matrix = matrix.astype(jnp.promote_types(dtype, jnp.float32))
+    return jnp.linalg.cholesky(matrix, symmetrize_input=False), unit / sizes, unit
+
+
+def solve_factored(factors: Factors, b: Float[Array, " m"]) -> Float[Array, " m"]:
+    lower, left, right = factors
+    x = jsp.linalg.cho_solve((lower, True), (b * left).astype(lower.dtype))
+    return x.astype(b.dtype) * right
+
+
+def row_sizes(rows: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """The largest element of each row, or one if all are zero. In float64 one, because products of
+    elements neither overflow nor underflow in usual units."""
+    if rows.dtype == jnp.float64:
+        return jnp.ones(len(rows))
+    sizes = jnp.max(jnp.abs(rows), axis=1)
+    return jnp.where(sizes > 0, sizes, 1)
+
+
+def _unit(gram: Float[Array, "m m"]) -> Float[Array, " m"]:
+    diagonal = jnp.abs(jnp.diagonal(gram))
+    return jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+
+
+def _added(m: int, dtype: jnp.dtype, damping: Array | float = 0.0) -> Array:
+    """Roundoff added to a unit diagonal: dependent constraints have small multipliers then."""
+    return jnp.asarray(damping + 16 * m * float(jnp.finfo(dtype).eps), dtype)
