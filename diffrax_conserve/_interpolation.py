@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.loop import any_lane
+from ._projection.equations import any_lane
 from ._projection.step import Step
 from ._projection.target import Target
 from ._tree import tree_add, tree_scale, tree_sub

@@ -16,8 +16,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values, rate_of
-from .._projection.equations import equations_of, measure, relative
-from .._tree import ravel, tree_all_finite, tree_max
+from .._projection.equations import Equations, equations_of, measure, measured_scale, relative
+from .._tree import ravel, tree_all_finite, tree_max, unravel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,46 +222,44 @@ def _measure(
     whether its gradient is zero there."""
 
     def at_one_state(t: Float[Array, ""], y: Any) -> list[tuple[Array, Array, Array]]:
-        f = vector_field(t, y, args)
-        return [_relative_sizes(entry, t, y, f, args) for _, entry in _entries(manifold)]
+        return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
 
     return jax.vmap(at_one_state)(ts, ys)
 
 
 def _relative_sizes(
-    entry: AbstractConserved, t: Float[Array, ""], y: Any, f: Any, args: Args
+    entry: AbstractConserved, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
 ) -> tuple[Array, Array, Array]:
     """The largest relative defect and residual of an entry, and whether its gradient is zero."""
-    f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), f, y)
     values = conserved_values(entry, t, y, args)
-    vector, slope = ravel(y), ravel(f)
+    vector = ravel(y)
     numbers = ravel(values).astype(vector.dtype)
 
-    def residual(t: Array) -> Array:
-        return equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args).residual(vector)
+    def equations(t: Array) -> Equations:
+        return equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args)
 
     t = jnp.asarray(t, vector.dtype)
-    now, in_time = jax.jvp(residual, (t,), (jnp.ones_like(t),))
+    now, in_time = jax.jvp(lambda t: equations(t).residual(vector), (t,), (jnp.ones_like(t),))
     rate = ravel(rates(entry, t, y, args)).astype(vector.dtype)
-    equations = equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args)
-    _, jacobian = equations.linearise(vector)
-    along = jacobian * slope
-    change = jnp.sum(along, axis=1) + in_time - rate
-    # The slope itself may be the roundoff of larger terms: a component has the size of the largest
-    # among those that enter the function.
-    enters = jacobian != 0
-    largest = jnp.max(jnp.where(enters, jnp.abs(slope), 0), axis=1, keepdims=True)
-    terms = jnp.sum(jnp.abs(along), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
-    most = jnp.sum(jnp.abs(jacobian) * largest, axis=1)
-    roundoff = 100 * float(jnp.finfo(vector.dtype).eps) * most
-    terms = jnp.where(jnp.abs(change) <= roundoff, jnp.maximum(terms, most), terms)
+    _, jacobian = equations(t).linearise(vector)
+
+    def along(vector: Array) -> Array:
+        slope = vector_field(t, unravel(vector, y), args)
+        slope = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), slope, y)
+        return jax.jvp(equations(t).residual, (vector,), (ravel(slope),))[1]
+
+    f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), vector_field(t, y, args), y)
+    terms = jnp.sum(jnp.abs(jacobian * ravel(f)), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
+    # Forces may cancel inside the field.
+    terms = jnp.maximum(terms, measured_scale(along, vector))
+    change = along(vector) + in_time - rate
     defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may
     # vanish.
     defect = jnp.where(tree_all_finite(now), defect, jnp.nan)
     violation = tree_max(relative(*measure(entry, values, t, y, args)))
     violation = violation if isinstance(entry, Constraint) else jnp.zeros_like(violation)
-    return defect, violation, ~jnp.any(enters) & jnp.all(in_time == 0)
+    return defect, violation, jnp.all(jacobian == 0) & jnp.all(in_time == 0)
 
 
 def _verdict(

@@ -1,6 +1,6 @@
 """Bounds: the constraints as functions of `z`, where `y = clip(z)`.
 
-The loop then solves `g(clip(ŷ + M⁻¹ Gᵀ λ)) = 0` as any other equation, a semismooth Newton iteration
+The loop solves `g(clip(ŷ + M⁻¹ Gᵀ λ)) = 0` as any other equation, a semismooth Newton iteration
 (L. Qi and D. Sun, "A nonsmooth version of Newton's method", 1993). For linear constraints this is
 the dual of a quadratic program, whose solution is the nearest point within the bounds.
 """
@@ -17,7 +17,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._custom_types import Y
 from .._tree import ravel, real_view
 from .base import check_like
 from .equations import Equations
@@ -54,14 +53,16 @@ class _Clipped(eqx.Module):
         return self.part(self.box.clip(z))
 
 
-def box_of(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None, like: Y) -> Box | None:
+def box_of(
+    lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None, like: Any
+) -> Box | None:
     """The box for the options `lower` and `upper`, or `None` if neither is given."""
     if lower is None and upper is None:
         return None
     return Box(_bound("lower", lower, -np.inf, like), _bound("upper", upper, np.inf, like))
 
 
-def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, like: Y) -> Array:
+def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, like: Any) -> Array:
     y = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     view = real_view(y)
     single = bound is None or jtu.treedef_is_leaf(jtu.tree_structure(bound))

@@ -11,6 +11,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -18,14 +19,14 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
-from .._tree import ravel, unflatten, unravel
+from .._tree import ravel, tree_stop_gradient, unflatten, unravel
 
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
 # residual contribute about one unit each.
 ROUNDOFF_MULTIPLE = 16
 # The measured roundoff of a function counts this many times, because it is a sample: of so many
 # displacements, of each of so many lengths.
-_SAMPLED, _SAMPLES, _LENGTHS = 8, 6, 8
+_SAMPLED, _SAMPLES, _LENGTHS = 8, 4, 8
 
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
@@ -109,7 +110,7 @@ def equations_of(
     values: Float[Array, " m"],
     sampled: Float[Array, " m"],
     t: RealScalarLike,
-    like: Y,
+    like: Any,
     args: Args,
 ) -> Equations:
     """The equations of a manifold with the conserved `values`, for states like `like`; `sampled` is
@@ -129,16 +130,16 @@ def equations_of(
     return Equations(tuple(parts), magnitude, sampled)
 
 
-def measured_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The size of the terms inside each function that its gradient at `y` does not show, such as
-    the 1 in `1 - cos(q)` near zero or the hidden layers of a network.
+def measured_scale(fn: Part, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """The size of the terms inside a function that its gradient at `y` does not show, such as the 1
+    in `1 - cos(q)` near zero or the hidden layers of a network.
 
-    Their roundoff shows them: `g(y + δ) - g(y) - G δ`, for displacements `δ` so small that the rest
-    of it is below roundoff. Where these are too small to change the function at all, larger ones
-    are taken.
+    Their roundoff shows them: `(fn(y + δ) - fn(y - δ)) / 2 - G δ`, for displacements `δ` so small
+    that the rest of it is below roundoff. Where these are too small to change the function at all,
+    larger ones are taken.
     """
-    eps = float(jnp.finfo(y.dtype).eps)
-    value, jacobian = equations.linearise(y)
+    info = jnp.finfo(y.dtype)
+    eps, tiny = float(info.eps), float(info.tiny)
     size = jnp.abs(y) + jnp.max(jnp.abs(y), initial=0)
     phases = jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2
 
@@ -146,19 +147,43 @@ def measured_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, 
         count, settled, largest = carry
         index = count // _SAMPLES
         length = eps ** (0.55 * (1 - index / _LENGTHS))
-        there = y + (length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size
-        change = equations.residual(there) - value
-        error = jnp.abs(change - jnp.sum(jacobian * (there - y), axis=1))
-        # A function is settled by the first length that changes it.
-        error = jnp.where((settled >= index) & (error < jnp.inf), error, 0)
+        ahead, behind = (
+            y + (s * length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size for s in (1, -1)
+        )
+        change = (fn(ahead) - fn(behind)) / 2
+        _, linear = jax.jvp(fn, (y,), ((ahead - behind) / 2,))
+        error = jnp.abs(change - linear)
+        # A function is settled by the first length that changes it. An underflow is no roundoff.
+        counts = (settled >= index) & (error < jnp.inf) & (error > _SAMPLED * tiny)
         settled = jnp.where(change != 0, jnp.minimum(settled, index), settled)
-        return count + 1, settled, jnp.maximum(largest, error)
+        return count + 1, settled, jnp.where(counts, jnp.maximum(largest, error), largest)
 
     def unsettled(carry: tuple[Array, Array, Array]) -> Array:
         count, settled, _ = carry
         more = jnp.any(settled >= count // _SAMPLES) | (count % _SAMPLES > 0)
         return more & (count < _SAMPLES * _LENGTHS)
 
-    start = jnp.asarray(0), jnp.full(value.shape, _LENGTHS), jnp.zeros_like(value)
-    _, _, found = lax.while_loop(unsettled, sample, start)
+    zero = jnp.zeros(jax.eval_shape(fn, y).shape, y.dtype)
+    start = jnp.asarray(0), jnp.full(zero.shape, _LENGTHS), zero
+    _, _, found = lax.while_loop(lambda carry: any_lane(unsettled(carry)), sample, start)
     return _SAMPLED / (ROUNDOFF_MULTIPLE * eps) * found
+
+
+def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """What the measured roundoff at `y` adds to the scale there."""
+    equations, y = tree_stop_gradient((equations, y))
+    value, jacobian = equations.linearise(y)
+    shown = jnp.abs(value) + equations.scale(jacobian, y)
+    return jnp.maximum(measured_scale(equations.residual, y) - shown, 0)
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether the flag of any lane of a batch is set: a loop with this condition has no selects."""
+    return flag
+
+
+@any_lane.def_vmap
+def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
+    del size, axes
+    return any_lane(jnp.any(flags)), False

@@ -32,7 +32,7 @@ def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float
 def gram_solve(
     gram: Float[Array, "m m"], b: Float[Array, " m"], damping: Array | float = 0.0
 ) -> Float[Array, " m"]:
-    """`gram⁻¹ b`, for a matrix that need not be symmetric; `damping` is relative to its diagonal."""
+    """`gram⁻¹ b`, for a matrix not symmetric in general; `damping` is relative to its diagonal."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         unit = _unit(gram)
@@ -58,7 +58,7 @@ def gram_solve(
     return jnp.stack(x)
 
 
-# The Cholesky factor of a matrix whose rows are scaled, and the factors of equations and multipliers.
+# The Cholesky factor of a matrix with scaled rows, and the factors of equations and multipliers.
 Factors = tuple[Float[Array, "m m"], Float[Array, " m"], Float[Array, " m"]]
 
 

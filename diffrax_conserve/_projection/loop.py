@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, Int8
 
-from .equations import Equations, relative, within
+from .equations import Equations, any_lane, relative, within
 from .gram import (
     WRITTEN_OUT_MAX,
     Factors,
@@ -59,7 +59,7 @@ def solve(
         return run(*eqx.combine(arrays, static), small=False)
 
     @alone.def_vmap
-    def batched(size: int, axes: Any, arrays: Any) -> tuple[Solved, Any]:
+    def batched(size: int, axes: Any, arrays: Any) -> Any:
         del size
         equations, y, _ = eqx.combine(arrays, static)
         small = (
@@ -152,15 +152,3 @@ def _corrected(
     rest = y - combined(multiplier, rows)
     roundoff = 2 * float(jnp.finfo(y.dtype).eps) * jnp.abs(y)
     return jnp.where(jnp.abs(rest) <= roundoff, 0, rest)
-
-
-@jax.custom_batching.custom_vmap
-def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether the flag of any lane of a batch is set: a loop with this condition has no selects."""
-    return flag
-
-
-@any_lane.def_vmap
-def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
-    del size, axes
-    return any_lane(jnp.any(flags)), False

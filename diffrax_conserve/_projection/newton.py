@@ -153,7 +153,7 @@ def _nearest(
 def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     """From `F(y, λ) = 0`, the optimality system: its tangent at constant `y` and `λ` is cancelled
     by theirs."""
-    equations, candidate, box = primals
+    equations, candidate, _ = primals
     y, multiplier, found, count = _nearest(*primals, max_steps=max_steps)
     unknowns = jnp.concatenate([y, multiplier])
     if unknowns.size > _NEAREST_MAX:

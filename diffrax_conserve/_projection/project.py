@@ -22,9 +22,9 @@ from .._manifold import (
     named_entries,
 )
 from .._options import dtype_of
-from .._tree import ravel, real_view, tree_stop_gradient, unflatten, unravel
+from .._tree import ravel, real_view, unflatten, unravel
 from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
-from .equations import equations_of, measured_scale
+from .equations import equations_of, hidden_scale
 from .newton import Newton
 from .step import Step
 
@@ -83,7 +83,7 @@ def project(
     values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
     problem = problem_of(projection, manifold, values, jnp.zeros_like(values), t, y, args)
     equations = problem.equations
-    sampled = measured_scale(*tree_stop_gradient((equations, vector)))
+    sampled = hidden_scale(equations, vector)
     equations = dataclasses.replace(
         equations, magnitude=equations.magnitude + sampled, sampled=sampled
     )
@@ -120,7 +120,7 @@ def problem_of(
     values: Float[Array, " m"],
     sampled: Float[Array, " m"],
     t: RealScalarLike,
-    like: Y,
+    like: Any,
     args: Args,
     step: Step | None = None,
 ) -> Problem:
@@ -144,8 +144,8 @@ def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> N
     leaves = jtu.tree_leaves(y)
     if len({jnp.finfo(dtype_of(x)).dtype for x in leaves if jnp.issubdtype(dtype_of(x), kind)}) > 1:
         raise TypeError(
-            f"The state has leaves of the dtypes {', '.join(str(dtype_of(x)) for x in leaves)}, but "
-            f"{user} needs a single precision. Convert them to one."
+            f"The state has leaves of the dtypes {', '.join(str(dtype_of(x)) for x in leaves)}, "
+            f"but {user} needs one precision. Convert them to one."
         )
     for leaf in leaves:
         dtype = dtype_of(leaf)
@@ -169,7 +169,7 @@ def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
     check_like("metric", metric, y, remedy)
 
 
-def inverse_metric(metric: PyTree[ArrayLike] | None, like: Y) -> Float[Array, " n"] | None:
+def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
     """`M⁻¹` as a vector; an infinite weight freezes its component."""
     if metric is None:
         return None

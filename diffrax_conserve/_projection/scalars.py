@@ -298,13 +298,12 @@ class _WriteOut:
         return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
 
     def _pad(self, places: _Places, value: _Places, config: Any) -> _Places:
-        shape = [
-            n + low + high + max(n - 1, 0) * i for n, (low, high, i) in zip(places.shape, config)
-        ]
-        out = np.full(shape, value.item())
-        inside = [
-            slice(low, low + n * (1 + i), 1 + i) for n, (low, _, i) in zip(places.shape, config)
-        ]
+        out_shape, inside = [], []
+        for n, (low, high, interior) in zip(places.shape, config, strict=True):
+            end = low + n + max(n - 1, 0) * interior
+            out_shape.append(end + high)
+            inside.append(slice(low, end, 1 + interior))
+        out = np.full(out_shape, value.item())
         out[tuple(inside)] = places
         return out
 

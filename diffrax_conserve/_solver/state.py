@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry
 from .._projection.base import ProjectionInfo
-from .._projection.equations import equations_of, measured_scale
+from .._projection.equations import equations_of, hidden_scale
 from .._tree import ravel, tree_stop_gradient
 from .statistics import ProjectionStatistics
 
@@ -53,7 +53,7 @@ def started(
     numbers = ravel(values).astype(vector.dtype)
     equations = equations_of(manifold, numbers, jnp.zeros_like(numbers), t, y, args)
     equations, vector = tree_stop_gradient((equations, vector))
-    sampled = measured_scale(equations, vector)
+    sampled = hidden_scale(equations, vector)
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
     sizes = [
         sum(jnp.size(x) for x in jtu.tree_leaves(part)) for part in treedef.flatten_up_to(values)

@@ -1,4 +1,4 @@
-"""The verdict on a step: whether its projection failed, why, and whether a smaller step could help."""
+"""The verdict on a step: whether its projection failed, why, and whether it can be saved."""
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -11,8 +11,9 @@ from .diffrax_private import register
 from .state import State
 
 _SMALLER = (
-    "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes with candidates "
-    "far from the manifold. Check by `check_invariance` that the quantity is conserved at all. "
+    "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes with "
+    "candidates far from the manifold. Check by `check_invariance` that the quantity is conserved "
+    "at all. "
 )
 _ENTRY = (
     "`diffrax_conserve.statistics(sol).worst`, of a solve with `SaveAt(solver_state=True)`, tells "
