@@ -26,6 +26,8 @@ class ProjectionInfo(eqx.Module):
     **Attributes:**
 
     - `ok`: whether every residual is within its tolerance at the state that is returned.
+    - `result`: an `optimistix.RESULTS`, successful if and only if `ok`; `nonfinite` if the
+        candidate has no finite residual, divergence if only the result has none.
     - `num_steps`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint at the projected state,
@@ -34,28 +36,19 @@ class ProjectionInfo(eqx.Module):
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `roundoff`: the largest measured share of a scale, which its gradient does not show: near one
         where `fn` is less accurate than its gradient tells.
-    - `worst`: if the projection failed, the position of the scalar constraint with the largest
-        relative residual (the smaller of its residuals before and after), in the order in which the
-        manifold is flattened; otherwise 0.
+    - `worst`: if the projection failed, the position of the entry of the manifold with the largest
+        relative residual (the smaller of its residuals before and after), as
+        [`diffrax_conserve.entry_name`][] takes it; otherwise 0.
     """
 
     ok: Bool[Array, ""]
+    result: optx.RESULTS
     num_steps: Int[Array, ""]
     residual_before: Float[Array, ""]
     residual_after: Float[Array, ""]
     correction: Float[Array, ""]
     roundoff: Float[Array, ""]
     worst: Int[Array, ""]
-
-    @property
-    def result(self) -> optx.RESULTS:
-        """An `optimistix.RESULTS`, successful if and only if `ok`: `nonfinite` if the candidate has
-        no finite residual, divergence if only the result has none."""
-        kinds = optx.RESULTS
-        finite = jnp.isfinite(self.residual_after)
-        failed = kinds.where(finite, kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence)
-        failed = kinds.where(jnp.isfinite(self.residual_before), failed, kinds.nonfinite)
-        return kinds.where(self.ok, kinds.successful, failed)
 
     def __str__(self) -> str:
         if is_traced(self):
@@ -137,16 +130,25 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
         if ok is None:
             ok = within(after, equations.tolerance(scale))
+        before, after = (jnp.max(x) for x in sizes)
+        kinds = optx.RESULTS
+        reached = kinds.where(
+            jnp.isfinite(after), kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
+        )
+        failed = kinds.where(jnp.isfinite(before), reached, kinds.nonfinite)
         # The smaller of both, so that none is blamed for an iteration that diverged.
         least = jnp.minimum(*(jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes))
+        parts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
+        entry = jnp.asarray(np.repeat(np.arange(len(parts)), parts))
         return ProjectionInfo(
             ok=ok,
+            result=kinds.where(ok, kinds.successful, failed),
             num_steps=jnp.asarray(num_steps),
-            residual_before=jnp.max(sizes[0]),
-            residual_after=jnp.max(sizes[1]),
+            residual_before=before,
+            residual_after=after,
             correction=jnp.linalg.norm(y - candidate),
             roundoff=jnp.max(relative(equations.sampled, scale)),
-            worst=jnp.where(ok, 0, jnp.argmax(least)),
+            worst=jnp.where(ok, 0, entry[jnp.argmax(least)]),
         )
 
 
@@ -218,8 +220,8 @@ NEWTON_OPTIONS = r"""**Arguments:**
     state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
     every projection ends well below it.
 - `atol`: an absolute tolerance, added to the relative one. Default: 0.
-- `max_steps`: the largest number of iterations. A projection that is not within its tolerance by
-    then has failed.
+- `max_steps`: the largest number of iterations, with bounds twice as many. A projection that is
+    not within its tolerance by then has failed.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.

@@ -23,7 +23,7 @@ from .equations import Equations
 
 # A component beyond its bound has this derivative: with zero, a constraint all of whose components
 # are at bounds would never change.
-_AT_BOUND = 1e-8
+_AT_BOUND = 1e-10
 
 
 class Box(eqx.Module):
@@ -42,7 +42,7 @@ class Box(eqx.Module):
     def compose(self, equations: Equations) -> Equations:
         """The equations as functions of `z`."""
         parts = tuple(_Clipped(part, self) for part in equations.parts)
-        return dataclasses.replace(equations, parts=parts)
+        return dataclasses.replace(equations, parts=parts, clip=self.clip)
 
 
 class _Clipped(eqx.Module):

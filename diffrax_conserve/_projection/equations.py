@@ -39,6 +39,9 @@ class Equations(eqx.Module):
     - `sampled`: what the measured roundoff of the functions adds to it.
     - `weights`: `M⁻¹`, the inverse of the metric; `None` if it is one.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
+    - `clip`: where the state is within bounds, the map to it from a vector without bounds, which is
+        then the argument of all methods. The residual is the gradient of a convex function of the
+        multipliers, with kinks, so that an iteration must look for the minimum along its step.
     """
 
     parts: tuple[Part, ...]
@@ -47,6 +50,7 @@ class Equations(eqx.Module):
     weights: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
+    clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
         return jnp.concatenate([part(y) for part in self.parts])
@@ -62,6 +66,7 @@ class Equations(eqx.Module):
         return jnp.concatenate(values), jnp.concatenate(rows)
 
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
+        y = y if self.clip is None else self.clip(y)
         return self.magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:

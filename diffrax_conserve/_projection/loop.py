@@ -5,7 +5,7 @@ out in scalars; in every batch, lanes iterate together until none goes on.
 """
 
 import functools as ft
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,11 +32,23 @@ from .scalars import components, in_scalars, joined
 _SAFELY = 0.25
 # The largest state of which a batch is written out in scalars.
 _UNKNOWNS_MAX = 8
+# The bisections of a step where it must be shortened.
+_HALVINGS = 30
+# With bounds, a component that an iteration reduces to this share of itself is zero.
+_VANISHES = 1e-8
 # The iterations of a batch before the first test: enough for most steps of an integrator.
 _UNTESTED = 2
 
-# The directions of the correction, and the factors of the Gram matrix if they are kept.
-_Base = tuple[Float[Array, "m n"], Factors | None]
+
+class _Base(NamedTuple):
+    """What an iteration keeps from the candidate: the directions of the correction; with many
+    constraints the factors of the Gram matrix. With fresh directions, if damped, the scale there."""
+
+    rows: Float[Array, "m n"] | None = None
+    factors: Factors | None = None
+    scale: Float[Array, " m"] | None = None
+
+
 # The state, whether it is on the manifold, and the number of iterations.
 Solved = tuple[Float[Array, " n"], Bool[Array, ""], Int[Array, ""]]
 
@@ -48,11 +60,13 @@ def solve(
     max_steps: int,
     directions: Float[Array, "m n"] | None = None,
     fresh: bool = False,
+    damped: bool = False,
 ) -> Solved:
     """The state `y = ŷ + Dᵀ λ` on the manifold. The directions `D` are by default `G M⁻¹` at the
-    candidate; with `fresh` they are that of the last state, and damped."""
+    candidate; with `fresh` those of the last state. A damping that vanishes with the residual helps
+    far from the manifold."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
-    run = ft.partial(_solve, max_steps=max_steps, fresh=fresh)
+    run = ft.partial(_solve, max_steps=max_steps, fresh=fresh, damped=damped)
 
     @jax.custom_batching.custom_vmap
     def alone(arrays: Any) -> Solved:
@@ -79,9 +93,10 @@ def _solve(
     *,
     max_steps: int,
     fresh: bool,
+    damped: bool,
     small: bool,
 ) -> Solved:
-    begin = ft.partial(_base, equations, directions, fresh)
+    begin = ft.partial(_base, equations, directions, fresh, damped)
     further, test = ft.partial(_further, equations), ft.partial(_test, equations)
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     if small:
@@ -103,52 +118,83 @@ def _solve(
 
 
 def _base(
-    equations: Equations, directions: Array | None, fresh: bool, y: Float[Array, " n"]
-) -> _Base | None:
-    if fresh:
-        return None
+    equations: Equations,
+    directions: Array | None,
+    fresh: bool,
+    damped: bool,
+    y: Float[Array, " n"],
+) -> _Base:
     if directions is not None:
-        return directions / row_sizes(directions)[:, None], None
+        return _Base(directions / row_sizes(directions)[:, None])
+    if fresh and not damped:
+        return _Base()
     _, jacobian = equations.linearise(y)
+    if fresh:
+        return _Base(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
     sizes = row_sizes(jacobian)
     unit = jacobian / sizes[:, None]
     rows = equations.weighted(unit)
-    return rows, factor(gram_matrix(unit, rows), sizes) if len(rows) > WRITTEN_OUT_MAX else None
+    many = len(rows) > WRITTEN_OUT_MAX
+    return _Base(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
 
 def _test(
-    equations: Equations, base: _Base | None, y: Float[Array, " n"], left: Int8[Array, ""]
+    equations: Equations, base: _Base, y: Float[Array, " n"], left: Int8[Array, ""]
 ) -> tuple[Float[Array, " n"], Int8[Array, ""]]:
     """One linearisation: residual, scale and verdict at the state itself, and the next state.
     `left` counts the iterations that are left; 0 is success, -1 failure."""
     g, jacobian = equations.linearise(y)
-    scale = equations.scale(jacobian, y)
-    tolerance = equations.tolerance(scale)
+    tolerance = equations.tolerance(equations.scale(jacobian, y))
     ok, safe = within(g, tolerance), within(g, _SAFELY * tolerance)
     less = jnp.where(ok, jnp.minimum(left - 1, 2), left - 1)
     now = jnp.where(safe, 0, jnp.where(left == 1, jnp.where(ok, 0, -1), less))
     left = jnp.where(left > 0, now, left).astype(left.dtype)
-    return jnp.where(left > 0, _corrected(equations, base, y, g, jacobian, scale), y), left
+    return jnp.where(left > 0, _corrected(equations, base, y, g, jacobian), y), left
 
 
 def _further(equations: Equations, base: _Base, y: Float[Array, " n"]) -> Float[Array, " n"]:
-    return _corrected(equations, base, y, *equations.linearise(y), equations.magnitude)
+    return _corrected(equations, base, y, *equations.linearise(y))
 
 
 def _corrected(
-    equations: Equations, base: _Base | None, y: Array, g: Array, jacobian: Array, scale: Array
+    equations: Equations, base: _Base, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`. A new component of two units of roundoff of the old one is zero:
-    otherwise a component whose true value is zero would never be small relative to itself."""
-    if base is not None and base[1] is not None:
-        rows, factors = base
-        multiplier = solve_factored(factors, g)
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the candidate, because near a state where all terms vanish it never becomes small
+    relative to theirs."""
+    if base.factors is not None:
+        rows, multiplier = base.rows, solve_factored(base.factors, g)
     else:
         sizes = row_sizes(jacobian)
-        unit, g = jacobian / sizes[:, None], g / sizes
-        rows = equations.weighted(unit) if base is None else base[0]
-        far = 0.0 if base is not None else jnp.sum(relative(g, scale / sizes) ** 2)
-        multiplier = gram_solve(gram_matrix(unit, rows), g, jnp.minimum(1e-2, far))
-    rest = y - combined(multiplier, rows)
-    roundoff = 2 * float(jnp.finfo(y.dtype).eps) * jnp.abs(y)
-    return jnp.where(jnp.abs(rest) <= roundoff, 0, rest)
+        unit = jacobian / sizes[:, None]
+        rows = equations.weighted(unit) if base.rows is None else base.rows
+        far = 0.0 if base.scale is None else jnp.sum(relative(g, base.scale) ** 2)
+        damping = jnp.minimum(1e-2, far)
+        multiplier = gram_solve(gram_matrix(unit, rows), g / sizes, damping)
+    change = combined(multiplier, rows)
+    if equations.clip is not None:
+        change = _length(equations, y, multiplier, change) * change
+    # A component that nearly vanishes does so: if its true value is zero, it would never be small
+    # relative to itself.
+    rest = y - change
+    least = 2 * float(jnp.finfo(y.dtype).eps) if equations.clip is None else _VANISHES
+    return jnp.where(jnp.abs(rest) <= least * jnp.abs(y), 0, rest)
+
+
+def _length(equations: Equations, y: Array, multiplier: Array, change: Array) -> Array:
+    """The share of a step at which a convex function is least, by bisection of its slope."""
+
+    def falls(length: Array) -> Array:
+        return jnp.sum(multiplier * equations.residual(y - length * change)) >= 0
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        a, b = ends
+        middle = (a + b) / 2
+        further = falls(middle)
+        return jnp.where(further, middle, a), jnp.where(further, b, middle)
+
+    one = jnp.ones((), y.dtype)
+    _, end = lax.fori_loop(0, _HALVINGS, halve, (0 * one, one))
+    # A full step that ends just past the minimum is accepted too.
+    last = jnp.sum(multiplier * equations.residual(y - change))
+    first = jnp.sum(multiplier * equations.residual(y))
+    return jnp.where(last >= -1e-3 * first, one, end)

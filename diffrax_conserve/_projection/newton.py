@@ -117,9 +117,13 @@ _Nearest = tuple[Float[Array, " n"], Float[Array, " m"], Bool[Array, ""], Int[Ar
 def _nearest(
     equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
 ) -> _Nearest:
-    bounded = equations if box is None else box.compose(equations)
-    y, ok, count = solve(bounded, candidate, max_steps=max_steps, fresh=True)
-    y = y if box is None else box.clip(y)
+    if box is None:
+        y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
+    else:
+        rows = equations.weighted(equations.linearise(candidate)[1])
+        bounded = box.compose(equations)
+        z, _, count = solve(bounded, candidate, directions=rows, max_steps=2 * max_steps)
+        y = box.clip(z)
     multiplier = jnp.zeros_like(equations.magnitude)
     n, unknowns = y.size, y.size + multiplier.size
     if unknowns > _NEAREST_MAX:
@@ -144,7 +148,8 @@ def _nearest(
     )
     start = jnp.concatenate([y, multiplier])
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
-    found = found & ok
+    if box is not None:
+        end = jnp.concatenate([box.clip(end[:n]), end[n:]])
     nearest = jnp.where(found, end, start)
     return nearest[:n], nearest[n:], found, count + more
 

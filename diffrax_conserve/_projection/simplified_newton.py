@@ -78,7 +78,7 @@ class SimplifiedNewton(AbstractProjection):
         else:
             rows = equations.weighted(equations.linearise(candidate)[1])
             bounded = box.compose(equations)
-            z, ok, count = project_along(bounded, candidate, rows, max_steps=self.max_steps)
+            z, ok, count = project_along(bounded, candidate, rows, max_steps=2 * self.max_steps)
             y = box.clip(z)
         return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol, ok=ok)
 

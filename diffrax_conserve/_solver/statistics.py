@@ -29,7 +29,7 @@ class ProjectionStatistics(eqx.Module):
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.
     - `roundoff`: the largest measured share of a scale; see [`diffrax_conserve.ProjectionInfo`][].
-    - `worst`: the position of the scalar constraint that failed last, as
+    - `worst`: the position of the entry of the manifold that failed last, as
         [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
     """
 
