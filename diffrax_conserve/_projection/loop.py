@@ -5,6 +5,7 @@ out in scalars; in every batch, lanes iterate together until none goes on.
 """
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,7 +14,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, Int, Int8
+from jaxtyping import Array, Bool, Float, Int
 
 from .equations import Equations, any_lane, relative, within
 from .gram import (
@@ -42,7 +43,7 @@ _UNTESTED = 2
 
 class _Base(NamedTuple):
     """What an iteration keeps from the candidate: the directions of the correction; with many
-    constraints the factors of the Gram matrix. With fresh directions, if damped, the scale there."""
+    constraints the factors of the Gram matrix. If damped, only the scale there."""
 
     rows: Float[Array, "m n"] | None = None
     factors: Factors | None = None
@@ -139,8 +140,8 @@ def _base(
 
 
 def _test(
-    equations: Equations, base: _Base, y: Float[Array, " n"], left: Int8[Array, ""]
-) -> tuple[Float[Array, " n"], Int8[Array, ""]]:
+    equations: Equations, base: _Base, y: Float[Array, " n"], left: Int[Array, ""]
+) -> tuple[Float[Array, " n"], Int[Array, ""]]:
     """One linearisation: residual, scale and verdict at the state itself, and the next state.
     `left` counts the iterations that are left; 0 is success, -1 failure."""
     g, jacobian = equations.linearise(y)
@@ -159,8 +160,8 @@ def _further(equations: Equations, base: _Base, y: Float[Array, " n"]) -> Float[
 def _corrected(
     equations: Equations, base: _Base, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the candidate, because near a state where all terms vanish it never becomes small
-    relative to theirs."""
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
+    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
     if base.factors is not None:
         rows, multiplier = base.rows, solve_factored(base.factors, g)
     else:
@@ -172,7 +173,7 @@ def _corrected(
         multiplier = gram_solve(gram_matrix(unit, rows), g / sizes, damping)
     change = combined(multiplier, rows)
     if equations.clip is not None:
-        change = _length(equations, y, multiplier, change) * change
+        change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: if its true value is zero, it would never be small
     # relative to itself.
     rest = y - change
@@ -180,7 +181,13 @@ def _corrected(
     return jnp.where(jnp.abs(rest) <= least * jnp.abs(y), 0, rest)
 
 
-def _length(equations: Equations, y: Array, multiplier: Array, change: Array) -> Array:
+def _length(
+    equations: Equations,
+    clip: Callable[[Array], Array],
+    y: Array,
+    multiplier: Array,
+    change: Array,
+) -> Array:
     """The share of a step at which a convex function is least, by bisection of its slope."""
 
     def falls(length: Array) -> Array:
@@ -194,7 +201,8 @@ def _length(equations: Equations, y: Array, multiplier: Array, change: Array) ->
 
     one = jnp.ones((), y.dtype)
     _, end = lax.fori_loop(0, _HALVINGS, halve, (0 * one, one))
-    # A full step that ends just past the minimum is accepted too.
+    # A full step is taken within the bounds, and if it ends just past the minimum.
+    within_bounds = jnp.all(clip(y) == y) & jnp.all(clip(y - change) == y - change)
     last = jnp.sum(multiplier * equations.residual(y - change))
     first = jnp.sum(multiplier * equations.residual(y))
-    return jnp.where(last >= -1e-3 * first, one, end)
+    return jnp.where(within_bounds | (last >= -1e-3 * first), one, end)

@@ -150,6 +150,7 @@ def _nearest(
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
+        found = found & equations.judged(end[:n])
     nearest = jnp.where(found, end, start)
     return nearest[:n], nearest[n:], found, count + more
 
