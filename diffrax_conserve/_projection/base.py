@@ -16,7 +16,7 @@ from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
 from .._options import check_count, check_number, check_numbers
 from .._printing import is_traced, printed
 from .._tree import tree_stop_gradient, unravel
-from .equations import Equations, relative, within
+from .equations import Equations, relative
 from .step import Step
 
 
@@ -128,8 +128,7 @@ class Problem(eqx.Module):
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
-        if ok is None:
-            ok = within(after, equations.tolerance(scale))
+        ok = equations.misfit(after, jacobian, y) <= 1 if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         reached = kinds.where(

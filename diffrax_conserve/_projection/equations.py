@@ -69,28 +69,27 @@ class Equations(eqx.Module):
         y = y if self.clip is None else self.clip(y)
         return self.magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1)
 
-    def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
-        """The largest residual that counts as zero; NaN, which none satisfies, where a residual of
-        that size would underflow."""
-        info = jnp.finfo(scale.dtype)
+    def misfit(
+        self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        """The largest residual in units of its tolerance; a state is on the manifold if this is at
+        most one. It is NaN where a residual within the tolerance would underflow."""
+        info = jnp.finfo(y.dtype)
+        scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
-        limit = jnp.asarray(rtol, scale.dtype) * scale
-        limit = limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
-        return jnp.where((scale > 0) & (limit < float(info.tiny)), jnp.nan, limit)
+        limit = jnp.asarray(rtol, y.dtype) * scale
+        limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
+        valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
+        return jnp.max(jnp.where(valid, jnp.where(g == 0, 0, jnp.abs(g) / limit), jnp.nan))
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return within(g, self.tolerance(self.scale(jacobian, y)))
+        return self.misfit(g, jacobian, y) <= 1
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""
         return rows if self.weights is None else rows * self.weights
-
-
-def within(residual: Float[Array, " m"], tolerance: Float[Array, " m"]) -> Bool[Array, ""]:
-    """Whether every residual is within its tolerance. NaN and infinity never are."""
-    return jnp.all((jnp.abs(residual) <= tolerance) & (tolerance < jnp.inf))
 
 
 def relative(residual: Any, scale: Any) -> Any:

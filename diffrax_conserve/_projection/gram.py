@@ -41,6 +41,15 @@ def gram_solve(
         x = jnp.linalg.solve(matrix.astype(working), (b * unit).astype(working))
         return x.astype(dtype) * unit
     least = 4 * m * float(jnp.finfo(dtype).eps)
+    if m == 2:  # with one division, because XLA compiles each into a kernel of its own
+        (a, b01), (b10, d) = gram[0], gram[1]
+        a, d = a * (1 + damping), d * (1 + damping)
+        det = a * d - b01 * b10
+        regular, first = jnp.abs(det) > least * jnp.abs(a * d), a != 0
+        divisor = jnp.where(regular, det, jnp.where(first, a, d))
+        upper = jnp.where(regular, d * b[0] - b01 * b[1], jnp.where(first, b[0], 0))
+        lower = jnp.where(regular, a * b[1] - b10 * b[0], jnp.where(first, 0, b[1]))
+        return jnp.stack([upper, lower]) / jnp.where(divisor == 0, jnp.inf, divisor)
     rows = [[gram[i, j] for j in range(m)] for i in range(m)]
     x, pivots = [b[i] for i in range(m)], []
     for k in range(m):

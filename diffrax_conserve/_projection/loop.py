@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
-from .equations import Equations, any_lane, relative, within
+from .equations import Equations, any_lane, relative
 from .gram import (
     WRITTEN_OUT_MAX,
     Factors,
@@ -145,10 +145,10 @@ def _test(
     """One linearisation: residual, scale and verdict at the state itself, and the next state.
     `left` counts the iterations that are left; 0 is success, -1 failure."""
     g, jacobian = equations.linearise(y)
-    tolerance = equations.tolerance(equations.scale(jacobian, y))
-    ok, safe = within(g, tolerance), within(g, _SAFELY * tolerance)
-    less = jnp.where(ok, jnp.minimum(left - 1, 2), left - 1)
-    now = jnp.where(safe, 0, jnp.where(left == 1, jnp.where(ok, 0, -1), less))
+    misfit = equations.misfit(g, jacobian, y)
+    less = jnp.where(misfit <= 1, jnp.minimum(left - 1, 2), left - 1)
+    now = jnp.where(left == 1, jnp.where(misfit <= 1, 0, -1), less)
+    now = jnp.where(misfit <= _SAFELY, 0, now)
     left = jnp.where(left > 0, now, left).astype(left.dtype)
     return jnp.where(left > 0, _corrected(equations, base, y, g, jacobian), y), left
 
