@@ -41,9 +41,9 @@ _VANISHES = 1e-8
 _UNTESTED = 2
 
 
-class _Base(NamedTuple):
-    """What an iteration keeps from the candidate: the directions of the correction; with many
-    constraints the factors of the Gram matrix. If damped, only the scale there."""
+class _Kept(NamedTuple):
+    """What an iteration keeps from the candidate: the directions of the correction, and with many
+    constraints the factors of the Gram matrix; or only the scale there, for the damping."""
 
     rows: Float[Array, "m n"] | None = None
     factors: Factors | None = None
@@ -89,86 +89,109 @@ def solve(
 
 def _solve(
     equations: Equations,
-    candidate: Array,
-    directions: Array | None,
+    candidate: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None,
     *,
     max_steps: int,
     fresh: bool,
     damped: bool,
     small: bool,
 ) -> Solved:
-    begin = ft.partial(_base, equations, directions, fresh, damped)
-    further, test = ft.partial(_further, equations), ft.partial(_test, equations)
+    keep = ft.partial(_keep, equations, fresh, damped)
+    kept, own = _Kept(), directions is None and not (fresh and not damped)
+    if directions is not None:
+        kept = _Kept(directions / row_sizes(directions)[:, None])
+    if own:
+        like = eqx.filter_eval_shape(
+            keep, candidate, *jax.eval_shape(equations.linearise, candidate)
+        )
+        kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+
+    def first(y: Array) -> tuple[Array, _Kept]:
+        g, jacobian = equations.linearise(y)
+        kept = keep(y, g, jacobian)
+        return _corrected(equations, kept, y, g, jacobian), kept
+
+    def further(kept: _Kept, y: Array) -> Array:
+        return _corrected(equations, kept, y, *equations.linearise(y))
+
+    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
+        return _tested(equations, kept, y, left, *equations.linearise(y))
+
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
-    if small:
-        base = jax.eval_shape(begin, y)
-        fns = in_scalars(begin, y), in_scalars(further, base, y), in_scalars(test, base, y, left)
-        if small := None not in fns:
+    if small and own and max_steps >= _UNTESTED:
+        fns = in_scalars(first, y), in_scalars(further, kept, y), in_scalars(test, kept, y, left)
+        if None not in fns:
             # From here on arrays are tuples of scalars.
-            (begin, further, test), y = fns, components(y)
-    base, count = begin(y), jnp.asarray(0)
-    for _ in range(min(_UNTESTED, max_steps) if small else 0):
-        y, left, count = further(base, y), left - 1, count + 1
+            first, further, test = fns
+            y, kept = first(components(y))
+            for _ in range(_UNTESTED - 1):
+                y = further(kept, y)
+            left, own = left - _UNTESTED, False
 
-    def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
-        y, left = test(base, *carry[:2])
-        return y, left, carry[2] + (left > 0)
+    def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
+        y, left, index, count, kept = carry
+        if own:
+            g, jacobian = equations.linearise(y)
+            is_first = index == 0 if kept.factors is not None else left > max_steps
+            kept = _if_first(is_first, lambda: keep(y, g, jacobian), kept)
+            y, left = _tested(equations, kept, y, left, g, jacobian)
+        else:
+            y, left = test(kept, y, left)
+        return y, left, index + 1, count + (left > 0), kept
 
-    y, left, count = lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, (y, left, count))
+    def unfinished(carry: tuple[Any, Array, Array, Array, Any]) -> Array:
+        return any_lane(carry[1] > 0)
+
+    index, count = jnp.asarray(0), max_steps + 1 - left.astype(int)
+    y, left, _, count, _ = lax.while_loop(unfinished, body, (y, left, index, count, kept))
     return joined(candidate, y), left == 0, count
 
 
-def _base(
-    equations: Equations,
-    directions: Array | None,
-    fresh: bool,
-    damped: bool,
-    y: Float[Array, " n"],
-) -> _Base:
-    if directions is not None:
-        return _Base(directions / row_sizes(directions)[:, None])
-    if fresh and not damped:
-        return _Base()
-    _, jacobian = equations.linearise(y)
+def _keep(
+    equations: Equations, fresh: bool, damped: bool, y: Array, g: Array, jacobian: Array
+) -> _Kept:
     if fresh:
-        return _Base(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
+        return _Kept(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
     sizes = row_sizes(jacobian)
     unit = jacobian / sizes[:, None]
     rows = equations.weighted(unit)
     many = len(rows) > WRITTEN_OUT_MAX
-    return _Base(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
+    return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
 
-def _test(
-    equations: Equations, base: _Base, y: Float[Array, " n"], left: Int[Array, ""]
+def _if_first(first: Bool[Array, ""], new: Callable[[], _Kept], kept: _Kept) -> _Kept:
+    """`new()` in the first iteration. What takes a factorisation is worth a branch."""
+    if kept.factors is not None:
+        return lax.cond(first, new, lambda: kept)
+    return jtu.tree_map(lambda a, b: jnp.where(first, a, b), new(), kept)
+
+
+def _tested(
+    equations: Equations, kept: _Kept, y: Array, left: Array, g: Array, jacobian: Array
 ) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """One linearisation: residual, scale and verdict at the state itself, and the next state.
-    `left` counts the iterations that are left; 0 is success, -1 failure."""
-    g, jacobian = equations.linearise(y)
+    """The verdict at the state itself, and the next state. `left` counts the iterations that are
+    left; 0 is success, -1 failure."""
     misfit = equations.misfit(g, jacobian, y)
     less = jnp.where(misfit <= 1, jnp.minimum(left - 1, 2), left - 1)
     now = jnp.where(left == 1, jnp.where(misfit <= 1, 0, -1), less)
     now = jnp.where(misfit <= _SAFELY, 0, now)
     left = jnp.where(left > 0, now, left).astype(left.dtype)
-    return jnp.where(left > 0, _corrected(equations, base, y, g, jacobian), y), left
-
-
-def _further(equations: Equations, base: _Base, y: Float[Array, " n"]) -> Float[Array, " n"]:
-    return _corrected(equations, base, y, *equations.linearise(y))
+    return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
 
 
 def _corrected(
-    equations: Equations, base: _Base, y: Array, g: Array, jacobian: Array
+    equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
     """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
     candidate: near a state where all terms vanish it never becomes small relative to theirs."""
-    if base.factors is not None:
-        rows, multiplier = base.rows, solve_factored(base.factors, g)
+    if kept.factors is not None:
+        rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:
         sizes = row_sizes(jacobian)
         unit = jacobian / sizes[:, None]
-        rows = equations.weighted(unit) if base.rows is None else base.rows
-        far = 0.0 if base.scale is None else jnp.sum(relative(g, base.scale) ** 2)
+        rows = equations.weighted(unit) if kept.rows is None else kept.rows
+        far = 0.0 if kept.scale is None else jnp.sum(relative(g, kept.scale) ** 2)
         damping = jnp.minimum(1e-2, far)
         multiplier = gram_solve(gram_matrix(unit, rows), g / sizes, damping)
     change = combined(multiplier, rows)

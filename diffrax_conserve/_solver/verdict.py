@@ -53,20 +53,19 @@ def verdict(
     or the solve cannot start. `states` are the last state, the candidate and the result."""
     last, candidate, result = (ravel(y) for y in states)
     eps = float(jnp.finfo(candidate.dtype).eps)
-    moved = jnp.max(jnp.abs(candidate - last))
+    moved, size = jnp.abs(candidate - last), jnp.abs(candidate)
     correction = jnp.max(jnp.abs(result - candidate))
-    size = jnp.max(jnp.abs(candidate))
-    cause = jnp.where(jnp.isfinite(moved + correction), _NOT_REACHED, _NOT_FINITE)
+    cause = jnp.where(jnp.isfinite(correction), _NOT_REACHED, _NOT_FINITE)
     cause = jnp.where(ok, 0, cause)
     if max_correction is not None:
         # A correction this small is allowed however short the step.
-        limit = jnp.asarray(max_correction, size.dtype) * every * moved + 8 * eps**0.5 * size
-        too_far = ok & ~(correction <= limit)
+        share = jnp.asarray(max_correction, size.dtype) * every
+        too_far = ok & ~(correction <= jnp.max(share * moved + 8 * eps**0.5 * size))
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
         cause = jnp.where(too_far, _TOO_FAR, cause)
     lost = jnp.any(jnp.isnan(state.values))
     cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    near = moved <= max(5e-4, 16 * eps) * size
+    near = jnp.max(moved) <= max(5e-4, 16 * eps) * jnp.max(size)
     return cause, near | instant | lost
