@@ -106,7 +106,7 @@ COSTS := overhead gradients work_precision scaling unlike_lanes devices balance 
   random_features
 TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures chemistry worth \
   parameters
-STUDIES := first_same_as_last max_correction project_error claims long_run
+STUDIES := max_correction claims long_run
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
@@ -121,7 +121,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
-# of `fast_cpu`. The slow tests judge what most of these runs find.
+# that the pages recommend. The slow tests judge what most of these runs find.
 SMALL_LOOPS := xla_cpu_small_while_loop_byte_threshold=65536
 comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))

@@ -11,12 +11,9 @@ import sys
 
 CODE = """
 import json, sys
-import diffrax, diffrax_conserve as dfc
+import diffrax, diffrax_conserve
 modules, messages = list(sys.modules), len(diffrax.RESULTS._index_to_message)
-dfc.fast_cpu()
-import jax
-total = float(jax.numpy.ones(3).sum())
-print(json.dumps({"modules": modules, "messages": messages, "computed with fast_cpu": total}))
+print(json.dumps({"modules": modules, "messages": messages}))
 """
 
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _PRINTING = {"_printing"}
 _TREE = _TYPES | {"_tree"}
-_ENTRIES = _TREE | {"_options", "_with_jacobian", "_along"}
+_ENTRIES = _TREE | {"_options", "_along"}
 _MANIFOLD = _ENTRIES | {"_manifold"}
 _BALANCE = _MANIFOLD | {"_balance"}
 _PROJECTION = _BALANCE | _PRINTING | {"_projection"}
@@ -36,8 +36,6 @@ MAY_IMPORT = {
     "_options": set(),
     "_tree": _TYPES,
     "_along": _TREE,
-    "_fast_cpu": set(),
-    "_with_jacobian": _TREE | {"_options"},
     "_manifold": _ENTRIES,
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,
@@ -47,7 +45,7 @@ MAY_IMPORT = {
     "learned": _CORE | {"_replace_file", "systems"},
     "systems": _CORE,
     "testing": _CORE | {"systems"},
-    PACKAGE: _CORE | _GUESTS | {"_fast_cpu"},
+    PACKAGE: _CORE | _GUESTS,
     "reproduce": _CORE | _GUESTS | {PACKAGE},
     "__main__": _CORE | _GUESTS | {"reproduce", PACKAGE},
 }

@@ -18,8 +18,7 @@ import pytest
 import diffrax_conserve as dfc
 from diffrax_conserve.__main__ import main
 from diffrax_conserve._replace_file import replace_file
-from diffrax_conserve.reproduce import _compare, _job, _tables
-from diffrax_conserve.reproduce import _trained as _learned
+from diffrax_conserve.reproduce import _compare, _job
 
 FIGURES = ("trajectory", "drift", "state_error")
 PAPER = dfc.systems.names()[:5]
@@ -168,33 +167,6 @@ def test_a_last_step_that_is_shorter(tmp_path, of_kepler):
     assert metrics["solvers"]["projected rk4"]["state_error"] < 2 * whole
 
 
-@pytest.mark.slow
-def test_flow_maps_are_compared_on_many_initial_states():
-    for name in PAPER:
-        system = dfc.systems.get(name)
-        states = np.asarray(_learned.initial_states(system))
-        assert len(states) == (1 if name in ("harmonic-oscillator", "rigid-body") else 20)
-        np.testing.assert_array_equal(states[0], system.y0)
-    # The vortices, which come last: no pair that a step cannot resolve.
-    for i, j in ((0, 1), (1, 2), (0, 2)):
-        assert np.min(np.linalg.norm(states[:, i] - states[:, j], axis=1)) > 0.3
-
-
-@pytest.mark.slow
-def test_a_figure_is_the_median_over_the_initial_states(tmp_path, monkeypatch):
-    """With RK4 alone, on flow maps' states: the same as one solve at a time."""
-    monkeypatch.setattr(_job, "is_learned", lambda system: False)
-    _, metrics = reproduce(tmp_path, "conservative-lorenz", "--t1", "1", "--dt", "0.25")
-    system = dfc.systems.get("conservative-lorenz")
-    errors = []
-    for y0 in np.asarray(_learned.initial_states(system)):
-        y = rk4(lambda y: np.array([y[1], y[0] / 2 - y[0] * y[2], y[0] * y[1]]), y0, 0.25, 4)[-1]
-        errors.append(np.linalg.norm(y - system.reference(jnp.array([1.0]), y0)[0]))
-    row = metrics["solvers"]["rk4"]
-    assert metrics["initial_states"] == 20
-    np.testing.assert_allclose(row["state_error"], np.median(errors), rtol=1e-8)
-
-
 # ---- What it writes and prints ----
 
 
@@ -213,17 +185,6 @@ def test_files_and_nothing_else(tmp_path, capsys, only_rk4):
     reproduce(tmp_path, *KEPLER)
     printed = capsys.readouterr().out
     assert_written(tmp_path / "out", FIGURES, printed, "rk4", "drift of angular momentum")
-
-
-@pytest.mark.slow
-@pytest.mark.draws
-def test_files_of_learned_solvers_and_nothing_else(tmp_path, capsys):
-    _, metrics = reproduce(tmp_path, "rigid-body", "--t1", "0.2", "--dt", "0.1")
-    assert set(metrics["solvers"]) == {"rk4", "projected rk4", *LEARNED}
-    assert max(metrics["solvers"]["conservative"]["drift"].values()) < 1e-14
-    assert metrics["solvers"]["conservative"]["state_error"] < 1e-2
-    texts = "projected rk4", "drift of squared angular momentum"
-    assert_written(tmp_path / "out", (*FIGURES, "loss"), capsys.readouterr().out, *texts)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
@@ -404,13 +365,6 @@ def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys
     assert "projected rk4 FAILED after t = " in capsys.readouterr().out
 
 
-@pytest.mark.slow
-@pytest.mark.draws
-def test_a_projection_that_fails_costs_no_figure(tmp_path):
-    assert reproduce(tmp_path, "kepler", "--t1", "60", "--dt", "6")[0] == 1
-    assert all((tmp_path / "out" / f"{name}.png").exists() for name in FIGURES)
-
-
 def test_a_solver_that_cannot_start(tmp_path, capsys, monkeypatch):
     def solvers(system, networks):
         return {"rk4": dfc.RK4(), "leapfrog": dfx.SemiImplicitEuler()}
@@ -455,13 +409,3 @@ def test_a_state_that_blows_up(tmp_path, only_rk4):
     status, metrics = reproduce(tmp_path, "harmonic-oscillator", "--t1", "1.5e11", "--dt", "1e10")
     assert status == 1
     assert "not finite" in metrics["solvers"]["rk4"]["failure"]
-
-
-@pytest.mark.slow
-def test_the_lines_between_the_steps_are_those_of_the_solution():
-    system = dfc.systems.get("rigid-body")
-    ts = np.linspace(0, system.t1, 36)
-    (path,) = _tables._line(system, ts, system.reference(ts)).values()
-    fine = np.linspace(0, system.t1, len(path))
-    np.testing.assert_allclose(path, system.reference(fine), atol=2e-4)
-    np.testing.assert_allclose(path[:: _tables._POINTS], system.reference(ts), atol=1e-13)

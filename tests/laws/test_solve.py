@@ -243,18 +243,3 @@ def test_random_quadratic_integrals_are_conserved(dimension, integrals, data):
     fractions = data.draw(dct.times(0.0, 1.0))
     sol = saved(system, system.y0, data.draw(dct.step_sizes(0.02)), fractions, dfx.Heun())
     dct.assert_conserved(sol, system.manifold, y0=system.y0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_the_order_survives_the_projection(name):
-    system = SYSTEMS[name]
-    # Their own steps are so short that the errors would be roundoff.
-    dt = {"rigid-body": 8, "korteweg-de-vries": 4}.get(name, 1) * system.dt
-    dct.assert_order(
-        dfc.ManifoldProjection(dfc.RK4(), system.manifold),
-        dfx.ODETerm(system.vector_field),
-        system.y0,
-        t1=2 * dt,
-        dt0=dt / 8,
-    )

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-import optax
 import pytest
 
 import diffrax_conserve as dfc
@@ -138,36 +137,8 @@ def test_a_layer_or_args_of_the_polynomial_are_refused():
 # ---- Training ----
 
 
-@pytest.mark.slow
-def test_a_training_draws_args_and_leaves_the_domain(trained):
-    flow_map, log = trained
-    assert isinstance(flow_map, dfc.DeepONet)
-    assert eqx.tree_equal(flow_map.args_domain, BOX)
-    assert log.error < 1e-3
-
-    @jax.jit
-    @jax.vmap
-    def error(key):
-        args, y0 = BOX.sample(key), sample(jr.fold_in(key, 1))
-        exact = dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 0.5, 0.05, y0, args).ys[0]
-        return jnp.max(jnp.abs(flow_map(y0, args, 0.5) - exact))
-
-    assert np.max(error(jr.split(jr.key(4), 8))) < 2e-3
-
-
 def _last(args, solver):
     return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8).ys[0]
-
-
-@pytest.mark.slow
-def test_derivatives_by_args_are_those_of_the_equation(trained):
-    learned = dfc.DeepONetSolver(trained[0])
-    forward = eqx.filter_jit(jax.jacfwd(_forward))(ARGS, learned)
-    reverse = eqx.filter_jit(jax.jacrev(_last))(ARGS, learned)
-    exact = jax.jit(jax.jacfwd(_fine))(ARGS)
-    for name in ARGS:
-        np.testing.assert_allclose(forward[name], reverse[name], rtol=1e-9)
-        np.testing.assert_allclose(reverse[name], exact[name], atol=2e-2)
 
 
 def test_derivatives_by_args_are_those_of_the_solve():
@@ -192,22 +163,6 @@ def _forward(args, solver):
 def _fine(args):
     adjoint = dfx.ForwardMode()
     return dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 2.0, 0.05, Y0, args, adjoint=adjoint).ys[0]
-
-
-@pytest.mark.slow
-def test_it_learns_from_data_of_many_args():
-    args = jax.vmap(BOX.sample)(jr.split(jr.key(5), 40))
-    field = lambda t, y, _: (spring(t, *y), jax.tree.map(jnp.zeros_like, y[1]))  # noqa: E731
-    data = dfc.learned.trajectories(field, (STATES[:40], args), jnp.linspace(0, 2, 9))
-    recipe = dfc.learned.Recipe(epochs=400, points=200, optimiser=optax.adam(1e-2), refresh=1)
-    trained, log = dfc.fit(family(), data=data, recipe=recipe, key=jr.key(6))
-    assert log.losses[-1] < 0.05 * log.losses[0]
-    _, (ys, args) = data
-    found = jax.vmap(trained, in_axes=(0, 0, None))(
-        ys[:, 0], jax.tree.map(lambda x: x[:, 0], args), 0.5
-    )
-    moved = jnp.sqrt(jnp.mean((ys[:, 2] - ys[:, 0]) ** 2))
-    assert jnp.sqrt(jnp.mean((found - ys[:, 2]) ** 2)) < 0.3 * moved
 
 
 def test_a_training_goes_on_bit_for_bit():

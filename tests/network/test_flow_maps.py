@@ -113,21 +113,6 @@ def test_its_domain_is_the_box_round_its_states():
 # ---- Windows ----
 
 
-@pytest.mark.slow
-def test_a_pinn_of_windows_follows_them():
-    pinn = solution(t1=3.0, windows=3)
-    assert pinn.windows == 3
-    states = jax.vmap(LORENZ.sample)(jr.split(jr.key(0), 3))
-    pinn = eqx.tree_at(lambda p: p.y0s, pinn, states)
-    compiled = eqx.filter_jit(pinn)
-    for t, k in [(0.0, 0), (0.5, 0), (1.0, 1), (1.9, 1), (2.0, 2), (3.0, 2)]:
-        np.testing.assert_array_equal(pinn(t), pinn.window(k)(t))
-        np.testing.assert_allclose(compiled(jnp.asarray(t)), pinn.window(k)(t), atol=1e-14)
-    for k in range(3):
-        np.testing.assert_array_equal(pinn.window(k)(float(k)), states[k])
-    np.testing.assert_array_equal(pinn.y0, states[0])
-
-
 def test_each_window_has_weights_of_its_own():
     nets = solution(windows=3).nets
     first = nets.weights[0]
@@ -138,15 +123,6 @@ def test_each_window_has_weights_of_its_own():
 def test_wrong_windows_are_named(wrong):
     with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must be"):
         solution(**wrong)
-
-
-@pytest.mark.slow
-def test_the_units_of_a_first_layer_are_spread_over_the_interval():
-    pinn = dfc.PINN(EAST, 0.0, 1.0, width=500, depth=1, slope=2.0, key=jr.key(0))
-    net = pinn.window(0).net
-    slopes, centres = net.weights[0][0], -net.biases[0] / net.weights[0][0]
-    np.testing.assert_allclose(jnp.std(slopes), 2, rtol=0.1)
-    np.testing.assert_allclose(jnp.quantile(centres, jnp.array([0, 0.5, 1])), [-1, 0, 1], atol=0.1)
 
 
 @pytest.mark.parametrize("projected", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -1,6 +1,5 @@
 """Moving frames: a flow map commutes with the symmetries of its equations, whatever its weights."""
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,8 +8,6 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._networks.trainable import Points
-from diffrax_conserve.learned._training.defect import defects
 
 from ..learned import CORES, LORENZ, SMALL, flow_map, states
 
@@ -110,67 +107,6 @@ def test_its_domain_is_one_of_shapes():
     # Larger is slower, which is a part of what is known; smaller is faster.
     np.testing.assert_array_equal(contains(10 * y0s), True)
     np.testing.assert_array_equal(contains(0.01 * y0s), False)
-
-
-@pytest.mark.slow
-def test_training_measures_the_defect_in_the_frame():
-    network = framed(1, core=dfc.learned.Concatenated)
-    y0s, ts = states(20, VORTICES), jnp.linspace(0.0, STEP, 20)
-
-    @jax.jit
-    def both():
-        points = Points(ts, y0s)
-        measured = defects(
-            network, VORTICES.vector_field, None, points, (jnp.asarray(0), jnp.asarray(1.0))
-        )
-        path = jax.vmap(network)
-        ys, slopes = jax.jvp(lambda ts: path(y0s, ts), (ts,), (jnp.ones_like(ts),))
-        return measured, slopes - jax.vmap(lambda y: VORTICES.vector_field(0.0, y, None))(ys)
-
-    measured, defect = both()
-    assert measured.shape == (20, 4)
-    assert jnp.max(jnp.abs(measured)) > 1e-3
-    frames = FRAMES(y0s)
-    again = jnp.einsum("snm,sm->sn", frames.basis, measured) * frames.clock[:, None]
-    np.testing.assert_allclose(again, defect.reshape(20, 6), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_training_lessens_the_error():
-    network = framed(core=dfc.learned.Concatenated, width=12, depth=1)
-    y0s = states(200, VORTICES)
-    recipe = dfc.learned.Recipe(epochs=30, points=40, optimiser=dfc.learned.SPRING(), refresh=1)
-    trained, _ = dfc.fit(
-        network, VORTICES.vector_field,
-        key=jr.key(0), sample=dfc.learned.FromStates(y0s), recipe=recipe,
-    )  # fmt: skip
-    fresh = states(20, VORTICES, seed=9)
-
-    @jax.jit
-    @jax.vmap
-    def exact(y0):
-        term = dfx.ODETerm(VORTICES.vector_field)
-        return dfx.diffeqsolve(term, dfx.Tsit5(), 0.0, STEP, STEP / 50, y0).ys[-1]
-
-    step = eqx.filter_jit(lambda network: jax.vmap(lambda y: network(y, STEP))(fresh))
-    before, after = (jnp.median(jnp.abs(step(n) - exact(fresh))) for n in (network, trained))
-    assert after < 0.1 * before
-
-
-@pytest.mark.slow
-def test_a_frame_of_a_dictionary():
-    def polar(y):
-        x = jnp.stack([y["q"], y["p"]])
-        return dfc.learned.Frame(
-            jnp.sum(x**2)[None], jnp.stack([x, jnp.stack([-y["p"], y["q"]])], axis=1)[::-1]
-        )
-
-    # Leaves are in the order of the keys: `p` before `q`.
-    y0s = {"q": jnp.array([1.0, 0.3]), "p": jnp.array([0.2, -1.0])}
-    network = dfc.DeepONet(y0s, 1.0, frame=polar, key=jr.key(0), **SMALL)
-    y1 = network({"q": 1.0, "p": 0.5}, 0.7)
-    turned = network({"q": -0.5, "p": 1.0}, 0.7)
-    np.testing.assert_allclose([turned["q"], turned["p"]], [-y1["p"], y1["q"]], rtol=1e-12)
 
 
 def test_wrong_frames_are_named():

@@ -156,26 +156,6 @@ def test_its_step_against_keplers_equation():
     assert np.max(error) < 2e-5
 
 
-@pytest.mark.slow
-def test_a_hundred_projected_steps_against_keplers_equation():
-    elements, place = random_orbits(40, seed=2)
-    y0s = arrays(ellipses(**elements, **place))
-    system = dfc.systems.Kepler()
-    solver = dfc.ManifoldProjection(
-        dfc.DeepONetSolver(dfc.load_pretrained("kepler")), system.manifold
-    )
-
-    @jax.jit
-    @jax.vmap
-    def solve(y0):
-        return dfx.diffeqsolve(dfx.ODETerm(system.vector_field), solver, 0.0, 50.0, 0.5, y0).ys
-
-    after = elements | {"anomaly": anomaly_after(50.0, **elements)}
-    error = distances([x[:, -1] for x in solve(y0s)], ellipses(**after, **place))
-    assert np.median(error) < 1e-4
-    assert np.max(error) < 1e-3
-
-
 def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
     """Small orbits can start inside and be too fast a quarter later."""
     rng = np.random.default_rng(3)

@@ -1,6 +1,5 @@
 """A projection that the user writes down is used as it is, and checked."""
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import evaluated, solve
+from ..problems import solve
 
 SPHERE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
 
@@ -39,15 +38,8 @@ def test_it_agrees_with_newton_and_so_do_its_derivatives():
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_dense_output_is_projected_by_it():
-    sol = run(dfc.ClosedForm(rescale), jnp.array([3.0, 4.0]), 1.0, saveat=dfx.SaveAt(dense=True))
-    ys = evaluated(sol, jnp.linspace(0, 1, 7))
-    np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 25.0, rtol=4e-16)
-
-
 def test_a_wrong_formula_fails(errors_raise):
-    with pytest.raises(eqx.EquinoxRuntimeError, match="`manifold` is still not satisfied"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="was not reached"):
         run(dfc.ClosedForm(lambda t, y, args, values: 1.01 * y), jnp.array([3.0, 4.0]), 1.0)
 
 

@@ -174,26 +174,6 @@ def test_gradient_with_redundant_constraints_is_that_without():
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_many_constraints_agree_with_finite_differences():
-    chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args)
-    rng = np.random.default_rng(0)
-    q = jnp.asarray(np.stack([np.arange(9.0), np.zeros(9)], -1) + 0.02 * rng.normal(size=(9, 2)))
-
-    @jax.jit
-    def value(q, length):
-        projection = dfc.SimplifiedNewton()
-        return jnp.sum(dfc.project(chain, q, args=length, projection=projection)[0] ** 3)
-
-    dq, dl = jax.jit(jax.grad(value, argnums=(0, 1)))(q, 1.0)
-    d, h = jnp.asarray(rng.normal(size=q.shape)), 1e-6
-    np.testing.assert_allclose(
-        jnp.sum(dq * d) + dl,
-        (value(q + h * d, 1.0 + h) - value(q - h * d, 1.0 - h)) / (2 * h),
-        rtol=1e-7,
-    )
-
-
 UNITS = jnp.array([1e-20, 1.0, 1e5, 1e13, 1e24])
 
 

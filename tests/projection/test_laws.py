@@ -81,15 +81,6 @@ def test_success_means_that_the_residual_is_at_roundoff(projection, y):
     assert abs(np.sum((inertia * w) ** 2) - 0.14) <= 4e-15 * 0.14
 
 
-@each_projection
-@given(y=near)
-def test_idempotent(projection, y):
-    once, _ = project(RIGID_BODY, y, projection)
-    twice, info = project(RIGID_BODY, once, projection)
-    assert successful(info)
-    np.testing.assert_allclose(twice, once, rtol=0, atol=1e-14)
-
-
 @one_projection
 @given(y=near)
 def test_permuting_the_constraints_changes_nothing(projection, y):
@@ -194,17 +185,6 @@ def test_simplified_newton_moves_along_the_gradients_at_the_candidate(y, weights
     assert abs((projected - y) @ normal) <= 1e-13 * np.linalg.norm(normal)
 
 
-@one_projection
-@given(y=near)
-def test_infinite_weights_freeze_components(projection, y):
-    frozen = eqx.tree_at(
-        lambda p: p.metric, projection, jnp.array([1.0, jnp.inf, 1.0]), is_leaf=lambda x: x is None
-    )
-    projected, info = project(ENERGY, y, frozen, VALUES["energy"])
-    assert successful(info)
-    assert projected[1] == y[1]
-
-
 @each_projection
 @given(ys=vectors((7, 3), 0.05).map(lambda d: np.ones(3) + d))
 def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
@@ -217,7 +197,7 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]))
 def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
-    """From none to all of a batch: few are gathered, many iterate together, and some then fail."""
+    """From none to all of a batch, and some of them fail."""
     rng = np.random.default_rng(seed)
     lanes = 260
     size = np.where(rng.random(lanes) < share, 10 ** rng.uniform(-3, 0.7, lanes), 1e-5)
@@ -297,9 +277,8 @@ def test_single_precision():
     assert info.residual_after <= 16 * np.finfo(np.float32).eps
 
 
-def test_mixed_precision_leaves():
+def test_leaves_of_different_precision_are_refused():
     manifold = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y[0] ** 2) + jnp.sum(y[1] ** 2))
     y = (np.array([1.0, 0.2]), np.array([0.5], np.float32))
-    projected, info = project(manifold, y, dfc.SimplifiedNewton(), jnp.array(1.3))
-    assert successful(info)
-    assert [x.dtype for x in projected] == [jnp.float64, jnp.float32]
+    with pytest.raises(TypeError, match="needs one precision"):
+        project(manifold, y, dfc.SimplifiedNewton(), jnp.array(1.3))

@@ -3,7 +3,6 @@
 import diffrax as dfx
 import equinox as eqx
 import hypothesis.strategies as st
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -112,16 +111,6 @@ def test_derivatives_in_both_modes_agree_with_finite_differences(forward):
 
     gravity = jnp.array(GRAVITY)
     dct.assert_gradients(run, gravity, rtol=1e-6, forward=forward, reverse=not forward)
-
-
-@pytest.mark.slow
-def test_a_lane_of_a_batch_is_that_lane_alone():
-    gravities = jnp.array([9.81, 13.0, 1.6])
-    # The simplest of all solvers, as it is the projection that is in question.
-    fixed = {"inner": dfx.Euler(), "dt0": 0.02, "stepsize_controller": dfx.ConstantStepSize()}
-    batch = jax.vmap(lambda g: solve(STAGED, args=g, t1=1.0, **fixed).ys[0])(gravities)
-    alone = solve(STAGED, args=1.6, t1=1.0, **fixed).ys[0]
-    np.testing.assert_allclose(batch[2], alone, rtol=1e-11)
 
 
 def test_a_stage_that_cannot_hold_is_a_failure():

@@ -74,12 +74,6 @@ def test_the_derivative_of_relaxation_is_that_of_its_solve(forward):
     dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=forward, reverse=not forward)
 
 
-def test_a_lane_of_a_batch_is_that_lane_alone():
-    sizes = jnp.array([0.5, 1.0, 0.7])
-    batch = jax.vmap(lambda s: solve(RELAXED, s * Y0).ys[-1])(sizes)
-    np.testing.assert_allclose(batch[2], solve(RELAXED, 0.7 * Y0).ys[-1], rtol=1e-13)
-
-
 class Seen(dfc.AbstractProjection):
     """Moves nothing, and checks what it sees against what the solver knows."""
 

@@ -37,8 +37,6 @@ SHARES = {
     "gradients": 0.02,
     "nan": 0.15,
     "ending": 0.001,
-    "processes": 0.0001,
-    "initial": 0.03,
 }
 # Most of the time goes into compilation, which takes half as long with XLA's older emitters.
 OLDER_EMITTERS = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"

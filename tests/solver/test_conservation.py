@@ -80,20 +80,6 @@ def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
     assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
-@pytest.mark.slow
-def test_dense_output_agrees_with_the_vector_field():
-    """The time derivative of the interpolant, which an event's root finder uses."""
-    projected = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
-    sol = solve(rigid_body, projected, OMEGA0, saveat=dfx.SaveAt(dense=True), dt0=0.005)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(None, 0))
-    def slopes(sol, t):
-        return sol.derivative(t), rigid_body(t, sol.evaluate(t), None)
-
-    np.testing.assert_allclose(*slopes(sol, jnp.array([0.013, 0.5, 0.71234])), rtol=0, atol=1e-7)
-
-
 SLOWER = ("point-vortices", "double-pendulum", "conservative-lorenz", "kepler")
 
 
@@ -115,33 +101,6 @@ def test_drift_does_not_grow_over_a_million_steps(name):
     )
     assert sol.stats["num_steps"] >= 1_000_000
     assert largest(drift_of(sol, system.manifold)) <= 4e-15
-
-
-def test_a_thousand_lanes_are_a_thousand_solves():
-    """Each lane converges on its own: some need the loop, most do not."""
-    system = dfc.systems.get("rigid-body")
-    y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 1000))
-
-    def run(y0):
-        solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
-        return solve(system.vector_field, solver, y0, t1=2.0, dt0=0.1).ys[-1]
-
-    batch = jax.jit(jax.vmap(run))(y0s)
-    alone = jax.jit(lambda y0s: jax.lax.map(run, y0s))(y0s)
-    np.testing.assert_allclose(batch, alone, rtol=0, atol=1e-12)
-
-
-def test_adaptive_steps():
-    solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
-    sol = solve(
-        rigid_body,
-        solver,
-        OMEGA0,
-        t1=20.0,
-        saveat=dfx.SaveAt(t0=True, steps=True),
-        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
-    )
-    assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
 
 
 def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
-import optimistix as optx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -92,16 +91,6 @@ def test_wrong_boxes_are_refused():
 # ---- Ignore and report ----
 
 
-@pytest.mark.slow
-def test_by_default_nothing_is_said():
-    np.testing.assert_array_equal(
-        solve(unchecked(KNOWS), saveat=STATE).ys,
-        solve(unchecked(BARE), saveat=STATE).ys,
-    )
-    with pytest.raises(ValueError, match="outside="):
-        dfc.learned.domain_statistics(solve(unchecked(KNOWS), saveat=STATE))
-
-
 @pytest.mark.parametrize("t0", [0.0, pytest.param(-3.0, marks=pytest.mark.slow)])
 def test_the_report_counts_steps_and_knows_the_first_time(t0):
     sol = solve(unchecked(KNOWS, outside=dfc.learned.Report()), t0=t0, t1=t0 + 5.0, saveat=STATE)
@@ -135,18 +124,6 @@ def test_the_report_is_seen_through_projection_and_in_a_batch():
     np.testing.assert_array_equal(domain.first_outside, [2.0, 0.0, 0.0])
     assert domain.num_outside[0] < domain.num_outside[2]
     assert jnp.all(found.residual_after < 4e-15)
-
-
-@pytest.mark.slow
-def test_a_continued_solve_goes_on_counting():
-    solver = unchecked(KNOWS, outside=dfc.learned.Report())
-    whole = solve(solver, saveat=STATE)
-    half = solve(solver, t1=2.5, saveat=STATE)
-    rest = solve(solver, half.ys[4], t0=2.5, saveat=STATE, solver_state=half.solver_state)
-    for a, b in zip(
-        *(jax.tree.leaves(dfc.learned.domain_statistics(x)) for x in (whole, rest)), strict=True
-    ):
-        np.testing.assert_array_equal(a, b)
 
 
 def limited(max_error, error=1e-3):
@@ -202,12 +179,6 @@ def test_one_lane_may_fail():
     np.testing.assert_array_equal(okay, [True, False])
 
 
-@pytest.mark.slow
-def test_through_projection_the_message_is_that_of_the_flow_map():
-    solver = dfc.ManifoldProjection(unchecked(KNOWS, outside=dfc.learned.Refuse()), RADIUS)
-    assert "starts outside the domain" in message(solve(solver, throw=False))
-
-
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
     solver = unchecked(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
@@ -243,48 +214,11 @@ def test_another_solver_takes_all_steps_outside_and_none_inside(solver):
     assert 0 < taken == dfc.learned.domain_statistics(sol).num_outside
 
 
-@pytest.mark.slow
-def test_dense_output_is_that_of_the_solver_outside():
-    nowhere = Within(BARE, dfc.learned.Box(jnp.ones(2), jnp.zeros(2)))
-    ts = jnp.linspace(0, 5, 23)
-    found = solve(unchecked(nowhere, outside=dfx.Tsit5()), saveat=dfx.SaveAt(ts=ts))
-    expected = solve(dfx.Tsit5(), saveat=dfx.SaveAt(ts=ts))
-    np.testing.assert_allclose(found.ys, expected.ys, rtol=0, atol=1e-14)
-
-
-def test_a_batch_is_its_lanes():
-    solver = unchecked(KNOWS, outside=dfx.Tsit5(), corrections=1)
-    y0s = jnp.stack([EAST, -EAST, 0.1 * EAST])
-    batch = jax.vmap(lambda y0: solve(solver, y0, saveat=STATE).ys)(y0s)
-    for y0, ys in zip(y0s, batch, strict=True):
-        np.testing.assert_allclose(solve(solver, y0, saveat=STATE).ys, ys, rtol=0, atol=1e-14)
-
-
-@pytest.mark.slow
-def test_adaptive_steps_are_accurate_where_the_flow_map_is_not():
-    """It is a hundred times worse than tolerated; a step of it is never trusted."""
-    solver = unchecked(Rotation(0.1), outside=dfx.Dopri5(), max_error=1e-5)
-    controller = dfx.PIDController(rtol=1e-7, atol=1e-7, dtmax=0.5)
-    sol = solve(solver, stepsize_controller=controller, saveat=STATE)
-    assert dfc.learned.domain_statistics(sol).fraction_outside == 1
-    end = sol.ys[int(sol.stats["num_accepted_steps"]) - 1]
-    np.testing.assert_allclose(end, [np.cos(5), -np.sin(5)], rtol=0, atol=1e-5)
-
-
 def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     solver = unchecked(KNOWS, outside=dfc.RK4())
     controller = dfx.PIDController(rtol=1e-2, atol=1e-2)
     sol = solve(solver, -EAST, stepsize_controller=controller, throw=False)
     assert sol.result == dfx.RESULTS.max_steps_reached
-
-
-@pytest.mark.slow
-def test_an_implicit_solver_outside():
-    root_finder = dfx.VeryChord(rtol=1e-10, atol=1e-10, norm=optx.max_norm)
-    implicit = dfx.Kvaerno3(root_finder=root_finder)
-    nowhere = Within(BARE, dfc.learned.Box(jnp.ones(2), jnp.zeros(2)))
-    found = solve(unchecked(nowhere, outside=implicit), t1=1.0).ys
-    np.testing.assert_allclose(found, solve(implicit, t1=1.0).ys, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -305,19 +239,6 @@ def test_derivatives(whole):
 
     point = jnp.array(0.1), jnp.array([0.9, 0.2])
     dct.assert_gradients(f, *point, rtol=1e-6, forward=False)
-
-
-@pytest.mark.slow
-def test_float32():
-    def single(tree):
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
-
-    solver = unchecked(single(KNOWS), outside=dfx.Tsit5())
-    sol = solve(solver, single(EAST), t0=np.float32(0), t1=np.float32(5), saveat=STATE)
-    assert sol.ys.dtype == jnp.float32
-    np.testing.assert_allclose(
-        sol.ys, solve(unchecked(KNOWS, outside=dfx.Tsit5()), saveat=STATE).ys, atol=1e-5
-    )
 
 
 # ---- What is refused ----

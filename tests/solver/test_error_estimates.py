@@ -131,14 +131,6 @@ def test_the_estimate_is_never_small_where_something_is_not_finite():
     assert jnp.all(jnp.isnan(estimate))
 
 
-@pytest.mark.slow
-def test_a_batch_is_its_lanes():
-    solver, y0s = unchecked(flow_map()), states(3)
-    batch = jax.vmap(lambda y0: step(solver, y0, 0.25)[1])(y0s)
-    for y0, estimate in zip(y0s, batch, strict=True):
-        np.testing.assert_allclose(step(solver, y0, 0.25)[1], estimate, rtol=1e-11)
-
-
 def test_float32():
     network, y0 = jax.tree.map(lambda x: x.astype(jnp.float32), (flow_map(), LORENZ.y0))
     _, single = step(unchecked(network), y0, jnp.float32(0.25), t0=jnp.float32(0))
@@ -241,13 +233,6 @@ def test_steps_longer_than_the_longest_are_rejected(dt0):
     assert jnp.nanmax(lengths) > 0.04
 
 
-@pytest.mark.slow
-def test_a_controller_that_knows_the_longest_step_rejects_nothing():
-    sol = solve(unchecked(SHIPPED), tol=1e-1, dtmax=SHIPPED.max_step)
-    assert sol.stats["num_rejected_steps"] == 0
-    assert sol.stats["num_accepted_steps"] <= 10
-
-
 def test_fixed_steps_that_are_too_long_fail_without_an_exception():
     sol = once(TERM, unchecked(flow_map()), 0.0, 2.0, 0.375, LORENZ.y0, throw=False)
     assert "a step is longer than the flow map was trained for" in dfx.RESULTS[sol.result]
@@ -276,14 +261,3 @@ def test_a_flow_map_that_small_steps_do_not_help_says_so():
     assert sol.result == dfx.RESULTS.dt_min_reached
     sol = solve(solver, tol=1e-6, max_steps=50, throw=False)
     assert sol.result == dfx.RESULTS.max_steps_reached
-
-
-@pytest.mark.slow
-def test_adaptive_steps_on_the_manifold():
-    solver = unchecked(SHIPPED, corrections=1)
-    projected = dfc.ManifoldProjection(solver, LORENZ.manifold, projection=dfc.Newton())
-    sol = solve(projected, tol=1e-3, saveat=dfx.SaveAt(steps=True))
-    assert sol.stats["num_rejected_steps"] > 0
-    drift = dfc.drift(sol, LORENZ.manifold)
-    finite = jnp.isfinite(sol.ts)
-    assert all(jnp.max(jnp.abs(jnp.where(finite, d, 0))) < 4e-15 for d in jax.tree.leaves(drift))

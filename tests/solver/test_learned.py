@@ -11,12 +11,11 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import LORENZ, flow_map, solution, states, unchecked
+from ..learned import LORENZ, flow_map, solution, unchecked
 
 DEEPONET, PINN = flow_map(), solution()
 FLOW, FOLLOW = unchecked(DEEPONET), dfc.PINNSolver(PINN)
 SOLVERS = pytest.mark.parametrize("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"])
-STEPS = dfx.SaveAt(t0=True, steps=True)
 
 
 def solve(solver, y0=LORENZ.y0, *, t0=0.0, t1=1.0, dt0=0.25, **kwargs):
@@ -56,19 +55,6 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@pytest.mark.slow
-@SOLVERS
-def test_more_nodes_follow_it_more_closely(solver):
-    def error(nodes):
-        follows = solver is FOLLOW
-        denser = dfc.PINNSolver(PINN, nodes=nodes) if follows else unchecked(DEEPONET, nodes=nodes)
-        sol = solve(denser, t1=0.25, saveat=dfx.SaveAt(dense=True))
-        return float(jnp.max(jnp.abs(sol.evaluate(0.07) - path(solver, 0.07))))
-
-    errors = [error(nodes) for nodes in (2, 5, 9)]
-    assert errors[0] > 10 * errors[1] > 100 * errors[2]
-
-
 @SOLVERS
 def test_the_chebyshev_series_does_not_hold_the_weights(solver):
     sol = solve(solver, saveat=dfx.SaveAt(dense=True), max_steps=4)
@@ -94,13 +80,6 @@ def test_events(solver):
     np.testing.assert_allclose(sol.ys[-1], path(solver, float(sol.ts[-1])), atol=1e-7)
 
 
-def test_a_batch_is_its_lanes():
-    y0s = states(4)
-    batch = jax.vmap(lambda y0: solve(FLOW, y0, saveat=STEPS).ys)(y0s)
-    for y0, ys in zip(y0s, batch, strict=True):
-        np.testing.assert_allclose(ys, solve(FLOW, y0, saveat=STEPS).ys, rtol=1e-13)
-
-
 def test_any_flow_map_of_the_user():
     class Rotation(eqx.Module):
         rate: jax.Array
@@ -119,26 +98,9 @@ def test_any_flow_map_of_the_user():
     np.testing.assert_allclose(sol.ys[0], np.cos([0.7, 3.0]), atol=1e-12)
 
 
-def test_a_shorter_last_step():
-    sol = solve(FLOW, t1=0.6, saveat=STEPS)
-    y = LORENZ.y0
-    for i, h in enumerate(np.diff(sol.ts[np.isfinite(sol.ts)])):
-        y = DEEPONET(y, h)
-        np.testing.assert_allclose(sol.ys[i + 1], y, rtol=0, atol=1e-14)
-
-
 def test_a_pinn_may_start_later_and_go_back():
     later = solve(FOLLOW, PINN(0.5), t0=0.5, t1=0.1, dt0=-0.1, saveat=dfx.SaveAt(ts=[0.33, 0.1]))
     np.testing.assert_allclose(later.ys, jax.vmap(PINN)(jnp.array([0.33, 0.1])), atol=1e-10)
-
-
-def test_float32():
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), DEEPONET)
-    y0 = LORENZ.y0.astype(jnp.float32)
-    ts = jnp.array([0.3, 1.0], jnp.float32)
-    sol = solve(unchecked(single), y0, saveat=dfx.SaveAt(ts=ts))
-    assert sol.ys.dtype == jnp.float32
-    np.testing.assert_allclose(sol.ys[1], path(FLOW, 1.0), rtol=1e-5)
 
 
 # ---- Derivatives ----
@@ -197,40 +159,6 @@ def test_gradients_of_a_rollout(layer, projection):
         expected = difference(along, 0.0)
         assert abs(expected) > 1e-3
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "reverse",
-    [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()],
-    ids=["checkpoints", "direct"],
-)
-def test_adjoints_agree(reverse):
-    def f(y0, adjoint):
-        return loss(DEEPONET, y0, 1.0, adjoint)
-
-    direction = jnp.array([0.3, -1.0, 0.5])
-    backward = jax.jit(jax.grad(lambda y: f(y, reverse)))(LORENZ.y0) @ direction
-    forward = jax.jit(lambda y: jax.jvp(lambda y: f(y, dfx.ForwardMode()), (y,), (direction,))[1])(
-        LORENZ.y0
-    )
-    np.testing.assert_allclose(backward, forward, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_gradient_with_respect_to_the_weights_of_a_pinn():
-    @eqx.filter_jit
-    @eqx.filter_grad
-    def through_the_solver(pinn):
-        return jnp.sum(solve(dfc.PINNSolver(pinn), saveat=STEPS, max_steps=4).ys[1:] ** 2)
-
-    @eqx.filter_grad
-    def directly(pinn):
-        return jnp.sum(jax.vmap(pinn)(jnp.arange(1, 5) / 4) ** 2)
-
-    a, b = through_the_solver(PINN).nets, directly(PINN).nets
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, atol=1e-13)
 
 
 @SOLVERS

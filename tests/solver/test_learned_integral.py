@@ -2,7 +2,6 @@
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -51,17 +50,6 @@ def test_its_value_is_kept_under_jit_and_without():
     sol = compiled(NETWORK, OMEGA0)
     assert largest(drift_of(sol, manifold)) < 1e-14 < 1e-6 < largest(drift_of(plain, manifold))
     np.testing.assert_allclose(sol.ys, states(NETWORK, OMEGA0).ys, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_one_network_of_a_batch_equals_that_network_alone():
-    networks = eqx.filter_vmap(NetworkIntegral)(jr.split(jr.key(4), 3))
-    batch = eqx.filter_jit(eqx.filter_vmap(states, in_axes=(eqx.if_array(0), None)))
-    together = batch(networks, OMEGA0).ys
-    for index in range(3):
-        weights, static = eqx.partition(networks, eqx.is_array)
-        alone = eqx.combine(jax.tree.map(lambda x: x[index], weights), static)  # noqa: B023
-        np.testing.assert_allclose(together[index], compiled(alone, OMEGA0).ys, rtol=1e-12)
 
 
 @pytest.mark.slow

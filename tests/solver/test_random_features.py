@@ -56,17 +56,6 @@ def test_a_nonlinear_solution_to_roundoff():
     np.testing.assert_allclose(sol.ys[-1], exponential_solution(1.0), rtol=0, atol=2e-14)
 
 
-@pytest.mark.slow
-def test_more_features_and_shorter_steps_are_more_accurate():
-    def error(features, dt0):
-        sol = solve(oscillator, NORTH, 12.0, solver=dfc.RandomFeatureSolver(features), dt0=dt0)
-        return np.max(np.abs(sol.ys[-1] - oscillation(12.0)))
-
-    errors = [error(features, 4.0) for features in (4, 8, 12)]
-    assert errors[0] > 100 * errors[1] > 1e4 * errors[2]
-    assert error(8, 4.0) > 5 * error(8, 3.0)
-
-
 # ---- The error estimate ----
 
 
@@ -166,28 +155,6 @@ def test_a_stiff_problem():
 
 
 # ---- Structure ----
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["henon-heiles", "toda-lattice"])
-def test_energy_is_kept_to_roundoff_where_the_state_is_not(name):
-    """As by every Galerkin method in time, for canonical equations."""
-    system = dfc.systems.get(name)
-
-    def run(features):
-        return solve(
-            system.vector_field,
-            system.y0,
-            10.0,
-            solver=dfc.RandomFeatureSolver(features),
-            dt0=0.5,
-            saveat=dfx.SaveAt(steps=True),
-            max_steps=20,
-        )
-
-    rough, fine = run(6), run(12)
-    assert np.max(np.abs(dfc.drift(rough, system.manifold)["energy"])) < 3e-14
-    assert largest(jax.tree.map(lambda a, b: a - b, rough.ys, fine.ys)) > 1e-10
 
 
 def test_a_step_decays_where_the_solution_does():

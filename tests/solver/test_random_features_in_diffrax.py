@@ -155,34 +155,11 @@ def test_second_derivatives_of_a_step():
     np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(final)))(0.0), expected, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_backsolve_adjoint():
-    """It solves the adjoint equations with the same solver."""
-
-    def final(h, adjoint):
-        sol = solve(exponential, EXPONENTIAL0 + h * DIRECTION, 1.0, dt0=0.25, adjoint=adjoint)
-        return jnp.sum(jnp.sin(sol.ys))
-
-    expected = jax.grad(final)(0.0, dfx.RecursiveCheckpointAdjoint())
-    np.testing.assert_allclose(jax.grad(final)(0.0, dfx.BacksolveAdjoint()), expected, rtol=1e-9)
-
-
 def test_gradient_with_respect_to_what_the_vector_field_closes_over():
     def final(rate):
         return solve(lambda t, y, args: rate * y, jnp.array(1.0), 1.0, dt0=0.5).ys[-1]
 
     np.testing.assert_allclose(jax.jit(jax.grad(final))(0.5), np.exp(0.5), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_gradient_of_a_solve_with_rejected_steps_is_finite():
-    def final(rate):
-        sol = solve(lambda t, y, args: rate * y**2, jnp.array(1.0), 0.9, dt0=0.9, tol=1e-8)
-        return sol.ys[-1], sol.stats["num_rejected_steps"]
-
-    slope, rejected = jax.jit(jax.grad(final, has_aux=True))(1.0)
-    assert rejected > 0
-    np.testing.assert_allclose(slope, 0.9 / 0.1**2, rtol=1e-5)  # of 1 / (1 - 0.9 rate)
 
 
 # ---- Failure ----

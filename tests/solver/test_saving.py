@@ -150,18 +150,6 @@ def test_a_steady_state_by_the_implicit_adjoint():
     np.testing.assert_allclose(end(args), args / 3, rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_vmap_of_grad():
-    @jax.jit
-    @jax.grad
-    def gradient(y0):
-        return jnp.sum(solve(rigid_body, SOLVER, y0, t1=0.3).ys ** 3)
-
-    y0s = jnp.stack([OMEGA0, 0.5 * OMEGA0 + jnp.array([0.1, 0.0, 0.0])])
-    one_by_one = jnp.stack([gradient(y0) for y0 in y0s])
-    np.testing.assert_allclose(jax.vmap(gradient)(y0s), one_by_one, rtol=1e-12)
-
-
 def test_an_event_in_a_backward_solve_lands_on_the_manifold():
     sol = solve(
         rigid_body,

@@ -110,14 +110,6 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Fourth(), corrections=1, sweep=dfc.learned.NewtonSweep()).order(TERM) == 10
 
 
-@pytest.mark.slow
-def test_few_nodes_limit_what_sweeps_reach():
-    """With 4 nodes the collocation itself is of fourth order."""
-    solver = unchecked(Still(), nodes=4, corrections=9)
-    assert solver.order(DRIVEN) == 4
-    dct.assert_order(solver, DRIVEN, DRIVEN0, t1=1.6, dt0=0.4, args=2.0)
-
-
 def test_both_sweeps_solve_the_same_equations():
     """Whatever the flow map."""
 
@@ -218,25 +210,6 @@ def test_derivatives(sweep, whole):
     weights = jnp.array([0.3, -1.0, 0.5])
     point = weights, LORENZ.y0, jnp.array(0.9)
     dct.assert_gradients(f, *point, rtol=1e-6, forward=not whole)
-
-
-@pytest.mark.parametrize("sweep", ["newton", pytest.param("picard", marks=pytest.mark.slow)])
-def test_a_batch_is_its_lanes(sweep):
-    solver = unchecked(SHIPPED, corrections=2, sweep=SWEEPS[sweep])
-    y0s = states(3)
-    batch = jax.vmap(lambda y0: solve(solver, y0).ys[-1])(y0s)
-    for y0, y1 in zip(y0s, batch, strict=True):
-        np.testing.assert_allclose(solve(solver, y0).ys[-1], y1, rtol=1e-13)
-
-
-@pytest.mark.parametrize("sweep", ["newton", pytest.param("picard", marks=pytest.mark.slow)])
-def test_float32(sweep, exact):
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), (SHIPPED, *exact))
-    network, y0s, y1s = single
-    solver = unchecked(network, corrections=6 if sweep == "picard" else 2, sweep=SWEEPS[sweep])
-    ys, error = jax.vmap(lambda y0: step(solver, y0, jnp.float32(0.25), t0=jnp.float32(0)))(y0s)
-    assert ys.dtype == error.dtype == jnp.float32
-    np.testing.assert_allclose(ys, y1s, rtol=0, atol=2e-6)
 
 
 def test_on_the_manifold():

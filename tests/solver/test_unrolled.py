@@ -68,18 +68,6 @@ def test_projected_and_batched():
     assert max(float(jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(drift)) < 4e-15
 
 
-@pytest.mark.slow
-def test_gradients_agree():
-    def end(solver, y0):
-        return solve(solver, y0, saveat=dfx.SaveAt(t1=True)).ys[0][0, 0]
-
-    ours, theirs = (
-        jax.grad(lambda y0, s=solver: end(s, y0))(KEPLER0)
-        for solver in (dfc.Unrolled(dfx.Bosh3()), dfx.Bosh3())
-    )
-    close(ours, theirs, 1e-11)
-
-
 @pytest.mark.parametrize("solver", [dfx.Euler(), dfx.Kvaerno5(), "Tsit5", dfc.RK4()])
 def test_other_solvers_are_refused(solver):
     with pytest.raises(TypeError, match="explicit Runge-Kutta"):

@@ -13,8 +13,6 @@ import scipy.linalg
 import diffrax_conserve as dfc
 from diffrax_conserve.systems import Mechanism
 
-from ..problems import drift_of, largest
-
 STIFF = {name: dfc.systems.get(name) for name in dfc.systems.names(stiff=True)}
 both = pytest.mark.parametrize("system", STIFF.values(), ids=STIFF)
 
@@ -202,28 +200,3 @@ def test_a_mechanism_whose_balances_have_signs_has_none():
     assert list(mechanism.balances) == ["-A + B"] or list(mechanism.balances) == ["- A + B"]
     with pytest.raises(ValueError, match="SimplifiedNewton"):
         mechanism.positive_projection()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "step", "t1", "median", "largest_error"),
-    [("pollu", 2.0, 61.0, 1e-3, 2e-2), ("robertson", 1.0, 41.0, 3e-5, 3e-4)],
-)
-def test_the_flow_maps_keep_signs_and_balances(name, step, t1, median, largest_error):
-    system = STIFF[name]
-    solver = dfc.ManifoldProjection(
-        dfc.DeepONetSolver(dfc.load_pretrained(name)),
-        system.manifold,
-        projection=system.mechanism.positive_projection(),
-    )
-    ts = np.arange(step, t1, step)
-    exact = np.asarray(system.reference(ts))
-    sol = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(system.vector_field), solver, ts[0], ts[-1], step, exact[0],
-        saveat=dfx.SaveAt(ts=ts),
-    )  # fmt: skip
-    error = np.abs(sol.ys / exact - 1)[exact > 1e-10]
-    assert np.median(error) < median
-    assert np.max(error) < largest_error
-    assert np.min(sol.ys) > 0
-    assert largest(drift_of(sol, system.manifold)) < 4e-15

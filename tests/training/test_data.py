@@ -65,17 +65,6 @@ def test_a_flow_map_learns_from_trajectories(field):
     assert log.error < 1e-3
 
 
-@pytest.mark.slow
-def test_the_same_key_gives_the_same_result():
-    before = network()
-    first, second = (
-        dfc.fit(before, data=(TS, EXACT), key=KEY, recipe=recipe(before, epochs=20))[0]
-        for _ in range(2)
-    )
-    assert eqx.tree_equal(first, second)
-    assert not eqx.tree_equal(first, before)
-
-
 def test_pairs_are_one_step_apart():
     """Of all lengths up to the longest, and from the same trajectory."""
     data = as_data((TS, EXACT), network())
@@ -174,38 +163,3 @@ def test_a_measured_rate_is_that_of_the_coordinates(name):
     np.testing.assert_allclose(t.inverse(z), states[0], rtol=1e-12)
     assert bool(flow_map.domain.contains(states[0]))
     assert not bool(flow_map.domain.contains(1e6 * states[0] + 1e6))
-
-
-@pytest.mark.slow
-def test_species_of_all_sizes_are_learned():
-    """A chain of decays over eight orders of magnitude, from data, in Box-Cox coordinates."""
-    mechanism = dfc.systems.Mechanism(["A -> B", "B -> C"], [1.0, 30.0])
-    y0s = jnp.exp(jr.normal(jr.key(0), (60, 3))) * jnp.array([1.0, 1e-8, 1e-4])
-    data = dfc.learned.trajectories(
-        mechanism.vector_field,
-        y0s,
-        jnp.linspace(0, 2, 21),
-        rtol=1e-8,
-        atol=1e-18,
-        solver=dfx.Kvaerno5(),
-    )
-    boxcox = dfc.learned.BoxCox(0.1)
-    inner = dfc.DeepONet(
-        boxcox(data[1].reshape(-1, 3)), 0.2, width=16, depth=1,
-        core=dfc.learned.Concatenated, key=jr.key(1),
-    )  # fmt: skip
-    before = dfc.learned.Transformed(inner, boxcox)
-    after, log = dfc.fit(before, data=data, key=KEY, recipe=recipe(before))
-    y0, y1 = data[1][:, 5], data[1][:, 7]
-    relative = jnp.abs(jax.vmap(after, (0, None))(y0, 0.2) / y1 - 1)
-    assert float(jnp.median(relative)) < 5e-3
-    assert log.best < log.criteria[0] / 100
-    solver = dfc.DeepONetSolver(after, check_field=False)
-    projection = mechanism.positive_projection()
-    projected = dfc.ManifoldProjection(solver, mechanism.manifold, projection=projection)
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(mechanism.vector_field), projected, 0.0, 1.0, 0.2, y0[0],
-        saveat=dfx.SaveAt(steps=True), max_steps=5,
-    )  # fmt: skip
-    assert float(jnp.min(sol.ys)) >= 0
-    np.testing.assert_allclose(jnp.sum(sol.ys, axis=1), jnp.sum(y0[0]), rtol=4e-15)

@@ -15,7 +15,6 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator
-from ..problems import Counted
 
 # Most of these trainings are too short, and say so.
 pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
@@ -77,26 +76,6 @@ def test_a_pinn_learns_a_solution(layer):
     assert defect(after) < defect(before) / 100
     assert error(after) < 0.05 < error(before)
     assert log.best < log.criteria[0] / 100
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("layer", [None, dfc.learned.ConservativeLayer(LORENZ.manifold, steps=2)])
-def test_a_deeponet_learns_a_flow_map(layer):
-    before = flow_map(layer=layer)
-    after, log = train(before, LORENZ.vector_field, sample=LORENZ.sample, epochs=150, points=200)
-    y0s = jax.vmap(LORENZ.sample)(jr.split(jr.key(9), 10))  # not those of the training
-    exact = jax.jit(jax.vmap(lambda y0: LORENZ.reference(jnp.array([0.25]), y0)[0]))(y0s)
-
-    def largest(network):
-        return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network, (0, None)))(y0s, 0.25) - exact)))
-
-    assert largest(after) < largest(before) / 2
-    assert log.best < log.criteria[0] / 3
-    # Only the weights were trained.
-    assert eqx.tree_equal(before.layer, after.layer)
-    assert eqx.tree_equal((before.shift, before.scale), (after.shift, after.scale))
-    assert not eqx.tree_equal(before.core.branch, after.core.branch)
-    assert not eqx.tree_equal(before.core.trunk, after.core.trunk)
 
 
 def test_any_flow_map_of_the_user_learns():
@@ -203,16 +182,6 @@ def test_progress(capsys):
 # ---- The schedule ----
 
 
-@pytest.mark.slow
-def test_the_whole_schedule_compiles_once():
-    def count(epochs):
-        field = Counted(oscillator)
-        train(circle(LAYER), field, epochs=epochs, iterations=dfc.learned.staged_iterations)
-        return field.calls
-
-    assert count(90) == count(3) > 0
-
-
 def test_the_schedules():
     epochs, steps = 400, 3
     es = jnp.arange(epochs)
@@ -225,20 +194,6 @@ def test_the_schedules():
         dfc.learned.every_iteration(es, epochs, steps), np.full(epochs, 3)
     )
     np.testing.assert_array_equal(dfc.learned.constant_weight(es, epochs, steps), np.ones(epochs))
-
-
-@pytest.mark.slow
-def test_the_trained_loss_follows_the_schedule():
-    """At the start of the staged schedule the layer does nothing, at its end everything."""
-    still = dict(optimiser=optax.sgd(0.0), epochs=6, times=dfc.learned.grid_times)
-    staged = dict(iterations=dfc.learned.staged_iterations, weight=dfc.learned.ramped_weight)
-    _, plain = train(circle(), **still)
-    _, log = train(circle(LAYER), **still, **staged)
-    _, full = train(circle(LAYER), **still, weight=dfc.learned.constant_weight)
-    np.testing.assert_allclose(log.losses[0], plain.losses[0], rtol=1e-12)
-    np.testing.assert_allclose(full.losses[0], log.criteria[0], rtol=1e-12)
-    # The weight makes the loss continuous where the number of iterations increases.
-    assert log.losses[0] == log.losses[1] == log.losses[2] != log.losses[3]
 
 
 # ---- The loss ----

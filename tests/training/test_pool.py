@@ -20,8 +20,7 @@ from diffrax_conserve.learned._networks.flow_map import as_flow_map
 from diffrax_conserve.learned._training.objective import _anew, start
 from diffrax_conserve.learned._training.pool import moved
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator, states
-from ..problems import Counted
+from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator
 
 KEY = jr.key(5)
 COUNT = 400
@@ -210,16 +209,6 @@ def test_the_same_key_gives_the_same_result():
     assert not eqx.tree_equal(a, c)
 
 
-@pytest.mark.slow
-def test_it_compiles_once():
-    def count(epochs):
-        field = Counted(oscillator)
-        train(vector_field=field, epochs=epochs)
-        return field.calls
-
-    assert count(45) == count(3) > 0
-
-
 def small_network(**options):
     # Normalised by states from all round the circle, as far as it will go.
     ring = jnp.concatenate([Y0S, -Y0S, Y0S @ QUARTER, -Y0S @ QUARTER])
@@ -276,73 +265,6 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
     before, after = next_states(wild)
     assert not np.any(np.asarray(before == after))
     assert float(jnp.max(radii(after))) <= 2
-
-
-@pytest.mark.slow
-def test_a_pool_goes_where_the_whole_network_leads():
-    """Its conservative layer included: without a projection the states stay on the circle."""
-    layer = dfc.learned.ConservativeLayer(RADIUS, steps=4)
-    trained, log = fitted(small_network(layer=layer), dfc.learned.Pool(near_east), epochs=60)
-    assert log.best < 0.01 * log.criteria[0]
-    corners = jnp.stack([trained.domain.lower, trained.domain.upper])
-    assert float(jnp.max(jnp.abs(corners))) < 2.001
-
-
-# ---- Frames ----
-
-VORTICES = dfc.systems.PointVortices()
-APART = states(100, VORTICES)
-
-
-@functools.cache
-def framed():
-    options = dict(core=dfc.learned.Concatenated, frame=VORTICES.frame, key=KEY) | SMALL
-    return dfc.DeepONet(APART, 0.125, taylor=dfc.learned.Taylor(VORTICES.vector_field), **options)
-
-
-@pytest.mark.slow
-def test_a_domain_of_shapes_is_extended_by_shapes():
-    domain, others = framed().domain, states(100, VORTICES, seed=8)
-    extended = eqx.filter_jit(lambda domain: domain.extended(others))(domain)
-
-    @jax.jit
-    @jax.vmap
-    def known(y):
-        slower = domain.frame(y).clock <= domain.fastest
-        return domain.contains(y), extended.contains(y), slower
-
-    before, after, slower = known(others)
-    assert not bool(jnp.all(before | ~slower))
-    np.testing.assert_array_equal(after, slower)
-    np.testing.assert_array_equal(known(APART)[1], True)
-    assert extended.fastest == domain.fastest
-
-
-@pytest.mark.slow
-def test_vortices_that_turn_too_fast_start_again():
-    """For the network time would be longer than what it calls one."""
-    network = framed()
-    pool = dfc.learned.Pool(VORTICES.sample, mean_steps=1e9)
-    ys = move(pool, network, 0.3 * APART, KEY, fresh=APART)
-    again = np.all(np.asarray(ys == APART), axis=(1, 2))
-    assert 0 < again.mean() < 1
-    clocks = jax.jit(jax.vmap(lambda y: network.frame(y).clock))(ys)
-    assert float(jnp.max(clocks)) <= float(network.domain.fastest)
-
-
-@pytest.mark.slow
-def test_a_pool_of_vortices():
-    """Their network computes the same as with the domain that it had."""
-    network = framed()
-    pool = dfc.learned.Pool(
-        VORTICES.sample, manifold=VORTICES.manifold, keep=lambda y: jnp.all(y < 10)
-    )
-    trained, log = fitted(network, pool, epochs=60, field=VORTICES.vector_field)
-    assert log.best < 0.5 * log.criteria[0]
-    assert trained.domain.fastest == network.domain.fastest
-    assert bool(jnp.all(trained.domain.box.upper[0] >= network.domain.box.upper[0]))
-    former = eqx.tree_at(lambda m: m.domain, trained, network.domain)
-    assert bool(jnp.all(trained(APART[0], 0.1) == former(APART[0], 0.1)))
 
 
 # ---- What is refused ----

@@ -12,7 +12,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-import optax
 import pytest
 
 import diffrax_conserve as dfc
@@ -79,20 +78,6 @@ def test_an_interrupted_training_goes_on(make):
     same((model, log), whole)
     if isinstance(model, dfc.PINN):
         assert model.windows > network.windows
-
-
-@pytest.mark.slow
-def test_twice_the_epochs_in_two_halves():
-    """For an optimiser that does not know how many epochs there will be."""
-    network, options = small_flow_map()
-    adam = dataclasses.replace(options.pop("recipe"), optimiser=optax.adam(1e-2))
-    half, whole = (dataclasses.replace(adam, epochs=epochs) for epochs in (20, 40))
-    expected = dfc.fit(network, **options, recipe=whole)
-    model, log = dfc.fit(network, **options, recipe=half)
-    with pytest.raises(ValueError, match="has made all its 20 epochs"):
-        dfc.fit(network, **options, recipe=half, state=log.state)
-    # The trained network will do as well as the first one.
-    same(dfc.fit(model, **options, recipe=whole, state=log.state), expected)
 
 
 def test_it_ends_at_a_target_and_after_a_time():

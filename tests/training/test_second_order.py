@@ -135,23 +135,6 @@ def test_windows_follow_each_other():
     np.testing.assert_array_equal(trained.y0, EAST)
 
 
-@pytest.mark.slow
-def test_a_window_knows_what_time_it_is():
-    """y' = 2 t, whose right-hand side depends on time alone."""
-    pinn = dfc.PINN(jnp.array([1.0]), 1.0, 3.0, windows=2, width=8, depth=1, key=KEY)
-    pinn, _ = dfc.fit(pinn, lambda t, y, args: jnp.full_like(y, 2 * t), key=KEY)
-    ts = jnp.linspace(1, 3, 9)
-    np.testing.assert_allclose(jax.vmap(pinn)(ts)[:, 0], ts**2, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_conservative_window_is_trained_through_its_layer():
-    pinn = turns(3.0, layer=dfc.learned.ConservativeLayer(RADIUS, steps=3))
-    pinn, _ = dfc.fit(pinn, oscillator, key=KEY, recipe=dfc.learned.second_order(pinn, epochs=40))
-    before = error(turns(3.0, layer=pinn.layer))
-    assert error(pinn) < 1e-4 * before
-
-
 def flow_map(core=dfc.learned.Concatenated, order=1):
     states = jax.vmap(LORENZ.sample)(jr.split(jr.key(7), 200))
     taylor = dfc.learned.Taylor(LORENZ.vector_field, order)
@@ -225,20 +208,6 @@ def test_reachable_states_are_on_the_solutions():
     assert float(jnp.max(jnp.abs(states - y0s))) > 1
     kept = dfc.learned.reachable_states(oscillator, y0s, 10.0, key=KEY, keep=lambda y: y[0] > 0)
     np.testing.assert_array_equal(kept, states[states[:, 0] > 0])
-
-
-@pytest.mark.slow
-def test_reachable_states_by_a_flow_map_of_ones_own():
-    states, network = flow_map(order=2)
-    solver = dfc.ManifoldProjection(
-        dfc.DeepONetSolver(network), LORENZ.manifold, projection=dfc.Newton()
-    )
-    found = dfc.learned.reachable_states(
-        LORENZ.vector_field, states[:20], 2.0, key=KEY, solver=solver, dt0=0.01
-    )
-    exact = dfc.learned.reachable_states(LORENZ.vector_field, states[:20], 2.0, key=KEY)
-    # Untrained, it is a method of order 2.
-    np.testing.assert_allclose(found, exact, atol=0.05)
 
 
 @pytest.mark.slow

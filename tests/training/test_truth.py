@@ -11,7 +11,6 @@ import optax
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._training import windows as windows_module
 
 from ..learned import EAST, LORENZ, flow_map, oscillator
 
@@ -104,19 +103,6 @@ def test_a_window_that_failed_is_trained_until_it_is_right():
     assert trained.windows == log.errors.size > 1
     np.testing.assert_allclose(log.error, true_error(trained), rtol=0.05, atol=1e-12)
     assert log.error < 1e-5
-
-
-@pytest.mark.slow
-def test_windows_are_trained_until_the_whole_solution_is_right(monkeypatch):
-    """Each window is good enough by itself, as if errors did not add up."""
-    monkeypatch.setattr(windows_module, "_GROWTH", 1e-4)
-    network = pinn(windows=3)
-    chosen = recipe(network, 40, check_every=1)
-    trained, log = dfc.fit(network, oscillator, key=KEY, recipe=chosen, target=1e-8)
-    assert log.ended == "target"
-    assert 1 <= log.state.windows.passes <= chosen.retries
-    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.05)
-    assert log.error < 1e-8
 
 
 def test_a_cut_network_is_saved_with_its_windows(tmp_path):

@@ -1,0 +1,103 @@
+"""Nobody who is right is refused: near rest, in other units, from an equilibrium."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-7)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, None, None, 0, 0, None))
+def okay(field, fn, solver, controller, y0, args, times):
+    t1, dt0 = times
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        dfc.ManifoldProjection(solver, dfc.FirstIntegral(fn)),
+        jnp.zeros_like(t1),
+        t1,
+        dt0,
+        y0,
+        args,
+        stepsize_controller=controller,
+        max_steps=4096,
+        throw=False,
+    )
+    return dfx.is_okay(sol.result)
+
+
+def pendulum(t, y, args):
+    return jnp.stack([y[1], -jnp.sin(y[0])])
+
+
+def pendulum_energy(t, y, args):
+    """From zero: the terms near one cancel, and its gradient does not show them."""
+    return y[1] ** 2 / 2 + 1 - jnp.cos(y[0])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("fixed", [True, False], ids=["fixed", "adaptive"])
+def test_a_pendulum_near_rest_is_solved(dtype, fixed):
+    rng = np.random.default_rng(0)
+    amplitude = 10 ** rng.uniform(-4, np.log10(0.3), 200)
+    angle = rng.uniform(0, 2 * np.pi, 200)
+    y0 = (amplitude * np.stack([np.cos(angle), np.sin(angle)])).T.astype(dtype)
+    solver, controller = (dfc.RK4(), dfx.ConstantStepSize()) if fixed else (dfx.Tsit5(), ADAPTIVE)
+    times = jnp.asarray([10.0, 0.1], dtype)
+    done = okay(pendulum, pendulum_energy, solver, controller, y0, jnp.zeros(200, dtype), times)
+    assert np.all(done), (np.mean(done), amplitude[~np.asarray(done)][:5])
+
+
+# Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
+# mass in electron masses.
+MOLECULES = {
+    "H2": (0.1744, 1.028, 1.401, 918.1),
+    "N2": (0.3640, 1.424, 2.074, 12761.0),
+    "HCl": (0.1697, 0.990, 2.409, 1784.7),
+    "CO": (0.4125, 1.219, 2.132, 12498.0),
+}
+# Hartree in joules, Bohr radius in metres, electron mass in kilograms, room temperature in hartree.
+JOULE, METRE, KILOGRAM, ROOM = 4.3597e-18, 5.2918e-11, 9.1094e-31, 9.5e-4
+
+
+def stretched(y, args):
+    _, width, length, _ = args
+    return jnp.exp(-width * (y[0] - length))
+
+
+def morse(t, y, args):
+    depth, width, _, mass = args
+    e = stretched(y, args)
+    return jnp.stack([y[1] / mass, -2 * depth * width * e * (1 - e)])
+
+
+def morse_energy(t, y, args):
+    return y[1] ** 2 / (2 * args[3]) + args[0] * (1 - stretched(y, args)) ** 2
+
+
+def bound_morse_energy(t, y, args):
+    """The same energy from the dissociated molecule."""
+    return morse_energy(t, y, args) - args[0]
+
+
+@pytest.mark.parametrize("energy", [morse_energy, bound_morse_energy])
+@pytest.mark.parametrize(
+    ("units", "dtype"), [("SI", np.float64), ("atomic", np.float64), ("atomic", np.float32)]
+)
+def test_a_molecule_from_its_equilibrium_length_is_not_refused(energy, units, dtype):
+    joule, metre, kilogram = (JOULE, METRE, KILOGRAM) if units == "SI" else (1.0, 1.0, 1.0)
+    rng = np.random.default_rng(1)
+    for depth, width, length, mass in MOLECULES.values():
+        args = depth * joule, width / metre, length * metre, mass * kilogram
+        # A thermal momentum, which may be small.
+        momentum = np.sqrt(args[3] * ROOM * joule) * rng.normal(size=100)
+        y0 = np.stack([np.full(100, args[2]), momentum], axis=1).astype(dtype)
+        period = 2 * np.pi / (args[1] * np.sqrt(2 * args[0] / args[3]))
+        times = jnp.asarray([3 * period, period / 40], dtype)
+        lanes = tuple(jnp.full(100, x, dtype) for x in args)
+        done = okay(morse, energy, dfc.RK4(), dfx.ConstantStepSize(), y0, lanes, times)
+        assert np.all(done), np.asarray(y0)[~np.asarray(done)][:5]
