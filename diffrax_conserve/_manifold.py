@@ -255,6 +255,9 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
     )
 
 
+_CONSTRAINTS_MAX = 2048
+
+
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless the functions of the manifold return real floating-point arrays, in total at
     least one scalar and at most as many as the state has unknowns."""
@@ -271,6 +274,11 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         raise ValueError(
             f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
             "unknowns: no state can satisfy them in general. Remove dependent ones."
+        )
+    if count > _CONSTRAINTS_MAX:
+        raise ValueError(
+            f"`manifold` has {count} scalar constraints, but a projection solves with a full matrix "
+            f"of at most {_CONSTRAINTS_MAX}. Project parts of the state by solves of their own."
         )
 
 

@@ -255,7 +255,7 @@ class _Passing(eqx.Module):
         return self.solver.step(terms, t0, t1, y0, args, state, self.made_jump)
 
 
-@noticed_by("tests/laws/test_lanes.py")
+@noticed_by("tests/laws/test_lanes.py", "-k", "no_gradient")
 def keep_the_last_stage_of_the_candidate(package):
     def mutate(step):
         def mutated(self, *rest):

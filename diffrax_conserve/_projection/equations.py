@@ -26,7 +26,7 @@ from .._tree import ravel, tree_stop_gradient, unflatten, unravel
 ROUNDOFF_MULTIPLE = 16
 # The measured roundoff of a function counts this many times, because it is a sample: of so many
 # displacements, of each of so many lengths.
-_SAMPLED, _SAMPLES, _LENGTHS = 8, 4, 8
+_SAMPLED, _SAMPLES, _LENGTHS = 16, 16, 8
 
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
@@ -174,11 +174,13 @@ def measured_scale(fn: Part, y: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """What the measured roundoff at `y` adds to the scale there."""
+    """What the measured roundoff at `y` adds to the scale there: nothing where it is within a
+    quarter of the tolerance anyway."""
     equations, y = tree_stop_gradient((equations, y))
     value, jacobian = equations.linearise(y)
     shown = jnp.abs(value) + equations.scale(jacobian, y)
-    return jnp.maximum(measured_scale(equations.residual, y) - shown, 0)
+    measured = measured_scale(equations.residual, y)
+    return jnp.where(measured > ROUNDOFF_MULTIPLE / 4 * shown, measured, 0)
 
 
 @jax.custom_batching.custom_vmap

@@ -57,7 +57,7 @@ def in_scalars(
         given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
         return _WriteOut(limit)(closed, shapes, given)
 
-    flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(jnp.size(x))]
+    flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(x.size)]
     try:
         evaluate = jex.jaxpr_as_fun(jax.make_jaxpr(write_out)(*flat))
     except _NotWrittenOut:

@@ -55,7 +55,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     The projected method has the order of the wrapped one. A wrapped solver that keeps its last
     stage for the next step (Tsit5, Dopri5, Bosh3: "first same as last") evaluates it again at the
     projected state. diffrax otherwise evaluates it for all lanes of a batch while any lane is in
-    its first step, so that lanes would depend on each other.
+    its first step, so that lanes would depend on each other, as they do with implicit methods:
+    these keep the stage.
 
     A solve fails at its first step if the initial state violates a `Constraint` by more than the
     square root of roundoff, relative to the size of its terms (find a consistent state by
@@ -211,10 +212,13 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         solver_state: State,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
-        del made_jump  # always: the inner state does not know of the projection
+        # A last stage that is kept belongs to the candidate. Only implicit methods need it, because
+        # a stage at the projected state amplifies the error of their root finder.
+        implicit = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver)
+        made_jump = made_jump if implicit else True
         state = solver_state
         candidate, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, state.inner, True
+            terms, t0, t1, y0, args, state.inner, made_jump
         )
         start = Target(
             self.projection,
@@ -247,7 +251,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(failed)
         )
-        return y1, error, dense_info, state.next(inner, target.gained, info), result
+        return y1, error, dense_info, state.next(inner, target.gained, info, due), result
 
     def _is_limited(self, terms: PyTree[dfx.AbstractTerm]) -> bool:
         """Whether `max_correction` applies: not to constraints, whose correction may do all the

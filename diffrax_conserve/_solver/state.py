@@ -36,10 +36,14 @@ class State(eqx.Module):
     is_first: Bool[Array, ""] | None
     statistics: ProjectionStatistics
 
-    def next(self, inner: Any, gained: Array | None, info: ProjectionInfo) -> "State":
+    def next(
+        self, inner: Any, gained: Array | None, info: ProjectionInfo, due: Array | None
+    ) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
-        is_first = None if self.is_first is None else self.is_first & (info.num_steps == 0)
-        statistics = self.statistics.add(info)
+        is_first = self.is_first
+        if is_first is not None:
+            is_first = jnp.zeros_like(is_first) if due is None else is_first & ~due
+        statistics = self.statistics.add(info, due)
         return State(inner, self.values, self.sampled, gained, num_steps, is_first, statistics)
 
 

@@ -55,10 +55,9 @@ class ProjectionStatistics(eqx.Module):
             del rows["worst"]
         return printed("projections of the accepted steps", rows)
 
-    def add(self, info: ProjectionInfo) -> "ProjectionStatistics":
-        projected = info.num_steps > 0
+    def add(self, info: ProjectionInfo, due: Array | None) -> "ProjectionStatistics":
         return ProjectionStatistics(
-            self.num_projections + projected.astype(int),
+            self.num_projections + (1 if due is None else due.astype(int)),
             self.num_iterations + info.num_steps,
             jnp.maximum(self.max_iterations, info.num_steps),
             jnp.maximum(self.residual_before, info.residual_before),

@@ -60,6 +60,7 @@ def verdict(
     if max_correction is not None:
         # A correction this small is allowed however short the step.
         share = jnp.asarray(max_correction, size.dtype) * every
+        share = jnp.minimum(share, float(jnp.finfo(size.dtype).max))  # infinity times zero is NaN
         too_far = ok & ~(correction <= jnp.max(share * moved + 8 * eps**0.5 * size))
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
         cause = jnp.where(too_far, _TOO_FAR, cause)
