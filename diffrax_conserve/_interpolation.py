@@ -79,7 +79,15 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         step = target.step(self.t0, self.t1, self.ends[0], self.error, lambda: self.inner)
-        y, _ = _projected(target, t0, candidate, step, end)
+
+        def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Bool[Array, ""]]:
+            y, info = target.project(t, candidate, step)
+            return y, info.ok
+
+        # Arrays over which the functions of the manifold close become leaves.
+        t0 = jnp.asarray(t0)
+        project = eqx.filter_closure_convert(project, t0, candidate, step)
+        y, _ = _projected(project, t0, candidate, step, end)
         if self.due is None:
             return y
         return jtu.tree_map(lambda a, b: jnp.where(self.due, a, b), y, candidate)
@@ -87,7 +95,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 @eqx.filter_custom_jvp
 def _projected(
-    target: Target, t: RealScalarLike, candidate: Y, step: Step | None, end: Y
+    project: Callable[..., Any], t: Array, candidate: Y, step: Step | None, end: Y
 ) -> tuple[Y, Bool[Array, ""]]:
     """The first candidate that can be projected, on the way from the interpolant to `end`; and
     whether that was the interpolant."""
@@ -103,11 +111,11 @@ def _projected(
             end,
             between,
         )
-        y, info = target.project(t, start, step)
-        y = jtu.tree_map(lambda x: jnp.where(info.ok, x, jnp.asarray(np.nan, x.dtype)), y)
+        y, ok = project(t, start, step)
+        y = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.asarray(np.nan, x.dtype)), y)
         y = jtu.tree_map(lambda a, b: jnp.where(going, a, b), y, last)
-        more = going & ~info.ok & (index + 1 < _CANDIDATES)
-        return index + going, more, y
+        more = going & ~ok & (index + 1 < _CANDIDATES)
+        return index + going.astype(int), more, y
 
     carry = jnp.asarray(0), jnp.asarray(True), candidate
     index, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, carry)
@@ -119,7 +127,7 @@ def _projected_jvp(primals: Any, tangents: Any) -> Any:
     """Only the projection of the interpolant itself has a derivative."""
     y, direct = _projected(*primals)
     given = primals[:-1], tangents[:-1]
-    _, t_y = eqx.filter_jvp(lambda target, *args: target.project(*args)[0], *given)
+    _, t_y = eqx.filter_jvp(lambda project, *args: project(*args)[0], *given)
     t_y = jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, y, t_y)
     return (y, direct), (tree_scale(jnp.where(direct, 1, jnp.nan), t_y), None)
 

@@ -277,8 +277,9 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         )
     if count > _CONSTRAINTS_MAX:
         raise ValueError(
-            f"`manifold` has {count} scalar constraints, but a projection solves with a full matrix "
-            f"of at most {_CONSTRAINTS_MAX}. Project parts of the state by solves of their own."
+            f"`manifold` has {count} scalar constraints, but a projection solves with a full "
+            f"matrix of at most {_CONSTRAINTS_MAX} rows. Project parts of the state by solves of "
+            "their own."
         )
 
 

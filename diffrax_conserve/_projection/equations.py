@@ -67,20 +67,24 @@ class Equations(eqx.Module):
 
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
         y = y if self.clip is None else self.clip(y)
-        return self.magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1)
+        return self.magnitude + jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
 
     def misfit(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> Float[Array, ""]:
         """The largest residual in units of its tolerance; a state is on the manifold if this is at
-        most one. It is NaN where a residual within the tolerance would underflow."""
+        most one. It is zero where no iteration could reduce the residual but by chance: within a
+        quarter of the tolerance, or within what is measured roundoff. It is NaN where a residual
+        within the tolerance would underflow."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
-        limit = jnp.asarray(rtol, y.dtype) * scale
+        rtol = jnp.asarray(rtol, y.dtype)
+        limit = rtol * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        return jnp.max(jnp.where(valid, jnp.where(g == 0, 0, jnp.abs(g) / limit), jnp.nan))
+        small = jnp.abs(g) <= 0.25 * limit + 0.75 * rtol * self.sampled
+        return jnp.max(jnp.where(valid, jnp.where(small, 0, jnp.abs(g) / limit), jnp.nan))
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
@@ -89,7 +93,7 @@ class Equations(eqx.Module):
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""
-        return rows if self.weights is None else rows * self.weights
+        return rows if self.weights is None else rows * self.weights[None]
 
 
 def relative(residual: Any, scale: Any) -> Any:

@@ -19,7 +19,7 @@ def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float
     """`rows othersᵀ`."""
     if len(rows) > WRITTEN_OUT_MAX:
         return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)
-    return jnp.sum(rows[:, None, :] * others, axis=2)
+    return jnp.sum(rows[:, None, :] * others[None], axis=2)
 
 
 def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
@@ -36,9 +36,13 @@ def gram_solve(
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         unit = _unit(gram)
-        matrix = gram * unit[:, None] * unit + _added(m, dtype, damping) * jnp.eye(m, dtype=dtype)
-        working = jnp.promote_types(dtype, jnp.float32)
-        x = jnp.linalg.solve(matrix.astype(working), (b * unit).astype(working))
+        scaled = (gram * unit[:, None] * unit[None]).astype(jnp.promote_types(dtype, jnp.float32))
+        right = (b * unit).astype(scaled.dtype)
+        damped = jnp.eye(m, dtype=scaled.dtype) * jnp.asarray(damping, scaled.dtype)
+        lu = jsp.linalg.lu_factor(scaled + damped + _roundoff(m, dtype).astype(scaled.dtype))
+        x = jnp.zeros_like(right)
+        for _ in range(3):  # which removes what the roundoff adds
+            x = x + jsp.linalg.lu_solve(lu, right - (scaled + damped) @ x)
         return x.astype(dtype) * unit
     least = 4 * m * float(jnp.finfo(dtype).eps)
     if m == 2:  # with one division, because XLA compiles each into a kernel of its own
@@ -75,7 +79,7 @@ def factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Factors:
     """The factors of a symmetric matrix, for right-hand sides to be divided by `sizes`."""
     m, dtype = len(gram), gram.dtype
     unit = _unit(gram)
-    matrix = gram * unit[:, None] * unit + _added(m, dtype) * jnp.eye(m, dtype=dtype)
+    matrix = gram * unit[:, None] * unit[None] + _roundoff(m, dtype)
     matrix = matrix.astype(jnp.promote_types(dtype, jnp.float32))
     return jnp.linalg.cholesky(matrix, symmetrize_input=False), unit / sizes, unit
 
@@ -100,6 +104,6 @@ def _unit(gram: Float[Array, "m m"]) -> Float[Array, " m"]:
     return jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
 
 
-def _added(m: int, dtype: jnp.dtype, damping: Array | float = 0.0) -> Array:
+def _roundoff(m: int, dtype: jnp.dtype) -> Float[Array, "m m"]:
     """Roundoff added to a unit diagonal: dependent constraints have small multipliers then."""
-    return jnp.asarray(damping + 16 * m * float(jnp.finfo(dtype).eps), dtype)
+    return jnp.eye(m, dtype=dtype) * (16 * m**0.5 * float(jnp.finfo(dtype).eps))

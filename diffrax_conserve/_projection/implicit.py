@@ -105,7 +105,11 @@ def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, 
     the metric."""
     unit = jacobian / row_sizes(jacobian)[:, None]
     roots = 1 if equations.weights is None else jnp.sqrt(equations.weights)
-    columns = (unit * roots).astype(jnp.promote_types(unit.dtype, jnp.float32)).T
+    columns = (
+        (unit * jnp.broadcast_to(roots, unit.shape))
+        .astype(jnp.promote_types(unit.dtype, jnp.float32))
+        .T
+    )
     norms = jnp.linalg.norm(columns, axis=0)
     lengths = jnp.abs(jnp.diagonal(jnp.linalg.qr(columns, mode="r")))
     return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(unit.dtype)

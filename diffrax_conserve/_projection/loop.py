@@ -29,16 +29,12 @@ from .gram import (
 )
 from .scalars import components, in_scalars, joined
 
-# An iteration ends at this fraction of the tolerance, or at most two iterations after it.
-_SAFELY = 0.25
 # The largest state of which a batch is written out in scalars.
 _UNKNOWNS_MAX = 8
 # The bisections of a step where it must be shortened.
 _HALVINGS = 30
 # With bounds, a component that an iteration reduces to this share of itself is zero.
 _VANISHES = 1e-8
-# The iterations of a batch before the first test: enough for most steps of an integrator.
-_UNTESTED = 2
 
 
 class _Kept(NamedTuple):
@@ -107,27 +103,32 @@ def _solve(
         )
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
-    def first(y: Array) -> tuple[Array, _Kept]:
+    def first(y: Array, left: Array) -> tuple[Array, Array, _Kept]:
         g, jacobian = equations.linearise(y)
         kept = keep(y, g, jacobian)
-        return _corrected(equations, kept, y, g, jacobian), kept
+        return *_tested(equations, kept, y, left, g, jacobian), kept
 
-    def further(kept: _Kept, y: Array) -> Array:
-        return _corrected(equations, kept, y, *equations.linearise(y))
+    def further(kept: _Kept, y: Array, left: Array) -> Array:
+        return jnp.where(left > 0, _corrected(equations, kept, y, *equations.linearise(y)), y)
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
         return _tested(equations, kept, y, left, *equations.linearise(y))
 
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
-    if small and own and max_steps >= _UNTESTED:
-        fns = in_scalars(first, y), in_scalars(further, kept, y), in_scalars(test, kept, y, left)
+    count = jnp.asarray(0)
+    if small and own:
+        fns = tuple(
+            in_scalars(fn, *given)
+            for fn, *given in ((first, y, left), (further, kept, y, left), (test, kept, y, left))
+        )
         if None not in fns:
-            # From here on arrays are tuples of scalars.
+            # From here on arrays are tuples of scalars. Most steps of an integrator need two
+            # iterations, so the second is not preceded by a test.
             first, further, test = fns
-            y, kept = first(components(y))
-            for _ in range(_UNTESTED - 1):
-                y = further(kept, y)
-            left, own = left - _UNTESTED, False
+            y, left, kept = first(components(y), left)
+            y, own = further(kept, y, left), False
+            count = jnp.where(left > 0, 2, 0)
+            left = jnp.where(left > 1, left - 1, left)
 
     def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
         y, left, index, count, kept = carry
@@ -138,13 +139,13 @@ def _solve(
             y, left = _tested(equations, kept, y, left, g, jacobian)
         else:
             y, left = test(kept, y, left)
-        return y, left, index + 1, count + (left > 0), kept
+        return y, left, index + 1, count + (left > 0).astype(int), kept
 
     def unfinished(carry: tuple[Any, Array, Array, Array, Any]) -> Array:
         return any_lane(carry[1] > 0)
 
-    index, count = jnp.asarray(0), max_steps + 1 - left.astype(int)
-    y, left, _, count, _ = lax.while_loop(unfinished, body, (y, left, index, count, kept))
+    carry = y, left, jnp.asarray(0), count, kept
+    y, left, _, count, _ = lax.while_loop(unfinished, body, carry)
     return joined(candidate, y), left == 0, count
 
 
@@ -175,7 +176,7 @@ def _tested(
     misfit = equations.misfit(g, jacobian, y)
     less = jnp.where(misfit <= 1, jnp.minimum(left - 1, 2), left - 1)
     now = jnp.where(left == 1, jnp.where(misfit <= 1, 0, -1), less)
-    now = jnp.where(misfit <= _SAFELY, 0, now)
+    now = jnp.where(misfit == 0, 0, now)
     left = jnp.where(left > 0, now, left).astype(left.dtype)
     return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
 

@@ -228,7 +228,11 @@ class _WriteOut:
         if name == "jit":
             return self._jaxpr(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
         # Parameters that are `None` have no effect.
-        given = {key: value for key, value in params.items() if value is not None}
+        given = {
+            key: value
+            for key, value in params.items()
+            if value is not None and key not in ("sharding", "out_sharding")
+        }
         if name == "unstack" and given.keys() == {"axis"}:
             return [np.asarray(x) for x in np.moveaxis(inputs[0], params["axis"], 0)]
         if name in _STRUCTURAL:
@@ -240,7 +244,7 @@ class _WriteOut:
         if name in _ELEMENTWISE:
             fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
             return [self._elementwise(fn, inputs)]
-        if name in _REDUCTIONS and given.keys() <= {"axes", "out_sharding"}:
+        if name in _REDUCTIONS and given.keys() == {"axes"}:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
         same_type = _dtype(eqn.invars[0]) == _dtype(eqn.outvars[0])
         if name == "dot_general" and given.keys() <= _DOT and same_type:

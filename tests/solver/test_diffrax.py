@@ -190,7 +190,8 @@ def test_time_dependent_integral_in_either_direction(t1):
     ts = jnp.linspace(0, t1, 7)
     sol = solve(
         cosine,
-        dfc.ManifoldProjection(dfx.Euler(), TIMED),
+        # Where the field vanishes, a step of Euler's method does not move, but the solution does.
+        dfc.ManifoldProjection(dfx.Euler(), TIMED, max_correction=None),
         jnp.array(1.0),
         t1=t1,
         dt0=0.1 * np.sign(t1),
