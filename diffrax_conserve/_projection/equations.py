@@ -15,7 +15,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
@@ -69,13 +69,12 @@ class Equations(eqx.Module):
         y = y if self.clip is None else self.clip(y)
         return self.magnitude + jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
 
-    def misfit(
+    def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
-    ) -> Float[Array, ""]:
-        """The largest residual in units of its tolerance; a state is on the manifold if this is at
-        most one. It is zero where no iteration could reduce the residual but by chance: within a
-        quarter of the tolerance, or within what is measured roundoff. It is NaN where a residual
-        within the tolerance would underflow."""
+    ) -> Int[Array, ""]:
+        """Two if `y` is not on the manifold, otherwise one; zero where no iteration could reduce a
+        residual but by chance, because all are within a quarter of the tolerance or within measured
+        roundoff. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
@@ -83,13 +82,14 @@ class Equations(eqx.Module):
         limit = rtol * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
+        within = valid & (jnp.abs(g) <= limit)
         small = jnp.abs(g) <= 0.25 * limit + 0.75 * rtol * self.sampled
-        return jnp.max(jnp.where(valid, jnp.where(small, 0, jnp.abs(g) / limit), jnp.nan))
+        return jnp.max(jnp.where(within, jnp.where(small, 0, 1), 2))
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.misfit(g, jacobian, y) <= 1
+        return self.verdict(g, jacobian, y) < 2
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""

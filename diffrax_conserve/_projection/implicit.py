@@ -104,12 +104,9 @@ def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, 
     """The sine of the angle between each gradient and the span of those before it, in the norm of
     the metric."""
     unit = jacobian / row_sizes(jacobian)[:, None]
-    roots = 1 if equations.weights is None else jnp.sqrt(equations.weights)
-    columns = (
-        (unit * jnp.broadcast_to(roots, unit.shape))
-        .astype(jnp.promote_types(unit.dtype, jnp.float32))
-        .T
-    )
+    if equations.weights is not None:
+        unit = unit * jnp.sqrt(equations.weights)[None]
+    columns = unit.astype(jnp.float32 if jnp.finfo(unit.dtype).bits < 32 else unit.dtype).T
     norms = jnp.linalg.norm(columns, axis=0)
     lengths = jnp.abs(jnp.diagonal(jnp.linalg.qr(columns, mode="r")))
     return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(unit.dtype)
