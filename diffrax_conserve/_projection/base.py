@@ -128,7 +128,7 @@ class Problem(eqx.Module):
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
-        ok = equations.verdict(after, jacobian, y) < 2 if ok is None else ok
+        ok = equations.verdict(after, jacobian, y)[0] if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         reached = kinds.where(

@@ -15,7 +15,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
@@ -71,10 +71,10 @@ class Equations(eqx.Module):
 
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
-    ) -> Int[Array, ""]:
-        """Two if `y` is not on the manifold, otherwise one; zero where no iteration could reduce a
-        residual but by chance, because all are within a quarter of the tolerance or within measured
-        roundoff. A residual within a tolerance that underflows says nothing."""
+    ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Whether `y` is on the manifold, and whether no iteration could reduce a residual but by
+        chance, because all are within a quarter of the tolerance or within measured roundoff. A
+        residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
@@ -84,12 +84,12 @@ class Equations(eqx.Module):
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         within = valid & (jnp.abs(g) <= limit)
         small = jnp.abs(g) <= 0.25 * limit + 0.75 * rtol * self.sampled
-        return jnp.max(jnp.where(within, jnp.where(small, 0, 1), 2))
+        return jnp.all(within), jnp.all(within & small)
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.verdict(g, jacobian, y) < 2
+        return self.verdict(g, jacobian, y)[0]
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""

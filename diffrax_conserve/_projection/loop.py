@@ -173,11 +173,10 @@ def _tested(
 ) -> tuple[Float[Array, " n"], Int[Array, ""]]:
     """The verdict at the state itself, and the next state. `left` counts the iterations that are
     left; 0 is success, -1 failure."""
-    verdict = equations.verdict(g, jacobian, y)
+    ok, done = equations.verdict(g, jacobian, y)
     # Within the tolerance at most two more.
-    less = jnp.where(verdict < 2, jnp.minimum(left - 1, 2), left - 1)
-    now = jnp.where(left == 1, jnp.where(verdict < 2, 0, -1), less)
-    now = jnp.where(verdict == 0, 0, now)
+    less = jnp.where(ok, jnp.minimum(left - 1, 2), left - 1)
+    now = jnp.where(done, 0, jnp.where(left == 1, jnp.where(ok, 0, -1), less))
     left = jnp.where(left > 0, now, left).astype(left.dtype)
     return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
 
