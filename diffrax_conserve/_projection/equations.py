@@ -77,14 +77,21 @@ class Equations(eqx.Module):
         residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
-        rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
-        rtol = jnp.asarray(rtol, y.dtype)
-        limit = rtol * scale
+        limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         within = valid & (jnp.abs(g) <= limit)
-        small = jnp.abs(g) <= 0.25 * limit + 0.75 * rtol * self.sampled
+        small = (jnp.abs(g) <= 0.25 * limit) | self.is_noise(g)
         return jnp.all(within), jnp.all(within & small)
+
+    def is_noise(self, g: Float[Array, " m"]) -> Bool[Array, " m"]:
+        """Which residuals are within measured roundoff."""
+        return jnp.abs(g) <= self._relative(self.sampled)
+
+    def _relative(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
+        eps = float(jnp.finfo(scale.dtype).eps)
+        rtol = ROUNDOFF_MULTIPLE * eps if self.rtol is None else self.rtol
+        return jnp.asarray(rtol, scale.dtype) * scale
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""

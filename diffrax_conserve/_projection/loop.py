@@ -103,32 +103,31 @@ def _solve(
         )
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
-    def first(y: Array, left: Array) -> tuple[Array, Array, _Kept]:
+    def first(y: Array) -> tuple[Array, _Kept]:
         g, jacobian = equations.linearise(y)
         kept = keep(y, g, jacobian)
-        return *_tested(equations, kept, y, left, g, jacobian), kept
+        return _corrected(equations, kept, y, g, jacobian), kept
 
-    def further(kept: _Kept, y: Array, left: Array) -> Array:
-        return jnp.where(left > 0, _corrected(equations, kept, y, *equations.linearise(y)), y)
+    def further(kept: _Kept, y: Array) -> Array:
+        return _corrected(equations, kept, y, *equations.linearise(y))
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
         return _tested(equations, kept, y, left, *equations.linearise(y))
 
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     count = jnp.asarray(0)
-    if small and own:
+    if small and own and max_steps > 1:
         fns = tuple(
             in_scalars(fn, *given)
-            for fn, *given in ((first, y, left), (further, kept, y, left), (test, kept, y, left))
+            for fn, *given in ((first, y), (further, kept, y), (test, kept, y, left))
         )
         if None not in fns:
             # From here on arrays are tuples of scalars. Most steps of an integrator need two
-            # iterations, so the second is not preceded by a test.
+            # iterations, so these are not preceded by a test.
             first, further, test = fns
-            y, left, kept = first(components(y), left)
-            y, own = further(kept, y, left), False
-            count = jnp.where(left > 0, 2, 0)
-            left = jnp.where(left > 1, left - 1, left)
+            y, kept = first(components(y))
+            y, own = further(kept, y), False
+            left, count = left - 2, count + 2
 
     def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
         y, left, index, count, kept = carry
@@ -184,8 +183,10 @@ def _tested(
 def _corrected(
     equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
-    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`, where measured roundoff counts as zero. The damping is the squared
+    residual, relative to the scale at the candidate: near a state where all terms vanish it never
+    becomes small relative to theirs."""
+    g = jnp.where(equations.is_noise(g), 0, g)
     if kept.factors is not None:
         rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:
