@@ -106,10 +106,13 @@ def _solve(
     def first(y: Array) -> tuple[Array, _Kept]:
         g, jacobian = equations.linearise(y)
         kept = keep(y, g, jacobian)
+        g = jnp.where(equations.is_noise(g), 0, g)
         return _corrected(equations, kept, y, g, jacobian), kept
 
     def further(kept: _Kept, y: Array) -> Array:
-        return _corrected(equations, kept, y, *equations.linearise(y))
+        g, jacobian = equations.linearise(y)
+        g = jnp.where(equations.is_noise(g), 0, g)
+        return _corrected(equations, kept, y, g, jacobian)
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
         return _tested(equations, kept, y, left, *equations.linearise(y))
@@ -183,10 +186,8 @@ def _tested(
 def _corrected(
     equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`, where measured roundoff counts as zero. The damping is the squared
-    residual, relative to the scale at the candidate: near a state where all terms vanish it never
-    becomes small relative to theirs."""
-    g = jnp.where(equations.is_noise(g), 0, g)
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
+    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
     if kept.factors is not None:
         rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:

@@ -20,6 +20,7 @@ from .._custom_types import (
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import (
+    Constraint,
     FirstIntegral,
     check_manifold,
     check_outputs,
@@ -235,8 +236,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         step = target.step(t0, t1, y0, error, path)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
-        limit = self.max_correction if self._is_limited(terms) else None
-        failed, hopeless = verdict(info.ok, state, (t0, t1), (y0, candidate, y1), limit, self.every)
+        failed, hopeless = verdict(
+            info.ok,
+            state,
+            (t0, t1),
+            (y0, candidate, y1),
+            self.max_correction if self._is_limited(terms) else None,
+            self.every,
+            any(isinstance(x, Constraint) for _, x in named_entries(self.manifold)),
+        )
         dense_info = dict(
             inner=dense_info,
             ends=(y0, y1),

@@ -24,7 +24,8 @@ _FIRST = register(
     "manifold is not finite there. Start on the manifold: "
     "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`. " + _ENTRY,
     "the projection of a step failed: the state that the wrapped solver proposed is not finite, or "
-    "the iteration diverged from it. Check the vector field and `fn` there. " + _SMALLER + _ENTRY,
+    "a function of the manifold there or at the initial state, or the iteration diverged. Check "
+    "the vector field and `fn`. " + _SMALLER + _ENTRY,
     "the projection of a step failed: the correction moved the state further than `max_correction` "
     "allows. Perhaps the quantity is not conserved at all, which `check_invariance` tells, or the "
     "state jumped to another part of the manifold. Take smaller steps, or pass another "
@@ -47,6 +48,7 @@ def verdict(
     states: tuple[Y, Y, Y],
     max_correction: RealScalarLike | None,
     every: int,
+    has_constraints: bool,
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """The cause of the failure of a step, 0 if it succeeded; and whether a failure is final,
     because the candidate is already very close to the last state, the step is a roundoff of time,
@@ -65,7 +67,8 @@ def verdict(
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
         cause = jnp.where(too_far, _TOO_FAR, cause)
     lost = jnp.any(jnp.isnan(state.values))
-    cause = jnp.where(lost, _START, cause)
+    if has_constraints:  # otherwise a function was not finite
+        cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Not by a maximum, which can lose NaN on a CPU.
