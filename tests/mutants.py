@@ -116,12 +116,12 @@ def do_not_project_the_interpolant(package):
 
 @noticed_by("tests/projection/test_laws.py", "-k", "nan")
 def call_nan_a_success(package):
-    def mutate(misfit):
-        return lambda self, *values: misfit(
+    def mutate(verdict):
+        return lambda self, *values: verdict(
             self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values)
         )
 
-    package.method("Equations.misfit", mutate)
+    package.method("Equations.verdict", mutate)
 
 
 @noticed_by("tests/solver/test_diffrax.py", "-k", "continued_solve")
