@@ -88,9 +88,10 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         t0 = jnp.asarray(t0)
         project = eqx.filter_closure_convert(project, t0, candidate, step)
         y, _ = _projected(project, t0, candidate, step, end)
-        if self.due is None:
+        due = self.due
+        if due is None:
             return y
-        return jtu.tree_map(lambda a, b: jnp.where(self.due, a, b), y, candidate)
+        return jtu.tree_map(lambda a, b: jnp.where(due, a, b), y, candidate)
 
 
 @eqx.filter_custom_jvp

@@ -149,8 +149,12 @@ def check_invariance(
     _check_like_y(vector_field, ts[0], jtu.tree_map(lambda x: x[0], ys), args)
     found = _measure(vector_field, manifold, ts, ys, args)
     entries = [
-        _verdict(name, entry, *map(np.asarray, measured), rtol)
-        for (name, entry), measured in zip(_entries(manifold), found, strict=True)
+        _verdict(
+            name, entry, np.asarray(defects), np.asarray(residuals), np.asarray(constant), rtol
+        )
+        for (name, entry), (defects, residuals, constant) in zip(
+            _entries(manifold), found, strict=True
+        )
     ]
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
@@ -251,7 +255,8 @@ def _relative_sizes(
     f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), vector_field(t, y, args), y)
     terms = jnp.sum(jnp.abs(jacobian * ravel(f)), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
     # Forces may cancel inside the field.
-    terms = jnp.maximum(terms, measured_scale(along, vector))
+    hidden = measured_scale(along, lambda d: jax.jvp(along, (vector,), (d,))[1], vector)
+    terms = jnp.maximum(terms, hidden)
     change = along(vector) + in_time - rate
     defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may

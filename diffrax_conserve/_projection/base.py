@@ -128,7 +128,7 @@ class Problem(eqx.Module):
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
-        ok = equations.verdict(after, jacobian, y)[0] if ok is None else ok
+        success = equations.verdict(after, jacobian, y) > 0 if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         reached = kinds.where(
@@ -140,14 +140,14 @@ class Problem(eqx.Module):
         parts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
         entry = jnp.asarray(np.repeat(np.arange(len(parts)), parts))
         return ProjectionInfo(
-            ok=ok,
-            result=kinds.where(ok, kinds.successful, failed),
+            ok=success,
+            result=kinds.where(success, kinds.successful, failed),
             num_steps=jnp.asarray(num_steps),
             residual_before=before,
             residual_after=after,
             correction=jnp.linalg.norm(y - candidate),
             roundoff=jnp.max(relative(equations.sampled, scale)),
-            worst=jnp.where(ok, 0, entry[jnp.argmax(least)]),
+            worst=jnp.where(success, 0, entry[jnp.argmax(least)]),
         )
 
 

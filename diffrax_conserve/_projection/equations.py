@@ -15,7 +15,8 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
@@ -55,6 +56,7 @@ class Equations(eqx.Module):
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
         return jnp.concatenate([part(y) for part in self.parts])
 
+    @eqx.filter_jit  # traced once for all uses
     def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
         """`g(y)` and the constraint Jacobian `G(y)`. Entry by entry, so that the rows of one do not
         contain the gradients of the others."""
@@ -71,18 +73,19 @@ class Equations(eqx.Module):
 
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
-    ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-        """Whether `y` is on the manifold, and whether no iteration could reduce a residual but by
-        chance, because all are within a quarter of the tolerance or within measured roundoff. A
-        residual within a tolerance that underflows says nothing."""
+    ) -> Int[Array, ""]:
+        """0 if `y` is off the manifold; 1 if it is on it; 2 if, besides, no iteration could reduce
+        a residual but by chance, because all are within a quarter of the tolerance or within
+        measured roundoff. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        within = valid & (jnp.abs(g) <= limit)
         small = (jnp.abs(g) <= 0.25 * limit) | self.is_noise(g)
-        return jnp.all(within), jnp.all(within & small)
+        reached = jnp.where(small, 2, 1)
+        # Not by a maximum of residuals, which can lose NaN on a CPU.
+        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
 
     def is_noise(self, g: Float[Array, " m"]) -> Bool[Array, " m"]:
         """Which residuals are within measured roundoff."""
@@ -96,7 +99,7 @@ class Equations(eqx.Module):
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.verdict(g, jacobian, y)[0]
+        return self.verdict(g, jacobian, y) > 0
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""
@@ -145,9 +148,11 @@ def equations_of(
     return Equations(tuple(parts), magnitude, sampled)
 
 
-def measured_scale(fn: Part, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The size of the terms inside a function that its gradient at `y` does not show, such as the 1
-    in `1 - cos(q)` near zero or the hidden layers of a network.
+def measured_scale(
+    fn: Part, linear: Callable[[Array], Array], y: Float[Array, " n"]
+) -> Float[Array, " m"]:
+    """The size of the terms inside a function that its derivative at `y`, the map `linear`, does
+    not show, such as the 1 in `1 - cos(q)` near zero or the hidden layers of a network.
 
     Their roundoff shows them: `(fn(y + δ) - fn(y - δ)) / 2 - G δ`, for displacements `δ` so small
     that the rest of it is below roundoff. Where these are too small to change the function at all,
@@ -156,18 +161,17 @@ def measured_scale(fn: Part, y: Float[Array, " n"]) -> Float[Array, " m"]:
     info = jnp.finfo(y.dtype)
     eps, tiny = float(info.eps), float(info.tiny)
     size = jnp.abs(y) + jnp.max(jnp.abs(y), initial=0)
-    phases = jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2
+    phases = np.arange(1, y.size + 1, dtype=y.dtype) ** 2
 
     def sample(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, settled, largest = carry
         index = count // _SAMPLES
         length = eps ** (0.55 * (1 - index / _LENGTHS))
-        ahead, behind = (
-            y + (s * length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size for s in (1, -1)
-        )
-        change = (fn(ahead) - fn(behind)) / 2
-        _, linear = jax.jvp(fn, (y,), ((ahead - behind) / 2,))
-        error = jnp.abs(change - linear)
+        shift = (length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size
+        ends = y + jnp.stack([shift, -shift])
+        values = jax.vmap(fn)(ends)
+        change = (values[0] - values[1]) / 2
+        error = jnp.abs(change - linear((ends[0] - ends[1]) / 2))
         # A function is settled by the first length that changes it. An underflow is no roundoff.
         counts = (settled >= index) & (error < jnp.inf) & (error > _SAMPLED * tiny)
         settled = jnp.where(change != 0, jnp.minimum(settled, index), settled)
@@ -190,7 +194,7 @@ def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " 
     equations, y = tree_stop_gradient((equations, y))
     value, jacobian = equations.linearise(y)
     shown = jnp.abs(value) + equations.scale(jacobian, y)
-    measured = measured_scale(equations.residual, y)
+    measured = measured_scale(equations.residual, lambda d: jnp.sum(jacobian * d, axis=1), y)
     return jnp.where(measured > ROUNDOFF_MULTIPLE / 4 * shown, measured, 0)
 
 

@@ -41,7 +41,7 @@ class _Kept(NamedTuple):
     """What an iteration keeps from the candidate: the directions of the correction, and with many
     constraints the factors of the Gram matrix; or only the scale there, for the damping."""
 
-    rows: Float[Array, "m n"] | None = None
+    rows: Any = None
     factors: Factors | None = None
     scale: Float[Array, " m"] | None = None
 
@@ -63,20 +63,20 @@ def solve(
     candidate; with `fresh` those of the last state. A damping that vanishes with the residual helps
     far from the manifold."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
-    run = ft.partial(_solve, max_steps=max_steps, fresh=fresh, damped=damped)
+    small = candidate.size <= _UNKNOWNS_MAX and equations.magnitude.size <= WRITTEN_OUT_MAX
 
-    @jax.custom_batching.custom_vmap
-    def alone(arrays: Any) -> Solved:
-        return run(*eqx.combine(arrays, static), small=False)
+    def run(small: bool, arrays: Any) -> Solved:
+        given = eqx.combine(arrays, static)
+        return _solve(*given, max_steps=max_steps, fresh=fresh, damped=damped, small=small)
+
+    # Jitted, because jax batches the loop over the steps several times.
+    in_arrays = jax.jit(ft.partial(run, False))
+    lane = jax.jit(ft.partial(run, True)) if small and not fresh else in_arrays
+    alone = jax.custom_batching.custom_vmap(in_arrays)
 
     @alone.def_vmap
     def batched(size: int, axes: Any, arrays: Any) -> Any:
         del size
-        equations, y, _ = eqx.combine(arrays, static)
-        small = (
-            max(y.shape[-1] / _UNKNOWNS_MAX, equations.magnitude.shape[-1] / WRITTEN_OUT_MAX) <= 1
-        )
-        lane = lambda x: run(*eqx.combine(x, static), small=small and not fresh)  # noqa: E731
         (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
         return jax.vmap(lane, (axes,))(arrays), (True, True, True)
 
@@ -98,9 +98,8 @@ def _solve(
     if directions is not None:
         kept = _Kept(directions / row_sizes(directions)[:, None])
     if own:
-        like = eqx.filter_eval_shape(
-            keep, candidate, *jax.eval_shape(equations.linearise, candidate)
-        )
+        zero = jnp.zeros_like(equations.magnitude)
+        like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate)
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
     def first(y: Array) -> tuple[Array, _Kept]:
@@ -120,7 +119,7 @@ def _solve(
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     count = jnp.asarray(0)
     if small and own and max_steps > 1:
-        fns = tuple(
+        fns: tuple[Any, ...] = tuple(
             in_scalars(fn, *given)
             for fn, *given in ((first, y), (further, kept, y), (test, kept, y, left))
         )
@@ -175,10 +174,11 @@ def _tested(
 ) -> tuple[Float[Array, " n"], Int[Array, ""]]:
     """The verdict at the state itself, and the next state. `left` counts the iterations that are
     left; 0 is success, -1 failure."""
-    ok, done = equations.verdict(g, jacobian, y)
+    level = equations.verdict(g, jacobian, y)
     # Within the tolerance at most two more.
-    less = jnp.where(ok, jnp.minimum(left - 1, 2), left - 1)
-    now = jnp.where(done, 0, jnp.where(left == 1, jnp.where(ok, 0, -1), less))
+    less = jnp.where(level > 0, jnp.minimum(left - 1, 2), left - 1)
+    last = jnp.where(level > 0, 0, -1)
+    now = jnp.where(level == 2, 0, jnp.where(left == 1, last, less))
     left = jnp.where(left > 0, now, left).astype(left.dtype)
     return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
 

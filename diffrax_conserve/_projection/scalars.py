@@ -238,7 +238,8 @@ class _WriteOut:
         if name in _STRUCTURAL:
             return [_STRUCTURAL[name](*inputs, **given)]
         if name == "pad" and all(low >= 0 <= high for low, high, _ in given["padding_config"]):
-            return [self._pad(*inputs, given["padding_config"])]
+            places, value = inputs
+            return [self._pad(places, value, given["padding_config"])]
         if all(self._is_known(places) for places in inputs):
             return self._fold(eqn, inputs)
         if name in _ELEMENTWISE:
