@@ -117,7 +117,7 @@ def measure(
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
     vector = ravel(y)
     numbers = ravel(values).astype(vector.dtype)
-    equations = equations_of(manifold, numbers, jnp.zeros_like(numbers), t, y, args)
+    equations = equations_of(manifold, numbers, t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
@@ -126,13 +126,14 @@ def measure(
 def equations_of(
     manifold: Manifold,
     values: Float[Array, " m"],
-    sampled: Float[Array, " m"],
     t: RealScalarLike,
     like: Any,
     args: Args,
+    sampled: Float[Array, " m"] | None = None,
 ) -> Equations:
     """The equations of a manifold with the conserved `values`, for states like `like`; `sampled` is
     the measured part of the scales."""
+    sampled = jnp.zeros_like(values) if sampled is None else sampled
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):

@@ -34,10 +34,9 @@ from .._projection.project import check_metric, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
 from .checks import check_direction, check_nested, innermost
-from .state import State, started
+from .state import State, member, started, verdict
 from .statistics import ProjectionStatistics
 from .terms import is_backsolve, is_ode, time_direction
-from .verdict import member, verdict
 
 
 @final
