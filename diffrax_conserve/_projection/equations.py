@@ -82,14 +82,10 @@ class Equations(eqx.Module):
         limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        small = (jnp.abs(g) <= 0.25 * limit) | self.is_noise(g)
+        small = (jnp.abs(g) <= 0.25 * limit) | (jnp.abs(g) <= self._relative(self.sampled))
         reached = jnp.where(small, 2, 1)
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
-
-    def is_noise(self, g: Float[Array, " m"]) -> Bool[Array, " m"]:
-        """Which residuals are within measured roundoff."""
-        return jnp.abs(g) <= self._relative(self.sampled)
 
     def _relative(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)

@@ -107,34 +107,25 @@ def _solve(
         like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate)
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
-    def first(y: Array) -> tuple[Array, _Kept]:
-        g, jacobian = equations.linearise(y)
-        kept = keep(y, g, jacobian)
-        g = jnp.where(equations.is_noise(g), 0, g)
-        return _corrected(equations, kept, y, g, jacobian), kept
+    def start(y: Array) -> _Kept:
+        return keep(y, *equations.linearise(y))
 
-    def further(kept: _Kept, y: Array) -> Array:
-        g, jacobian = equations.linearise(y)
-        g = jnp.where(equations.is_noise(g), 0, g)
-        return _corrected(equations, kept, y, g, jacobian)
-
-    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
+    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
         return _tested(equations, kept, y, left, *equations.linearise(y))
 
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     count = jnp.asarray(0)
-    if small and own and max_steps > 1:
-        fns: tuple[Any, ...] = tuple(
-            in_scalars(fn, *given)
-            for fn, *given in ((first, y), (further, kept, y), (test, kept, y, left))
-        )
-        if None not in fns:
+    if small and own:
+        written = in_scalars(start, y), in_scalars(test, kept, y, left)
+        if written[0] is not None and written[1] is not None:
             # From here on arrays are tuples of scalars. Most steps of an integrator need two
-            # iterations, so these are not preceded by a test.
-            first, further, test = fns
-            y, kept = first(components(y))
-            y, own = further(kept, y), False
-            left, count = left - 2, count + 2
+            # iterations, which need no loop.
+            start, test = written
+            y, own = components(y), False
+            kept = start(y)
+            for _ in range(2):
+                y, left, more = test(kept, y, left)
+                count = count + more
 
     def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
         y, left, index, count, kept = carry
@@ -142,10 +133,10 @@ def _solve(
             g, jacobian = equations.linearise(y)
             is_first = index == 0 if kept.factors is not None else left > max_steps
             kept = _if_first(is_first, lambda: keep(y, g, jacobian), kept)
-            y, left = _tested(equations, kept, y, left, g, jacobian)
+            y, left, more = _tested(equations, kept, y, left, g, jacobian)
         else:
-            y, left = test(kept, y, left)
-        return y, left, index + 1, count + (left > 0).astype(int), kept
+            y, left, more = test(kept, y, left)
+        return y, left, index + 1, count + more, kept
 
     def unfinished(carry: tuple[Any, Array, Array, Array, Any]) -> Array:
         return any_lane(carry[1] > 0)
@@ -176,16 +167,17 @@ def _if_first(first: Bool[Array, ""], new: Callable[[], _Kept], kept: _Kept) -> 
 
 def _tested(
     equations: Equations, kept: _Kept, y: Array, left: Array, g: Array, jacobian: Array
-) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """The verdict at the state itself, and the next state. `left` counts the iterations that are
-    left; 0 is success, -1 failure."""
+) -> tuple[Float[Array, " n"], Int[Array, ""], Int[Array, ""]]:
+    """The verdict at the state itself, the next state, and whether that is another one. `left`
+    counts the iterations that are left; 0 is success, -1 failure."""
     level = equations.verdict(g, jacobian, y)
     # Within the tolerance at most two more.
     less = jnp.where(level > 0, jnp.minimum(left - 1, 2), left - 1)
     last = jnp.where(level > 0, 0, -1)
     now = jnp.where(level == 2, 0, jnp.where(left == 1, last, less))
     left = jnp.where(left > 0, now, left).astype(left.dtype)
-    return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
+    more = left > 0
+    return jnp.where(more, _corrected(equations, kept, y, g, jacobian), y), left, more.astype(int)
 
 
 def _corrected(
