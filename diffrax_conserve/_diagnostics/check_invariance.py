@@ -16,7 +16,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values, rate_of
-from .._projection.equations import Equations, equations_of, measure, measured_scale, relative
+from .._projection.equations import Equations, equations_of, measure, relative
+from .._projection.roundoff import hidden_terms
 from .._tree import ravel, tree_all_finite, tree_max, unravel
 
 
@@ -255,8 +256,7 @@ def _relative_sizes(
     f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), vector_field(t, y, args), y)
     terms = jnp.sum(jnp.abs(jacobian * ravel(f)), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
     # Forces may cancel inside the field.
-    hidden = measured_scale(along, lambda d: jax.jvp(along, (vector,), (d,))[1], vector)
-    terms = jnp.maximum(terms, hidden)
+    terms = jnp.maximum(terms, hidden_terms(along, vector))
     change = along(vector) + in_time - rate
     defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may

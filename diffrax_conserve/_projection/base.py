@@ -31,11 +31,11 @@ class ProjectionInfo(eqx.Module):
     - `num_steps`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, each relative to the scale of its own constraint at the projected state,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus the measured
-        part.
+        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus the terms
+        that cancel inside `fn`.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
-    - `roundoff`: the largest measured share of a scale, which its gradient does not show: near one
-        where `fn` is less accurate than its gradient tells.
+    - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
+        is less accurate than its gradient tells, as `1 - cos(q)` near zero.
     - `worst`: if the projection failed, the position of the entry of the manifold with the largest
         relative residual (the smaller of its residuals before and after), as
         [`diffrax_conserve.entry_name`][] takes it; otherwise 0.
@@ -146,7 +146,7 @@ class Problem(eqx.Module):
             residual_before=before,
             residual_after=after,
             correction=jnp.linalg.norm(y - candidate),
-            roundoff=jnp.max(relative(equations.sampled, scale)),
+            roundoff=jnp.max(relative(equations.hidden, scale)),
             worst=jnp.where(success, 0, entry[jnp.argmax(least)]),
         )
 

@@ -2,7 +2,7 @@
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The *scale* of a
 residual at `y` is the size of the terms that cancel in it: `|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what is
-inside `fn` but not in its gradient, which its measured roundoff shows. Roundoff is proportional to
+inside `fn` but not in its gradient, which `roundoff` finds. Roundoff is proportional to
 the scale, so success is judged relative to the scale at the state that is returned.
 """
 
@@ -15,20 +15,15 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
-from .._tree import ravel, tree_stop_gradient, unflatten, unravel
+from .._tree import ravel, unflatten, unravel
 
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
 # residual contribute about one unit each.
 ROUNDOFF_MULTIPLE = 16
-# The measured roundoff of a function counts this many times, because it is a sample: of so many
-# displacements, of each of so many lengths.
-_SAMPLED, _SAMPLES, _LENGTHS = 16, 16, 8
-
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
 
@@ -36,8 +31,8 @@ class Equations(eqx.Module):
     """The residuals of a manifold, in the order in which it is flattened.
 
     - `parts`: the residual of each entry.
-    - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + sampled`.
-    - `sampled`: what the measured roundoff of the functions adds to it.
+    - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
+    - `hidden`: the part of it that the gradients do not show.
     - `weights`: `M⁻¹`, the inverse of the metric; `None` if it is one.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: where the state is within bounds, the map to it from a vector without bounds, which is
@@ -47,7 +42,7 @@ class Equations(eqx.Module):
 
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
-    sampled: Float[Array, " m"]
+    hidden: Float[Array, " m"]
     weights: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
@@ -75,15 +70,14 @@ class Equations(eqx.Module):
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> Int[Array, ""]:
         """0 if `y` is off the manifold; 1 if it is on it; 2 if, besides, no iteration could reduce
-        a residual but by chance, because all are within a quarter of the tolerance or within
-        measured roundoff. A residual within a tolerance that underflows says nothing."""
+        a residual but by chance, because all are within a quarter of the tolerance. A residual
+        within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        small = (jnp.abs(g) <= 0.25 * limit) | (jnp.abs(g) <= self._relative(self.sampled))
-        reached = jnp.where(small, 2, 1)
+        reached = jnp.where(jnp.abs(g) <= 0.25 * limit, 2, 1)
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
 
@@ -125,11 +119,11 @@ def equations_of(
     t: RealScalarLike,
     like: Any,
     args: Args,
-    sampled: Float[Array, " m"] | None = None,
+    hidden: Float[Array, " m"] | None = None,
 ) -> Equations:
-    """The equations of a manifold with the conserved `values`, for states like `like`; `sampled` is
-    the measured part of the scales."""
-    sampled = jnp.zeros_like(values) if sampled is None else sampled
+    """The equations of a manifold with the conserved `values`, for states like `like`; `hidden` is
+    the part of the scales that the gradients do not show."""
+    hidden = jnp.zeros_like(values) if hidden is None else hidden
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
@@ -141,58 +135,8 @@ def equations_of(
         # Arrays over which `fn` closes become leaves, and can be differentiated.
         parts.append(eqx.filter_closure_convert(part, vector))
         start += jax.eval_shape(part, vector).size
-    magnitude = lax.stop_gradient(jnp.abs(values) + sampled)
-    return Equations(tuple(parts), magnitude, sampled)
-
-
-def measured_scale(
-    fn: Part, linear: Callable[[Array], Array], y: Float[Array, " n"]
-) -> Float[Array, " m"]:
-    """The size of the terms inside a function that its derivative at `y`, the map `linear`, does
-    not show, such as the 1 in `1 - cos(q)` near zero or the hidden layers of a network.
-
-    Their roundoff shows them: `(fn(y + δ) - fn(y - δ)) / 2 - G δ`, for displacements `δ` so small
-    that the rest of it is below roundoff. Where these are too small to change the function at all,
-    larger ones are taken.
-    """
-    info = jnp.finfo(y.dtype)
-    eps, tiny = float(info.eps), float(info.tiny)
-    size = jnp.abs(y) + jnp.max(jnp.abs(y), initial=0)
-    phases = np.arange(1, y.size + 1, dtype=y.dtype) ** 2
-
-    def sample(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, settled, largest = carry
-        index = count // _SAMPLES
-        length = eps ** (0.55 * (1 - index / _LENGTHS))
-        shift = (length * jnp.sin((1 + count) * phases)).astype(y.dtype) * size
-        ends = y + jnp.stack([shift, -shift])
-        values = jax.vmap(fn)(ends)
-        change = (values[0] - values[1]) / 2
-        error = jnp.abs(change - linear((ends[0] - ends[1]) / 2))
-        # A function is settled by the first length that changes it. An underflow is no roundoff.
-        counts = (settled >= index) & (error < jnp.inf) & (error > _SAMPLED * tiny)
-        settled = jnp.where(change != 0, jnp.minimum(settled, index), settled)
-        return count + 1, settled, jnp.where(counts, jnp.maximum(largest, error), largest)
-
-    def unsettled(carry: tuple[Array, Array, Array]) -> Array:
-        count, settled, _ = carry
-        more = jnp.any(settled >= count // _SAMPLES) | (count % _SAMPLES > 0)
-        return more & (count < _SAMPLES * _LENGTHS)
-
-    zero = jnp.zeros(jax.eval_shape(fn, y).shape, y.dtype)
-    start = jnp.asarray(0), jnp.full(zero.shape, _LENGTHS), zero
-    _, _, found = lax.while_loop(lambda carry: any_lane(unsettled(carry)), sample, start)
-    return _SAMPLED / (ROUNDOFF_MULTIPLE * eps) * found
-
-
-def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """What the measured roundoff at `y` adds to the scale there: nothing where it is within a
-    quarter of the tolerance anyway."""
-    equations, y = tree_stop_gradient((equations, y))
-    value, jacobian = equations.linearise(y)
-    shown = jnp.abs(value) + equations.scale(jacobian, y)
-    measured = measured_scale(equations.residual, lambda d: jnp.sum(jacobian * d, axis=1), y)
-    return jnp.where(measured > ROUNDOFF_MULTIPLE / 4 * shown, measured, 0)
+    magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
+    return Equations(tuple(parts), magnitude, hidden)
 
 
 @jax.custom_batching.custom_vmap

@@ -116,8 +116,8 @@ def _solve(
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     count = jnp.asarray(0)
     if small and own:
-        written = in_scalars(start, y), in_scalars(test, kept, y, left)
-        if written[0] is not None and written[1] is not None:
+        written: tuple[Any, ...] = in_scalars(start, y), in_scalars(test, kept, y, left)
+        if None not in written:
             # From here on arrays are tuples of scalars. Most steps of an integrator need two
             # iterations, which need no loop.
             start, test = written

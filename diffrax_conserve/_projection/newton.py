@@ -135,12 +135,12 @@ def _nearest(
     lengths = jnp.diagonal(gram)
     units = [jnp.ones(n, y.dtype) if equations.weights is None else equations.weights]
     units += [1 / jnp.where(lengths > 0, lengths, 1)]
-    sampled = jnp.concatenate([jnp.zeros_like(y), equations.sampled])
+    hidden = jnp.concatenate([jnp.zeros_like(y), equations.hidden])
     magnitude = jnp.concatenate([jnp.abs(candidate), equations.magnitude])
     optimality = Equations(
         (_Optimality(equations, candidate, box),),
         magnitude,
-        sampled,
+        hidden,
         jnp.concatenate(units),
         equations.rtol,
         equations.atol,

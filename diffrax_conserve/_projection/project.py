@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
@@ -19,10 +19,11 @@ from .._manifold import (
     named_entries,
 )
 from .._options import dtype_of
-from .._tree import ravel
+from .._tree import ravel, tree_stop_gradient
 from .base import AbstractProjection, ProjectionInfo, check_like, check_projection
-from .equations import equations_of, hidden_scale
+from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of
 from .newton import Newton
+from .roundoff import hidden_terms
 from .target import Target
 
 
@@ -78,8 +79,18 @@ def project(
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
     values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
-    sampled = hidden_scale(equations_of(manifold, values, t, y, args), vector)
-    return Target(projection, manifold, values, sampled, args, jnp.asarray(1)).project(t, y)
+    hidden = _hidden_scale(equations_of(manifold, values, t, y, args), vector)
+    return Target(projection, manifold, values, hidden, args, jnp.asarray(1)).project(t, y)
+
+
+def _hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """The part of the scales at the candidate that the gradients do not show. Nothing where it is
+    within a quarter of the tolerance anyway, because the candidate may be far away."""
+    equations, y = tree_stop_gradient((equations, y))
+    value, jacobian = equations.linearise(y)
+    shown = jnp.abs(value) + equations.scale(jacobian, y)
+    hidden = hidden_terms(equations.residual, y)
+    return jnp.where((hidden > ROUNDOFF_MULTIPLE / 4 * shown) & (hidden < jnp.inf), hidden, 0)
 
 
 def given_values(

@@ -114,7 +114,7 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
     equations = Equations(
         tuple(part for part, want in parts if want),
         problem.equations.magnitude[rows],
-        problem.equations.sampled[rows],
+        problem.equations.hidden[rows],
         inverse_metric(projection.metric, problem.like),
     )
     return dataclasses.replace(problem, equations=equations)

@@ -27,7 +27,7 @@ class Target(eqx.Module):
     **Attributes:**
 
     - `values`: the conserved values at the start of the solve.
-    - `sampled`: the measured part of the scales.
+    - `hidden`: the part of the scales that the gradients do not show.
     - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
     - `gained`: the integrals of the rates of the manifold since the start of the solve.
     """
@@ -35,7 +35,7 @@ class Target(eqx.Module):
     projection: AbstractProjection
     manifold: Manifold
     values: Float[Array, " m"]
-    sampled: Float[Array, " m"]
+    hidden: Float[Array, " m"]
     args: Args
     direction: Real[Array, ""]
     gained: Float[Array, " m"] | None = None
@@ -90,7 +90,7 @@ def _project(
 ) -> tuple[Y, ProjectionInfo]:
     values = target.values if target.gained is None else target.values + target.gained
     problem = problem_of(
-        target.projection, target.manifold, values, target.sampled, t, candidate, target.args, step
+        target.projection, target.manifold, values, target.hidden, t, candidate, target.args, step
     )
     y, info = target.projection.solve(problem, ravel(candidate))
     return unravel(y, problem.like), info
@@ -100,7 +100,7 @@ def problem_of(
     projection: AbstractProjection,
     manifold: Manifold,
     values: Float[Array, " m"],
-    sampled: Float[Array, " m"],
+    hidden: Float[Array, " m"],
     t: RealScalarLike,
     like: Any,
     args: Args,
@@ -108,7 +108,7 @@ def problem_of(
 ) -> Problem:
     """The problem of a projection at a time, for states like `like`."""
     like = jax.eval_shape(lambda: like)
-    equations = equations_of(manifold, values, t, like, args, sampled)
+    equations = equations_of(manifold, values, t, like, args, hidden)
     weights = inverse_metric(projection.metric, like)
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     keys = tuple(_key(path[0]) if path else None for path, _ in flat)

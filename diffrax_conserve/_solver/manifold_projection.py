@@ -190,12 +190,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
         check_values(self.manifold, values, t, y0, args)
-        values, sampled = started(self.manifold, values, t, y0, args)
+        values, hidden = started(self.manifold, values, t, y0, args)
         given = any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold))
         return State(
             self.solver.init(terms, t0, t1, y0, args),
             values,
-            sampled,
+            hidden,
             jnp.zeros_like(values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
             jnp.asarray(True) if given and self._is_limited(terms) else None,
@@ -224,7 +224,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             self.projection,
             self.manifold,
             state.values,
-            state.sampled,
+            state.hidden,
             args,
             time_direction(terms, t1),
             state.gained,
@@ -276,8 +276,8 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
     `Directional`, a `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
-    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), all as
-    sums of absolute components. Corrections are of the size of the local error of the wrapped
+    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), all in the
+    largest component. Corrections are of the size of the local error of the wrapped
     solver: one as long as half a step tells that the quantity is not conserved, or that the state
     jumped to another part of the manifold. With `every`, the limit is multiplied by it. It does not
     apply where the manifold has a `Constraint`, whose correction may do all the work of a step, to

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry
 from .._projection.base import ProjectionInfo
-from .._projection.equations import equations_of, hidden_scale
+from .._projection.equations import equations_of
+from .._projection.roundoff import hidden_terms
 from .._tree import ravel, tree_stop_gradient
 from .diffrax_private import member as _member
 from .diffrax_private import register
@@ -49,8 +50,8 @@ class State(eqx.Module):
     """What later steps need.
 
     - `inner`: the state of the wrapped solver.
-    - `values`, `sampled`: the conserved values, and the measured part of their scales. A value that
-      is NaN tells that the solve cannot start.
+    - `values`, `hidden`: the conserved values, and the part of their scales that the gradients do
+      not show. A value that is NaN tells that the solve cannot start.
     - `gained`: the integrals of the rates, if there are any. They are kept apart from the values,
       because the increment of one step is small and would lose digits.
     - `num_steps`: counted only if not every step is projected.
@@ -59,7 +60,7 @@ class State(eqx.Module):
 
     inner: Any
     values: Float[Array, " m"]
-    sampled: Float[Array, " m"]
+    hidden: Float[Array, " m"]
     gained: Float[Array, " m"] | None
     num_steps: Int[Array, ""] | None
     is_first: Bool[Array, ""] | None
@@ -73,20 +74,21 @@ class State(eqx.Module):
         if is_first is not None:
             is_first = jnp.zeros_like(is_first) if due is None else is_first & ~due
         statistics = self.statistics.add(info, due)
-        return State(inner, self.values, self.sampled, gained, num_steps, is_first, statistics)
+        return State(inner, self.values, self.hidden, gained, num_steps, is_first, statistics)
 
 
 def started(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """The conserved values and the measured part of their scales. The value of a `Constraint` that
-    the initial state violates by more than the square root of roundoff, relative to the size of its
-    terms, is NaN."""
+    """The conserved values and the part of their scales that the gradients do not show. The value
+    of a `Constraint` that the initial state violates by more than the square root of roundoff,
+    relative to the size of its terms, is NaN."""
     vector = ravel(y)
     numbers = ravel(values).astype(vector.dtype)
     equations = equations_of(manifold, numbers, t, y, args)
     equations, vector = tree_stop_gradient((equations, vector))
-    sampled = hidden_scale(equations, vector)
+    hidden = hidden_terms(equations.residual, vector)
+    hidden = jnp.where(jnp.isfinite(hidden), hidden, 0)
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
     sizes = [
         sum(jnp.size(x) for x in jtu.tree_leaves(part)) for part in treedef.flatten_up_to(values)
@@ -96,9 +98,9 @@ def started(
         g, jacobian = equations.linearise(vector)
         # A constraint on a component that is zero up to roundoff has a scale too.
         terms = jnp.sum(jnp.abs(jacobian), axis=1) * jnp.max(jnp.abs(vector), initial=0)
-        limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (equations.magnitude + sampled + terms)
+        limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (equations.magnitude + hidden + terms)
         numbers = jnp.where(must_hold & ~(jnp.abs(g) <= limit), jnp.nan, numbers)
-    return numbers, sampled
+    return numbers, hidden
 
 
 def member(cause: Int[Array, ""]) -> dfx.RESULTS:
@@ -120,9 +122,10 @@ def verdict(
     or the solve cannot start. `states` are the last state, the candidate and the result."""
     last, candidate, result = (ravel(y) for y in states)
     eps = float(jnp.finfo(candidate.dtype).eps)
-    # By sums, because NaN can get lost in a maximum on a CPU; in one, which is one kernel.
+    # In one kernel; NaN can get lost in a maximum on a CPU.
     parts = jnp.stack([candidate - last, candidate, result - candidate])
-    moved, size, correction = jnp.sum(jnp.abs(parts), axis=1)
+    parts = jnp.where(jnp.isnan(parts), jnp.inf, jnp.abs(parts))
+    moved, size, correction = jnp.max(parts, axis=1, initial=0)
     cause = jnp.where(ok, 0, jnp.where(jnp.isfinite(correction), _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         # A correction this small is allowed however short the step.
@@ -136,5 +139,5 @@ def verdict(
         cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    near = moved <= max(5e-4, 16 * eps) * size
+    near = (moved <= max(5e-4, 16 * eps) * size) & (moved < jnp.inf)
     return cause, near | instant | lost

@@ -28,7 +28,8 @@ class ProjectionStatistics(eqx.Module):
     - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
         state, relative to the scale of its constraint.
     - `correction`: the largest Euclidean norm of a projected state minus its candidate.
-    - `roundoff`: the largest measured share of a scale; see [`diffrax_conserve.ProjectionInfo`][].
+    - `roundoff`: the largest share of a scale that the gradient does not show; see
+        [`diffrax_conserve.ProjectionInfo`][].
     - `worst`: the position of the entry of the manifold that failed last, as
         [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
     """
