@@ -3,9 +3,9 @@
 In `1 - cos(q)` near zero the terms are about one and the gradient is about zero; in a network the
 terms of the hidden layers cancel. Only sums cancel, and each of their operands has an error of half
 a unit in the last place. To first order these change the value by `Σ v̄ v θ` over all operands `v`
-with adjoints `v̄`: a derivative in the direction of the relative errors `θ`, for which random signs
-are taken (as in the stochastic arithmetic of J. Vignes, 1993). An operand of one, as often where
-elements are masked, has no error.
+with adjoints `v̄`: a derivative in the direction of the relative errors `θ`, which are random (as in
+the stochastic arithmetic of J. Vignes, 1993). What does not depend on the state, such as a constant
+or a masked element, has the same error at each evaluation, which is none here.
 """
 
 import functools as ft
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-_SAMPLES = 4
+_SAMPLES = 8
 # What other operations contain is taken as one sum.
 _SUMS = {"add", "add_any", "sub", "reduce_sum", "dot_general", "cumsum", "conv_general_dilated"}
 
@@ -28,36 +28,41 @@ def hidden_terms(
 ) -> Float[Array, " m"]:
     """The roundoff of `fn(y)` in units of roundoff: the largest of some samples."""
     closed = jax.make_jaxpr(fn)(y)
+    evaluated = ft.partial(_evaluated, closed.jaxpr, closed.consts)
 
-    def sample(sample: Array) -> Float[Array, " m"]:
+    def operands(y: Array) -> list[Any]:
+        found = []
+        evaluated([y], lambda x: found.append(x) or x)
+        return found
+
+    elsewhere = jnp.sin(jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2) - y
+    depends = [a != b for a, b in zip(operands(y), operands(elsewhere), strict=True)]
+
+    def sample(weights: list[list[Array]]) -> Float[Array, " m"]:
         def rounded(size: Array) -> Array:
-            errors = _Errors(size, sample)
-            return _evaluated(errors, closed.jaxpr, closed.consts, [y])[0]
+            given = zip(depends, weights, strict=True)
+
+            def changed(x: Any) -> Array:
+                moves, axes = next(given)
+                share = 0.5 * ft.reduce(jnp.multiply.outer, axes).reshape(np.shape(x))
+                share = jnp.where(moves, share, 0).astype(jnp.finfo(jnp.result_type(x)).dtype)
+                return _changed(x, share, size)
+
+            return evaluated([y], changed)[0]
 
         zero = jnp.zeros((), y.dtype)
         return jnp.abs(jax.jvp(rounded, (zero,), (jnp.ones_like(zero),))[1])
 
-    # A sample is the one of its signs that is not zero, so that the signs are constants.
-    return jnp.max(jax.vmap(sample)(jnp.eye(_SAMPLES, dtype=y.dtype)), axis=0)
+    weights = [_weights(number, np.shape(x), y.dtype) for number, x in enumerate(depends)]
+    return jnp.max(jax.vmap(sample)(weights), axis=0)
 
 
-class _Errors:
-    """Relative errors of `size` times plus or minus a half, others for each operand."""
-
-    def __init__(self, size: Array, sample: Array):
-        self.size, self.sample, self.operands = size, sample, 0
-
-    def __call__(self, x: Any) -> Any:
-        if not jnp.issubdtype(jnp.result_type(x), jnp.inexact):
-            return x
-        self.operands += 1
-        rng = np.random.default_rng(self.operands)
-        # A product of one sign for each axis.
-        shape = np.shape(x) or (1,)
-        axes = [self.sample @ rng.choice([-1.0, 1.0], (_SAMPLES, n)) for n in shape]
-        signs = ft.reduce(jnp.multiply.outer, axes).reshape(np.shape(x))
-        share = jnp.where(jnp.abs(x) == 1, 0, 0.5 * signs)
-        return _changed(x, share.astype(jnp.finfo(jnp.result_type(x)).dtype), self.size)
+def _weights(seed: int, shape: tuple[int, ...], dtype: Any) -> list[Array]:
+    """For each sample, random numbers of both signs and size one: for an array the product of one
+    for each axis. Not of size one exactly: two equal terms would cancel in every other sample."""
+    rng = np.random.default_rng(seed)
+    sizes = [(_SAMPLES, n) for n in shape or (1,)]
+    return [jnp.asarray(rng.choice([-1, 1], x) * rng.uniform(0.5, 1.5, x), dtype) for x in sizes]
 
 
 @jax.custom_jvp
@@ -73,12 +78,15 @@ def _changed_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return _changed(*primals), tangents[0] + x * share * tangents[2].astype(share.dtype)
 
 
-def _evaluated(errors: _Errors, jaxpr: Any, consts: Any, inputs: Any) -> list[Any]:
-    """The outputs of a jaxpr whose sums have operands with errors."""
+def _evaluated(jaxpr: Any, consts: Any, inputs: Any, changed: Callable[[Any], Any]) -> list[Any]:
+    """The outputs of a jaxpr whose sums have `changed` operands."""
     env: dict[Any, Any] = {}
 
     def read(var: Any) -> Any:
         return var.val if isinstance(var, jex.Literal) else env[var]
+
+    def operand(x: Any) -> Any:
+        return changed(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
 
     env.update(zip(jaxpr.constvars, consts, strict=True))
     env.update(zip(jaxpr.invars, inputs, strict=True))
@@ -86,10 +94,10 @@ def _evaluated(errors: _Errors, jaxpr: Any, consts: Any, inputs: Any) -> list[An
         given = [read(var) for var in eqn.invars]
         if eqn.primitive.name == "jit":
             inner = eqn.params["jaxpr"]
-            outs = _evaluated(errors, inner.jaxpr, inner.consts, given)
+            outs = _evaluated(inner.jaxpr, inner.consts, given, changed)
         else:
             if eqn.primitive.name in _SUMS or jex.jaxprs_in_params(eqn.params):
-                given = map(errors, given)
+                given = map(operand, given)
             outs = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
             outs = outs if eqn.primitive.multiple_results else [outs]
         env.update(zip(eqn.outvars, outs, strict=True))
