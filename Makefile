@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
+.PHONY: help demo test slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -70,6 +70,15 @@ slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest $(SHARED) -m slow
+
+# All that the package annotates in a solve, a projection, a system and a network is called by these.
+CHECKED := tests/laws/test_projection.py tests/solver/test_saving.py tests/solver/test_options.py \
+  tests/systems/test_conformance.py tests/network/test_layer.py
+
+# Without a summary line of its own: see `examples`.
+shapes: export SHAPES := 1
+shapes: $(TEST) ## run some tests with the types and shapes of all arguments checked
+	$(BIN)/python -m pytest $(SHARED) -qq -m "not slow and not examples" $(CHECKED)
 
 COUNT ?= 10000
 SEED ?= 0

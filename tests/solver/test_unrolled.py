@@ -49,11 +49,8 @@ def test_same_steps_and_dense_output(solver):
                 dfx.PIDController(rtol=1e-6, atol=1e-6), jump_ts=[0.4, 1.1]
             )
         ),
-        pytest.param(
-            dict(stepsize_controller=dfx.ConstantStepSize(), dt0=0.05), marks=pytest.mark.slow
-        ),
     ],
-    ids=["backwards", "jumps", "fixed steps"],
+    ids=["backwards", "jumps"],
 )
 def test_same_as_the_wrapped_solver(kwargs):
     ours, theirs = (solve(s, **kwargs) for s in (dfc.Unrolled(dfx.Tsit5()), dfx.Tsit5()))

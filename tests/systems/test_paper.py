@@ -15,6 +15,7 @@ E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131. Its misprints, corrected here:
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -152,7 +153,7 @@ CASES = {
     ),
     "double-pendulum": Case(
         lambda m1, m2, l1, l2, g: systems.DoublePendulum(
-            jnp.stack([m1, m2]), jnp.stack([l1, l2]), g
+            jnp.stack([m1, m2]), jnp.stack([l1, l2]), gravity=g
         ),
         pendulum_field,
         {"energy": pendulum_energy},
@@ -188,21 +189,21 @@ def largest_relative(ours, theirs):
 
 
 @pytest.mark.parametrize("name", list(CASES))
-@pytest.mark.parametrize("given", ["random parameters", "the default ones"])
-def test_equations_and_integrals_are_those_printed(name, given):
+def test_equations_and_integrals_are_those_printed(name):
     case = CASES[name]
     system = systems.get(name)
     state_key, parameter_key = jr.split(jr.key(13))
     ys = jax.jit(jax.vmap(system.sample))(jr.split(state_key, COUNT))
     shape = (COUNT, case.parameters)
     parameters = jr.uniform(parameter_key, shape, minval=0.5, maxval=2.0)
-    if given == "the default ones":
-        parameters = jnp.broadcast_to(jnp.array(DEFAULTS[name]), shape)
+    # The first ones are the default.
+    parameters = parameters.at[0].set(jnp.array(DEFAULTS[name]))
+    assert eqx.tree_equal(case.make(*map(jnp.asarray, DEFAULTS[name])), system)
 
     @jax.jit
     @jax.vmap
     def both(y, p):
-        own = case.make(*p) if given == "random parameters" else system
+        own = case.make(*p)
         state = case.ours(y, *p)
         rates = case.theirs(own.vector_field(0.0, state, None), *p), case.field(y, *p)
         values = {
@@ -250,11 +251,6 @@ def test_flow_maps_take_the_papers_steps(name):
     step, number = STEPS[name]
     assert system.dt == step
     assert system.t1 == step * number
-
-
-def test_the_rigid_body_turns_one_and_a_half_times():
-    system = systems.RigidBody()
-    assert 1.5 < system.t1 / float(system.period()) < 1.6
 
 
 def drawn(name):
