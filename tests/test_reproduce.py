@@ -1,16 +1,13 @@
 """The command line: what it prints and writes, and how it refuses what it cannot do."""
 
 import contextlib
-import errno
 import io
 import json
-import os
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
-import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -143,17 +140,6 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk(tmp_path, monkeypatch, capsys, only_rk4):
-    def full(*arguments, **options):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "metrics.json")
-
-    monkeypatch.setattr("diffrax_conserve.reproduce._job.replace_file", full)
-    argv = ["reproduce", "harmonic-oscillator", "--t1", "0.5", "--out", str(tmp_path / "out")]
-    assert main(argv) == 1
-    found = capsys.readouterr().err
-    assert found.endswith("\nerror: cannot write metrics.json: No space left on device\n")
-
-
 PROJECT = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").read_text())
 MODULE, FUNCTION = PROJECT["project"]["scripts"]["diffrax-conserve"].split(":")
 
@@ -278,18 +264,6 @@ def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys
     assert rows["projected rk4"]["state_error"] is None
     assert np.isfinite(rows["rk4"]["state_error"])
     assert "projected rk4 FAILED after t = " in capsys.readouterr().out
-
-
-def test_a_solver_that_cannot_start(tmp_path, capsys, monkeypatch):
-    def solvers(system, networks):
-        return {"rk4": dfc.RK4(), "leapfrog": dfx.SemiImplicitEuler()}
-
-    monkeypatch.setattr(_job, "solvers", solvers)
-    status, metrics = reproduce(tmp_path, *KEPLER)
-    assert status == 1
-    assert "failure" in metrics["solvers"]["leapfrog"]
-    assert metrics["solvers"]["rk4"]["state_error"] > 0
-    assert "leapfrog FAILED at the start" in capsys.readouterr().out
 
 
 @pytest.mark.slow

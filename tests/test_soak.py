@@ -29,19 +29,6 @@ def test_the_oracle_takes_a_rounded_answer_and_refuses_one_that_is_off(name, dty
     assert np.isinf(oracle.ratio(family.fn, lane["start"], lane["a"], value)[3])
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_the_scale_is_that_of_finite_differences(name):
-    family = FAMILIES[name]
-    y, a = map(oracle.long, family.draw(np.random.default_rng(1), 5))
-    value = oracle.values(family.fn, y, a)
-    expected = np.abs(value)
-    for k in range(family.n):
-        h = 1e-6 * y[k] * np.eye(family.n)[:, [k]]
-        change = oracle.values(family.fn, y + h, a) - oracle.values(family.fn, y - h, a)
-        expected = expected + np.abs(change) / 2e-6
-    np.testing.assert_allclose(oracle.scales(family.fn, y, a, value), expected, 1e-5)
-
-
 def test_every_attack_has_its_turn_and_its_share():
     options = argparse.Namespace(attack=None, count=10**6, lanes=None, seed=0, program=None)
     jobs = runner.jobs_of(options)

@@ -218,9 +218,10 @@ def test_mistakes_are_named():
     wrong = dfc.FirstIntegral(energy, rate=lambda t, y, args: jnp.ones(2))
     with pytest.raises(ValueError, match="`rate` of `manifold` returns"):
         solve(manifold=wrong)
+    sol = solve(saveat=dfx.SaveAt(t0=True, t1=True), solver=dfx.Euler())
     with pytest.raises(ValueError, match="dense=True"):
-        dfc.drift(solve(saveat=dfx.SaveAt(t0=True, t1=True)), BALANCE, ARGS)
+        dfc.drift(sol, BALANCE, ARGS)
     with pytest.raises(ValueError, match="a balance law"):
         dfc.learned.ConservativeLayer(BALANCE)
     with pytest.raises(ValueError, match="a balance law"):
-        dct.assert_conserved(solve(), BALANCE, ARGS)
+        dct.assert_conserved(sol, BALANCE, ARGS)

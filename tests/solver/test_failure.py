@@ -250,6 +250,5 @@ def test_a_first_projection_may_be_as_long_as_a_given_value_needs():
 
 
 def test_no_limit_is_no_limit_at_an_equilibrium():
-    for limit in (None, float("inf")):
-        sol = run(WELL, y0=jnp.array([1.0, 0.0]), vector_field=double_well, max_correction=limit)
-        assert sol.result == dfx.RESULTS.successful
+    sol = run(WELL, y0=jnp.array([1.0, 0.0]), vector_field=double_well, max_correction=None)
+    assert sol.result == dfx.RESULTS.successful
