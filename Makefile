@@ -71,9 +71,9 @@ slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest $(SHARED) -m slow
 
-# All that the package annotates in a solve, a projection, a system and a network is called by these.
-CHECKED := tests/laws/test_projection.py tests/solver/test_saving.py tests/solver/test_options.py \
-  tests/systems/test_conformance.py tests/network/test_layer.py
+# Some projections, solves, systems and networks.
+CHECKED := tests/laws/test_projection.py tests/solver/test_saving.py tests/systems/test_paper.py \
+  tests/network/test_layer.py
 
 # Without a summary line of its own: see `examples`.
 shapes: export SHAPES := 1
@@ -83,7 +83,7 @@ shapes: $(TEST) ## run some tests with the types and shapes of all arguments che
 COUNT ?= 10000
 SEED ?= 0
 
-soak: $(TEST) ## try COUNT random combinations of everything, in search of a wrong one
+soak: $(TEST) ## attack the promises COUNT times, in search of a wrong success
 	$(BIN)/python -m tests.soak --count $(COUNT) --seed $(SEED)
 
 mutants: $(TEST) ## plant defects, and see that the tests notice each

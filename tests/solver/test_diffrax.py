@@ -76,14 +76,20 @@ def test_adjoints_agree(backwards, forwards):
     np.testing.assert_allclose(forward(OMEGA0, forwards), expected, atol=1e-8)
 
 
-def test_backsolve_adjoint_explains():
+def backsolved(y0, adjoint):
     solver = dfc.ManifoldProjection(dfx.Euler(), RIGID_BODY)
+    return jnp.sum(solve(rigid_body, solver, y0, t1=0.3, dt0=0.01, adjoint=adjoint).ys ** 3)
 
-    def end(y0):
-        return jnp.sum(solve(rigid_body, solver, y0, adjoint=dfx.BacksolveAdjoint()).ys)
 
+def test_backsolve_adjoint_explains():
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=inner\)"):
-        jax.grad(end)(OMEGA0)
+        jax.grad(backsolved)(OMEGA0, dfx.BacksolveAdjoint())
+
+
+@pytest.mark.slow
+def test_backsolve_adjoint_works_with_the_inner_solver():
+    got = eqx.filter_jit(jax.grad(backsolved))(OMEGA0, dfx.BacksolveAdjoint(solver=dfx.Euler()))
+    assert bool(jnp.all(jnp.isfinite(got)))
 
 
 def test_gradient_with_respect_to_conserved_value_end_time_and_what_is_closed_over():

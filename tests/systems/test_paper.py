@@ -238,19 +238,15 @@ STEPS = {
 }
 
 
-@pytest.mark.parametrize("name", list(HORIZONS))
-def test_single_solutions_start_and_end_where_the_paper_says(name):
+@pytest.mark.parametrize("name", list(DEFAULTS))
+def test_solutions_start_and_steps_end_where_the_paper_says(name):
     system = systems.get(name)
-    assert system.t1 == HORIZONS[name]
-    np.testing.assert_array_equal(system.y0, STARTS[name])
-
-
-@pytest.mark.parametrize("name", list(STEPS))
-def test_flow_maps_take_the_papers_steps(name):
-    system = systems.get(name)
-    step, number = STEPS[name]
-    assert system.dt == step
-    assert system.t1 == step * number
+    if name in HORIZONS:
+        assert system.t1 == HORIZONS[name]
+        np.testing.assert_array_equal(system.y0, STARTS[name])
+    else:
+        step, number = STEPS[name]
+        assert (system.dt, system.t1) == (step, step * number)
 
 
 def drawn(name):
@@ -279,7 +275,7 @@ def hidden(net):
 
 @pytest.mark.parametrize("kind", ["standard", "conservative"])
 @pytest.mark.parametrize("name", list(DEFAULTS))
-def test_networks_have_the_papers_sizes(name, kind):
+def test_networks_and_recipe_have_the_papers_numbers(name, kind):
     network = build(systems.get(name), kind, jr.key(0), jr.key(1))
     if name in HORIZONS:
         assert (network.t0, network.t1) == (0.0, HORIZONS[name])
@@ -291,11 +287,6 @@ def test_networks_have_the_papers_sizes(name, kind):
         assert hidden(net) == [40] * 4
         assert net.activation is jnp.tanh
     assert (network.layer is not None) == (kind == "conservative")
-
-
-@pytest.mark.parametrize("name", list(DEFAULTS))
-def test_the_recipe_has_the_papers_numbers(name):
-    network = build(systems.get(name), "standard", jr.key(0), jr.key(1))
     recipe = dfc.learned.paper(network)
     assert recipe.epochs == 5000
     assert recipe.points == (2000 if name in HORIZONS else 5000)
