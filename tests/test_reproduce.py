@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.__main__ import main
 from diffrax_conserve._replace_file import replace_file
-from diffrax_conserve.reproduce import _job
+from diffrax_conserve.reproduce import _job, main
 
 FIGURES = ("trajectory", "drift", "state_error")
 PAPER = dfc.systems.names()[:5]
