@@ -67,6 +67,7 @@ def test_a_run_continues_from_its_file(monkeypatch, tmp_path, capsys):
     assert "WRONG: why: 1" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("which", [("exponential", "simplified"), ("quartic", "closed form")])
 def test_far_candidates_in_short(which):
     index = far.PROGRAMS.index((*which, np.float64))
     number = next(n for n in range(len(far.PROGRAMS)) if 7 * n % len(far.PROGRAMS) == index)
