@@ -130,7 +130,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
-# that the pages recommend. The slow tests judge what most of these runs find.
+# that the pages recommend.
 SMALL_LOOPS := xla_cpu_small_while_loop_byte_threshold=65536
 comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))

@@ -31,23 +31,24 @@ def vortex_impulse_with_a_sum_from_zero(t, y, args):
     return jnp.sum(y[:, 0]) + y[-1, 0]
 
 
-@pytest.mark.parametrize(
-    ("name", "misprint"),
-    [
-        ("rigid-body", rigid_body_momentum_as_printed),
-        ("double-pendulum", double_pendulum_energy_without_bracket),
-        ("point-vortices", vortex_energy_with_the_separation_as_printed),
-        ("point-vortices", vortex_impulse_with_a_sum_from_zero),
+MISPRINTS = {
+    "rigid-body": [rigid_body_momentum_as_printed],
+    "double-pendulum": [double_pendulum_energy_without_bracket],
+    "point-vortices": [
+        vortex_energy_with_the_separation_as_printed,
+        vortex_impulse_with_a_sum_from_zero,
     ],
-)
-def test_it_finds_each_misprint_of_the_paper(name, misprint):
+}
+
+
+@pytest.mark.parametrize("name", MISPRINTS)
+def test_it_finds_each_misprint_of_the_paper(name):
     system = systems.get(name)
-    manifold = {**system.manifold, "as printed": dfc.FirstIntegral(misprint)}
-    report = check_invariance(system.vector_field, manifold, system.sample)
-    assert not report.ok
+    printed = {fn.__name__: dfc.FirstIntegral(fn) for fn in MISPRINTS[name]}
+    report = check_invariance(system.vector_field, system.manifold | printed, system.sample)
     for entry in report.entries:
-        assert entry.ok == (entry.name != "as printed")
-    assert max(entry.defect for entry in report.entries) > 1e-2
+        assert entry.ok == (entry.name not in printed)
+        assert entry.ok or entry.defect > 1e-2
 
 
 def test_it_finds_a_sign_error_in_the_vector_field():
