@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
+.PHONY: help demo test slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -71,10 +71,19 @@ slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest $(SHARED) -m slow
 
+# Some projections, solves, systems and networks.
+CHECKED := tests/laws/test_projection.py tests/solver/test_saving.py tests/systems/test_paper.py \
+  tests/network/test_layer.py
+
+# Without a summary line of its own: see `examples`.
+shapes: export SHAPES := 1
+shapes: $(TEST) ## run some tests with the types and shapes of all arguments checked
+	$(BIN)/python -m pytest $(SHARED) -qq -m "not slow and not examples" $(CHECKED)
+
 COUNT ?= 10000
 SEED ?= 0
 
-soak: $(TEST) ## try COUNT random combinations of everything, in search of a wrong one
+soak: $(TEST) ## attack the promises COUNT times, in search of a wrong success
 	$(BIN)/python -m tests.soak --count $(COUNT) --seed $(SEED)
 
 mutants: $(TEST) ## plant defects, and see that the tests notice each
@@ -121,7 +130,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
-# that the pages recommend. The slow tests judge what most of these runs find.
+# that the pages recommend.
 SMALL_LOOPS := xla_cpu_small_while_loop_byte_threshold=65536
 comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))

@@ -1,20 +1,14 @@
-"""Double precision, run-time shape checks, and hypothesis profiles for the whole suite."""
+"""Double precision, a cache of what is compiled, and hypothesis profiles for the whole suite."""
 
-import contextlib
-import functools as ft
 import gc
 import importlib
 import itertools
 import os
 import shutil
-import types
 from pathlib import Path
 
 import jax
-import jaxtyping
 import pytest
-from beartype import BeartypeConf, beartype
-from beartype.door import is_bearable
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
@@ -51,46 +45,10 @@ def errors_raise(monkeypatch):
         yield
 
 
-_jaxtyped = jaxtyping.jaxtyped
-_CHECKED = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
-
-
-def _once(fn=None, *, typechecker):
-    """In place of jaxtyping's decorator, which checks the arguments of a function twice."""
-    if fn is None:
-        return ft.partial(_once, typechecker=typechecker)
-    if not isinstance(fn, types.FunctionType):
-        return _jaxtyped(fn, typechecker=typechecker)
-    checked = _jaxtyped(_CHECKED(fn), typechecker=None)
-
-    @ft.wraps(fn)
-    def called(*args, **kwargs):
-        unchecked = jaxtyping.config.jaxtyping_disable
-        return fn(*args, **kwargs) if unchecked else checked(*args, **kwargs)
-
-    return called
-
-
-jaxtyping.jaxtyped = _once
-# Before the first import of the package: its annotations are then checked at every call.
-install_import_hook("diffrax_conserve", "beartype.beartype")
-
-
-def _checked_by_beartype(accepts):
-    """In place of jaxtyping's `typechecked`, for its function of a leaf of a `PyTree[...]`."""
-    (hint,) = accepts.__annotations__.values()
-
-    def check(x):
-        if not is_bearable(x, hint):
-            raise TypeError
-
-    return check
-
-
-# jaxtyping looks up the signature of that function anew for every leaf, which was a fifth of the
-# time of tracing. `test_typeguards.py` holds that leaves are checked as before.
-with contextlib.suppress(ImportError):
-    importlib.import_module("jaxtyping._typeguard").typechecked = _checked_by_beartype
+# Annotations are checked at every call in `make shapes` alone: it takes an eighth of the time.
+if os.environ.get("SHAPES"):
+    # Before the first import of the package.
+    install_import_hook("diffrax_conserve", "beartype.beartype")
 
 # Tracing makes many small objects, of which few are garbage: a tenth of its time.
 gc.set_threshold(50_000, 20, 100)

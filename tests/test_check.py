@@ -1,6 +1,5 @@
 """`check_invariance` accepts what is conserved, and finds what is not."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -32,23 +31,24 @@ def vortex_impulse_with_a_sum_from_zero(t, y, args):
     return jnp.sum(y[:, 0]) + y[-1, 0]
 
 
-@pytest.mark.parametrize(
-    ("name", "misprint"),
-    [
-        ("rigid-body", rigid_body_momentum_as_printed),
-        ("double-pendulum", double_pendulum_energy_without_bracket),
-        ("point-vortices", vortex_energy_with_the_separation_as_printed),
-        ("point-vortices", vortex_impulse_with_a_sum_from_zero),
+MISPRINTS = {
+    "rigid-body": [rigid_body_momentum_as_printed],
+    "double-pendulum": [double_pendulum_energy_without_bracket],
+    "point-vortices": [
+        vortex_energy_with_the_separation_as_printed,
+        vortex_impulse_with_a_sum_from_zero,
     ],
-)
-def test_it_finds_each_misprint_of_the_paper(name, misprint):
+}
+
+
+@pytest.mark.parametrize("name", MISPRINTS)
+def test_it_finds_each_misprint_of_the_paper(name):
     system = systems.get(name)
-    manifold = {**system.manifold, "as printed": dfc.FirstIntegral(misprint)}
-    report = check_invariance(system.vector_field, manifold, system.sample)
-    assert not report.ok
+    printed = {fn.__name__: dfc.FirstIntegral(fn) for fn in MISPRINTS[name]}
+    report = check_invariance(system.vector_field, system.manifold | printed, system.sample)
     for entry in report.entries:
-        assert entry.ok == (entry.name != "as printed")
-    assert max(entry.defect for entry in report.entries) > 1e-2
+        assert entry.ok == (entry.name not in printed)
+        assert entry.ok or entry.defect > 1e-2
 
 
 def test_it_finds_a_sign_error_in_the_vector_field():
@@ -62,16 +62,6 @@ def test_it_finds_a_sign_error_in_the_vector_field():
         ("Casimir", True),
         ("energy", False),
     ]
-
-
-def test_it_finds_a_small_error():
-    system = systems.Kepler()
-
-    def wrong(t, y, args):
-        dq, dp = system.vector_field(t, y, args)
-        return dq, (1 + 1e-10) * dp
-
-    assert not check_invariance(wrong, system.manifold, system.sample).ok
 
 
 def test_the_defect_is_relative_to_the_size_of_the_terms():
@@ -89,13 +79,6 @@ def test_the_defect_is_relative_to_the_size_of_the_terms():
     assert report.entries[0].defect < 1e-15
 
 
-def test_scaling_an_integral_changes_nothing():
-    system = systems.HenonHeiles()
-    for factor in (1e-150, 1e150):
-        scaled = dfc.FirstIntegral(lambda t, y, a, c=factor: c * system.energy(t, y, a))
-        assert check_invariance(system.vector_field, scaled, system.sample, num_states=8).ok
-
-
 def test_explicit_time_is_part_of_the_derivative():
     def f(t, y, args):
         return y
@@ -107,15 +90,6 @@ def test_explicit_time_is_part_of_the_derivative():
     assert check_invariance(f, dfc.FirstIntegral(integral), ys, t=jnp.linspace(0.0, 3.0, 7)).ok
     report = check_invariance(f, dfc.FirstIntegral(lambda t, y, a: y), ys, t=1.0)
     assert not report.ok
-
-
-def test_one_wrong_element_of_an_array_is_enough():
-    system = systems.RigidBody()
-
-    def both(t, y, args):
-        return {"right": system.energy(t, y, args), "wrong": jnp.stack([y[0], y[1]])}
-
-    assert not check_invariance(system.vector_field, dfc.FirstIntegral(both), system.sample).ok
 
 
 def test_a_state_given_as_a_batch_is_checked_and_named():
@@ -160,15 +134,6 @@ def test_states_off_the_constraints_are_refused():
         check_invariance(system.vector_field, system.manifold, ys)
 
 
-def test_single_precision_is_judged_by_its_own_roundoff():
-    system = systems.PointVortices()
-    ys = jax.vmap(system.sample)(jr.split(jr.key(0), 50)).astype(jnp.float32)
-    report = check_invariance(system.vector_field, system.manifold, ys)
-    assert report.ok
-    np.testing.assert_allclose(report.rtol, 1e4 * np.finfo(np.float32).eps)
-    assert all(1e-10 < entry.defect < 1e-5 for entry in report.entries)
-
-
 def test_the_report_reads_as_a_table():
     system = systems.RigidBody()
     text = str(check_invariance(system.vector_field, system.manifold, system.sample))
@@ -177,25 +142,6 @@ def test_the_report_reads_as_a_table():
     assert [row.split("  ")[1] for row in rows] == ["energy", "squared angular momentum"]
     assert all(row.endswith("conserved") for row in rows)
     assert len({row.index("first integral") for row in rows}) == 1
-
-
-def test_a_sampler_and_a_vector_field_may_be_modules():
-    class Rotation(eqx.Module):
-        rate: jax.Array
-
-        def __call__(self, t, y, args):
-            return self.rate * jnp.stack([-y[1], y[0]])
-
-    class Sampler(eqx.Module):
-        scale: jax.Array
-
-        def __call__(self, key):
-            return self.scale * jr.normal(key, (2,))
-
-    norm = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    report = check_invariance(Rotation(jnp.array(2.0)), norm, Sampler(jnp.array(3.0)), num_states=7)
-    assert report.ok
-    assert report.num_states == 7
 
 
 @pytest.mark.parametrize(
@@ -212,22 +158,10 @@ def test_a_vector_field_unlike_the_state_is_refused(bad):
         check_invariance(bad, dfc.FirstIntegral(lambda t, y, a: y[0]), jnp.ones((4, 3)))
 
 
-def test_times_that_do_not_match_the_states_are_refused():
-    with pytest.raises(ValueError, match="`t` must be one time or one for each"):
-        check_invariance(
-            lambda t, y, a: y, dfc.FirstIntegral(lambda t, y, a: y), jnp.ones(4), t=jnp.ones(3)
-        )
-
-
 def test_one_state_is_no_batch():
     pendulum, energy = lambda t, y, a: jnp.stack([y[1], -y[0]]), lambda t, y, a: jnp.sum(y**2)
     with pytest.raises(ValueError, match=r"For one state `y` write `jax.tree.map"):
         check_invariance(pendulum, dfc.FirstIntegral(energy), jnp.ones(2))
-
-
-def test_a_bare_function_is_refused():
-    with pytest.raises(TypeError, match="FirstIntegral"):
-        check_invariance(lambda t, y, a: y, lambda t, y, a: y, jnp.ones(4))
 
 
 def test_forces_that_cancel_up_to_roundoff_conserve():

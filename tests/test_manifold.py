@@ -170,11 +170,6 @@ def test_drift_of_nothing():
         dfc.drift(batch, RIGID_BODY)
 
 
-def test_a_closed_form_needs_a_function():
-    with pytest.raises(TypeError, match="not callable"):
-        dfc.ClosedForm(3.0)  # pyright: ignore
-
-
 ENERGY = dfc.FirstIntegral(rotational_energy)
 NEWTONS = dfc.SimplifiedNewton, dfc.Newton, dfc.Directional
 

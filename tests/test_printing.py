@@ -6,10 +6,8 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import diffrax_conserve as dfc
-from diffrax_conserve._printing import printed
 
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
@@ -39,17 +37,6 @@ def test_a_batch_is_printed_by_its_ranges():
     assert "correction       1.0e+00 to 4.0e+00" in str(info)
 
 
-def test_inside_a_compiled_function_there_are_no_numbers_to_print():
-    def text(y):
-        nonlocal seen
-        seen = str(dfc.project(SPHERE, y)[1])
-        return y
-
-    seen = ""
-    jax.jit(text)(jnp.ones(2))
-    assert "ProjectionInfo" in seen
-
-
 def test_statistics_print_numbers():
     sol = eqx.filter_jit(dfx.diffeqsolve)(
         dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]])),
@@ -63,17 +50,6 @@ def test_statistics_print_numbers():
     text = str(dfc.statistics(sol))
     assert text.splitlines()[1] == "  num_projections  8"
     assert "worst" not in text
-
-
-def test_rows_are_aligned_and_an_empty_batch_is_none():
-    rows = {"a": 1234567, "long": np.float32(0.5), "none": np.zeros(0), "same": np.ones(3)}
-    assert printed("title", rows).splitlines() == [
-        "title",
-        "  a     1,234,567",
-        "  long  5.0e-01",
-        "  none  none",
-        "  same  1.0e+00",
-    ]
 
 
 def test_help_opens_with_an_introduction():

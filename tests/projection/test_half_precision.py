@@ -36,7 +36,7 @@ def solve(projection, dtype):
 CASES = combinations({name: name for name in WORK}, {x.__name__: x for x in DTYPES})
 
 
-@some_of("name,dtype", CASES.values(), ids=CASES, period=4)
+@some_of("name,dtype", CASES.values(), ids=CASES, period=5)
 def test_it_works_in_half_precision(name, dtype):
     ys = solve(WORK[name], dtype).ys
     assert ys.dtype == dtype
@@ -48,7 +48,6 @@ def test_it_works_in_half_precision(name, dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("projection", [dfc.Newton(), dfc.Newton(upper=2.0)])
-def test_it_is_refused_before_compilation(projection, dtype):
+def test_it_is_refused_before_compilation(dtype):
     with pytest.raises(TypeError, match="Convert the state to float32"):
-        jax.eval_shape(lambda: solve(projection, dtype).ys)
+        jax.eval_shape(lambda: solve(dfc.Newton(), dtype).ys)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from hypothesis import assume, example, given
+from hypothesis import assume, example, given, settings
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
@@ -38,19 +38,12 @@ one_projection = some_of("projection", PROJECTIONS.values(), ids=PROJECTIONS, pe
 
 ENERGY, MOMENTUM = RIGID_BODY.values()
 SQUARED_ENERGY = dfc.FirstIntegral(lambda t, y, args: rotational_energy(t, y, args) ** 2)
-SCALED = dfc.FirstIntegral(lambda t, y, args: args * squared_momentum(t, y, None))
 PLANE = dfc.Constraint(lambda t, y, args: args[0] @ y - args[1])
 SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
 
 def stack(y):
     return jnp.concatenate([y["a"], y["b"][None]])
-
-
-TREE = {
-    name: dfc.FirstIntegral(lambda t, y, args, fn=entry.fn: fn(t, stack(y), args))
-    for name, entry in RIGID_BODY.items()
-}
 
 
 # Compiled once for each manifold: what is drawn is passed in, never closed over.
@@ -68,48 +61,17 @@ def successful(info):
     return bool(info.result == optx.RESULTS.successful)
 
 
-@each_projection
-@given(y=near)
-def test_success_means_that_the_residual_is_at_roundoff(projection, y):
-    projected, info = project(RIGID_BODY, y, projection)
-    assert successful(info)
-    assert info.residual_after <= 16 * EPS
-    # Independently, and relative to the conserved value alone:
-    w = np.asarray(projected, np.longdouble)
-    inertia = np.array([0.1, 0.2, 0.3])
-    assert abs(np.sum(inertia * w**2) / 2 - 0.3) <= 4e-15 * 0.3
-    assert abs(np.sum((inertia * w) ** 2) - 0.14) <= 4e-15 * 0.14
-
-
 @one_projection
 @given(y=near)
-def test_permuting_the_constraints_changes_nothing(projection, y):
-    a, _ = project(tuple(RIGID_BODY.values()), y, projection, tuple(VALUES.values()))
-    b, _ = project(tuple(RIGID_BODY.values())[::-1], y, projection, tuple(VALUES.values())[::-1])
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-
-
-@one_projection
-@given(y=near)
-def test_a_duplicated_or_dependent_constraint_changes_nothing(projection, y):
+def test_a_permuted_duplicated_or_dependent_constraint_changes_nothing(projection, y):
     """The Gram matrix is singular then."""
     plain, _ = project(RIGID_BODY, y, projection)
     for entry, value in [(ENERGY, VALUES["energy"]), (SQUARED_ENERGY, VALUES["energy"] ** 2)]:
-        redundant = (ENERGY, MOMENTUM, entry)
-        values = (VALUES["energy"], VALUES["momentum"], value)
+        redundant = (MOMENTUM, ENERGY, entry)
+        values = (VALUES["momentum"], VALUES["energy"], value)
         y1, info = project(redundant, y, projection, values)
         assert successful(info)
         np.testing.assert_allclose(y1, plain, rtol=0, atol=1e-12)
-
-
-@one_projection
-@given(y=near, factor=st.floats(1e-8, 1e8))
-def test_the_scale_of_a_constraint_changes_nothing(projection, y, factor):
-    values = (VALUES["energy"], factor * VALUES["momentum"])
-    a, info = project((ENERGY, SCALED), y, projection, values, args=jnp.asarray(factor))
-    b, _ = project(RIGID_BODY, y, projection)
-    assert successful(info)
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
 
 
 @given(y=vectors(4, 10.0), matrix=vectors((2, 4), 1.0), b=vectors(2, 10.0), weights=vectors(4, 1.0))
@@ -151,14 +113,6 @@ def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weig
         np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
 
 
-@given(y=vectors(5, 3.0))
-def test_sphere_agrees_with_normalising(y):
-    assume(np.linalg.norm(y) > 0.3)
-    projected, info = project(SPHERE, y, dfc.Newton(), None)
-    assert successful(info)
-    np.testing.assert_allclose(projected, y / np.linalg.norm(y), rtol=0, atol=1e-14)
-
-
 @given(y=near, weights=vectors(3, 2.0))
 def test_newton_finds_the_nearest_point(y, weights):
     """On a curve: the weighted correction is orthogonal to the tangent, and no point found by
@@ -186,44 +140,28 @@ def test_simplified_newton_moves_along_the_gradients_at_the_candidate(y, weights
 
 
 @each_projection
-@given(ys=vectors((7, 3), 0.05).map(lambda d: np.ones(3) + d))
-def test_a_lane_of_a_batch_is_that_lane_alone(projection, ys):
-    batched, info = batch(ys, projection)
-    for i, y in enumerate(ys):
-        alone, alone_info = project(RIGID_BODY, y, projection)
-        np.testing.assert_allclose(batched[i], alone, rtol=0, atol=1e-14)
-        assert abs(int(info.num_steps[i]) - int(alone_info.num_steps)) <= 1
-
-
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]))
-def test_lanes_that_need_more_iterations_are_as_alone(seed, share):
-    """From none to all of a batch, and some of them fail."""
+def test_a_lane_of_a_batch_is_that_lane_alone(projection, seed, share):
+    """Where some need more iterations, or all do, or none, and some of them fail."""
     rng = np.random.default_rng(seed)
     lanes = 260
     size = np.where(rng.random(lanes) < share, 10 ** rng.uniform(-3, 0.7, lanes), 1e-5)
     ys = 1 + size[:, None] * rng.uniform(-1, 1, (lanes, 3))
     ys[rng.integers(lanes)] = np.nan if share == 0.5 else 1
-    batched, info = batch(ys, dfc.SimplifiedNewton())
+    batched, info = batch(ys, projection)
     succeeds = np.asarray(info.result == optx.RESULTS.successful)
     for name, entry in RIGID_BODY.items():
         values = np.asarray(jax.vmap(entry.fn, (None, 0, None))(0, batched, None))
         error = np.abs(values - VALUES[name])[succeeds]
         assert np.all(error <= 64 * EPS * np.maximum(VALUES[name], values[succeeds]))
     for i in rng.permutation(lanes)[:40]:
-        alone, alone_info = project(RIGID_BODY, ys[i], dfc.SimplifiedNewton())
+        alone, alone_info = project(RIGID_BODY, ys[i], projection)
         assert succeeds[i] == successful(alone_info)
         if size[i] < 0.05:
             assert succeeds[i] == np.all(np.isfinite(ys[i]))
         if succeeds[i]:
             np.testing.assert_allclose(batched[i], alone, rtol=1e-14, atol=1e-14)
-
-
-@one_projection
-@given(y=near)
-def test_any_pytree_is_the_same_as_one_array(projection, y):
-    projected, _ = project(TREE, {"a": y[:2], "b": y[2]}, projection)
-    expected, _ = project(RIGID_BODY, y, projection)
-    np.testing.assert_allclose(stack(projected), expected, rtol=0, atol=1e-14)
 
 
 @each_projection
@@ -250,31 +188,6 @@ def test_a_critical_point_that_satisfies_the_constraint_stays(projection):
     projected, info = project(RIGID_BODY, np.zeros(3), projection, values)
     assert successful(info)
     assert np.all(projected == 0)
-
-
-@each_projection
-def test_many_constraints(projection):
-    """More than are unrolled: a chain of nine rigid bonds."""
-    chain = dfc.Constraint(lambda t, q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - 1)
-    rng = np.random.default_rng(0)
-    q = np.stack([np.arange(10.0), np.zeros(10)], -1) + 0.02 * rng.normal(size=(10, 2))
-    projected, info = project(chain, q, projection, None)
-    assert successful(info)
-    np.testing.assert_allclose(
-        np.linalg.norm(np.diff(projected, axis=0), axis=-1), 1, rtol=0, atol=1e-14
-    )
-
-
-def test_single_precision():
-    y, info = project(
-        RIGID_BODY,
-        np.array([1.01, 0.99, 1.02], np.float32),
-        dfc.SimplifiedNewton(),
-        jax.tree.map(lambda x: x.astype(jnp.float32), VALUES),
-    )
-    assert y.dtype == jnp.float32
-    assert successful(info)
-    assert info.residual_after <= 16 * np.finfo(np.float32).eps
 
 
 def test_leaves_of_different_precision_are_refused():

@@ -1,9 +1,9 @@
 """Runs the attacks, unattended (`make soak COUNT=... SEED=...`): exit status 1 if any is wrong.
 
-A program is one static choice of an attack, compiled once for many lanes of numbers; a lane is one
-combination. It draws from `(seed, program)` alone. Programs run in workers, so that one that
-crashes or never ends is found wrong, and the rest goes on. What has finished is kept in a file: a
-run that was interrupted continues where it was, as long as the package is the same.
+A program is one static choice of an attack, compiled once for many lanes of numbers. It draws from
+`(seed, program)` alone, and runs in an interpreter of its own, so that one that crashes or never
+ends is found wrong, and the rest goes on. What has finished is kept in a file: a run that was
+interrupted continues where it was, as long as the package is the same.
 
     python -m tests.soak --count 1000000                    # all attacks
     python -m tests.soak --attack far --count 1000000       # one of them
@@ -13,43 +13,32 @@ run that was interrupted continues where it was, as long as the package is the s
 import argparse
 import collections
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import importlib
 import json
 import os
-import queue
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .oracle import Tally
 
 ROOT = Path(__file__).parents[2]
 # How much of the count is for each attack.
-SHARES = {
-    "combinations": 0.2,
-    "far": 0.6,
-    "gradients": 0.02,
-    "nan": 0.15,
-    "ending": 0.001,
-}
+SHARES = {"far": 0.7, "gradients": 0.05, "nan": 0.249, "ending": 0.001}
 # Most of the time goes into compilation, which takes half as long with XLA's older emitters.
 OLDER_EMITTERS = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
-GRACE = 60.0  # seconds for a worker to start
-CHUNK = 6  # programs per worker: what is compiled takes memory
+GRACE = 60.0  # seconds for an interpreter to start
 
 
-@dataclasses.dataclass
-class Job:
+class Job(NamedTuple):
     attack: str
-    numbers: list[int]
+    number: int
     lanes: int
-    timeout: float
+    seed: int
 
 
 def module_of(attack: str) -> Any:
@@ -68,90 +57,40 @@ def jobs_of(options: argparse.Namespace) -> list[Job]:
     """In turn, so that a run which is cut short has tried every attack."""
     attacks = options.attack or list(SHARES)
     whole = sum(SHARES[a] for a in attacks)
-    queues = []
-    for attack in attacks:
-        module = module_of(attack)
-        lanes = options.lanes or module.LANES
+    jobs = []
+    for i, attack in enumerate(attacks):
+        lanes = options.lanes or module_of(attack).LANES
         programs = max(1, round(options.count * SHARES[attack] / whole / lanes))
-        numbers = list(range(options.first, options.first + programs))
-        if options.program is not None:
-            numbers = [options.program]
-        chunks = [numbers[i : i + CHUNK] for i in range(0, len(numbers), CHUNK)]
-        queues.append([Job(attack, chunk, lanes, module.TIMEOUT) for chunk in chunks])
-    order = [(k / len(q), i, job) for i, q in enumerate(queues) for k, job in enumerate(q)]
-    return [job for *_, job in sorted(order, key=lambda entry: entry[:2])]
+        numbers = range(programs) if options.program is None else [options.program]
+        jobs += [(n / programs, i, Job(attack, n, lanes, options.seed)) for n in numbers]
+    return [job for *_, job in sorted(jobs, key=lambda entry: entry[:2])]
 
 
-def work(options: argparse.Namespace) -> None:
-    """The worker: a line of JSON for each program."""
+def work(job: Job) -> None:
+    """In its own interpreter: prints the tally as JSON."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    module = module_of(options.attack[0])
-    for number in map(int, options.worker.split(",")):
-        tally = module.run(options.seed, number, options.lanes)
-        print("TALLY " + json.dumps({"number": number, **vars(tally)}), flush=True)
+    print(json.dumps(vars(module_of(job.attack).run(job.seed, job.number, job.lanes))))
 
 
-def command_of(job: Job, numbers: list[int], seed: int) -> list[str]:
-    worker = ["--worker", ",".join(map(str, numbers)), "--lanes", str(job.lanes)]
-    return [
-        sys.executable,
-        "-m",
-        "tests.soak",
-        "--attack",
-        job.attack,
-        "--seed",
-        str(seed),
-        *worker,
-    ]
+def command_of(job: Job) -> list[str]:
+    return [sys.executable, "-m", __package__, "--worker", json.dumps(job)]
 
 
-def run_job(job: Job, seed: int) -> Any:
-    """Yields each program's number and tally; starts again after one that hangs or crashes."""
-    left = list(job.numbers)
-    while left:
-        worker = subprocess.Popen(
-            command_of(job, left, seed),
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={"JAX_PLATFORMS": "cpu", "XLA_FLAGS": OLDER_EMITTERS, **os.environ},
+def run_job(job: Job) -> Tally:
+    timeout = module_of(job.attack).TIMEOUT + GRACE
+    environment = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": OLDER_EMITTERS, **os.environ}
+    try:
+        done = subprocess.run(
+            command_of(job), cwd=ROOT, env=environment, timeout=timeout, capture_output=True
         )
-        lines: queue.Queue = queue.Queue()
-        threading.Thread(target=feed, args=(worker, lines), daemon=True).start()
-        tail: collections.deque = collections.deque(maxlen=12)
-        deadline, why = time.monotonic() + job.timeout + GRACE, "crashed"
-        while left:
-            try:
-                line = lines.get(timeout=max(deadline - time.monotonic(), 0.01))
-            except queue.Empty:
-                why = f"not ended after {job.timeout} s"
-                break
-            if line is None:
-                break
-            if not line.startswith("TALLY "):
-                tail.append(line)
-                continue
-            record = json.loads(line.removeprefix("TALLY "))
-            number = record.pop("number")
-            left.remove(number)
-            deadline = time.monotonic() + job.timeout
-            yield number, Tally(**record)
-        worker.kill()
-        worker.wait()
-        if left:
-            yield (
-                left.pop(0),
-                Tally(job.lanes, 0, {why: 1}, {}, [why + ": " + "".join(tail)[-2000:]]),
-            )
-
-
-def feed(worker: Any, lines: queue.Queue) -> None:
-    for line in worker.stdout:
-        lines.put(line)
-    lines.put(None)
+        if done.returncode == 0:
+            return Tally(**json.loads(done.stdout.splitlines()[-1]))
+        why, tail = "crashed", done.stderr[-2000:].decode(errors="replace")
+    except subprocess.TimeoutExpired:
+        why, tail = f"not ended after {timeout} s", ""
+    return Tally(job.lanes, 0, {why: 1}, {}, [f"{why}: {tail}"])
 
 
 def summary(tallies: dict[str, list[Tally]]) -> bool:
@@ -172,53 +111,49 @@ def summary(tallies: dict[str, list[Tally]]) -> bool:
     return right
 
 
+def finished(state: Path) -> dict[tuple, Tally]:
+    done = {}
+    for line in state.read_text().splitlines() if state.exists() else ():
+        # The last one may have been cut off.
+        with contextlib.suppress(json.JSONDecodeError):
+            record = json.loads(line)
+            done[tuple(record["key"])] = Tally(**record["tally"])
+    return done
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--count", type=int, default=10_000, help="combinations in all")
+    parser.add_argument("--count", type=int, default=10_000, help="lanes in all")
     parser.add_argument("--attack", action="append", choices=SHARES, help="only these")
-    parser.add_argument("--lanes", type=int, help="combinations per program")
+    parser.add_argument("--lanes", type=int, help="lanes per program")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0, help="the first program of each attack")
     parser.add_argument("--program", type=int, help="run this one only, and show what is wrong")
     parser.add_argument("--state", type=Path, default=ROOT / "out" / "soak.jsonl")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
-        work(options)
+        work(Job(*json.loads(options.worker)))
         return
     options.state.parent.mkdir(parents=True, exist_ok=True)
-    done: dict[tuple, Tally] = {}
-    if options.state.exists() and options.program is None:
-        for line in options.state.read_text().splitlines():
-            # The last one may have been cut off.
-            with contextlib.suppress(json.JSONDecodeError):
-                record = json.loads(line)
-                done[tuple(record["key"])] = Tally(**record["tally"])
+    done = finished(options.state) if options.program is None else {}
     tallies: dict[str, list[Tally]] = {}
     begin = time.monotonic()
     for job in jobs_of(options):
-        found = tallies.setdefault(job.attack, [])
-        prefix = (package_hash(), options.seed, job.attack, job.lanes)
-        found += [done[*prefix, n] for n in job.numbers if (*prefix, n) in done]
-        job.numbers = [n for n in job.numbers if (*prefix, n) not in done]
-        for number, tally in run_job(job, options.seed):
-            found.append(tally)
-            with options.state.open("a") as file:
-                entry = {"key": [*prefix, number], "tally": vars(tally)}
-                file.write(json.dumps(entry) + "\n")
-            print(
-                f"{time.monotonic() - begin:7.0f} s  {job.attack} {number}: {tally.success} of "
-                f"{tally.tried} succeeded, {sum(tally.wrong.values())} wrong",
-                flush=True,
-            )
-            for example in tally.examples:
-                print(f"    WRONG {example}")
-            if tally.wrong:
-                print(
-                    f"    again: python -m tests.soak --attack {job.attack} --program {number} "
-                    f"--seed {options.seed} --lanes {job.lanes}",
-                    flush=True,
-                )
+        key = (package_hash(), *job)
+        tally = done.get(key) or run_job(job)
+        tallies.setdefault(job.attack, []).append(tally)
+        if key in done:
+            continue
+        with options.state.open("a") as file:
+            file.write(json.dumps({"key": key, "tally": vars(tally)}) + "\n")
+        print(
+            f"{time.monotonic() - begin:7.0f} s  {job.attack} {job.number}: {tally.success} of "
+            f"{tally.tried} succeeded, {sum(tally.wrong.values())} wrong",
+            flush=True,
+        )
+        for example in tally.examples:
+            again = f"--attack {job.attack} --program {job.number} --seed {job.seed}"
+            print(f"    WRONG {example}\n    again: {again} --lanes {job.lanes}", flush=True)
     sys.exit(not summary(tallies))
 
 

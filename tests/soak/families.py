@@ -72,40 +72,21 @@ def _satellite_energy(xp: Any, y: Any, a: Any) -> list[Any]:
     return [a[0] * (0.5 * (y[2] * y[2] + y[3] * y[3]) - 3.986e14 / r)]
 
 
-def _pair(xp: Any, y: Any, a: Any) -> list[Any]:
-    """Lennard-Jones, and the momentum."""
-    s = (a[0] / _r(xp, y, 0, 1)) ** 6
-    return [0.5 * _square(y[4:8]) + 4 * (s * s - s), y[4] + y[6]]
-
-
 FAMILIES: dict[str, Family] = {
     "exponential": Family(lambda xp, y, a: [y[0] + xp.exp(y[1]), y[1] - a[0]], 2, a=((0.01, 200),)),
-    "exponentials": Family(
-        lambda xp, y, a: [xp.exp(a[0] * y[0]) + xp.exp(y[1]) - y[2]], 3, a=((0.1, 30),)
-    ),
-    "double exponential": Family(lambda xp, y, a: [xp.exp(xp.exp(y[0])) + y[1]], 2),
     "quartic": Family(lambda xp, y, a: [sum(x**4 for x in y)], 2),
-    "polynomial": Family(
-        lambda xp, y, a: [y[0] ** 6 - a[0] * y[0] * y[1] + y[1] ** 2, y[2] ** 3 + y[0]],
-        3,
-        a=((1, 9),),
-    ),
     "powers": Family(
         lambda xp, y, a: [xp.exp(0.5 * a[0] * xp.log(y[0] * y[0])) + a[1] * y[1] ** 2],
         2,
         _positive,
         ((0.2, 15), (1e-3, 1e3)),
     ),
-    "saddle": Family(lambda xp, y, a: [y[0] * y[1], y[1] * y[2]], 3),
-    "rational": Family(lambda xp, y, a: [1 / (1 + y[0] ** 2) + a[0] * y[1] / (1 + y[2] ** 2)], 3),
     "pendulum": Family(
         lambda xp, y, a: [0.5 * y[1] ** 2 - a[0] * xp.cos(y[0])], 2, a=((1e-2, 1e2),)
     ),
     "waves": Family(
         lambda xp, y, a: [xp.sin(a[0] * y[0]) + y[1], y[0] * xp.cos(y[2])], 3, a=((0.1, 300),)
     ),
-    "wells": Family(lambda xp, y, a: [xp.exp(-a[0] * _square(y)) + 0.1 * y[0]], 2, a=((0.1, 20),)),
-    "lennard-jones": Family(_pair, 8, _orbit, ((0.5, 1.2),)),
     "kepler": Family(_kepler, 4, _orbit, ((0.3, 3),)),
     "vortices": Family(_vortices, 6, _orbit, ((0.3, 3), (0.3, 3))),
     "toda": Family(
@@ -127,9 +108,6 @@ FAMILIES: dict[str, Family] = {
         _orbit,
         ((0.05, 2),),
     ),
-    "steep": Family(
-        lambda xp, y, a: [y[0] + a[0] * y[1] ** 3, xp.tanh(y[2]) + y[1]], 3, a=((1e3, 1e9),)
-    ),
     "rows": Family(
         lambda xp, y, a: [1e12 * (y[0] ** 2 + y[1] ** 2), 1e-12 * a[0] * y[2] * y[0]],
         3,
@@ -146,9 +124,6 @@ FAMILIES: dict[str, Family] = {
         lambda xp, y, a: [_square(y), y[0] ** 2 + y[1] ** 2 + (1 + a[0]) * y[2] ** 2],
         3,
         a=((1e-13, 0.1),),
-    ),
-    "redundant": Family(
-        lambda xp, y, a: [_square(y), 2 * _square(y), y[0] * y[1]], 3, a=((0.5, 2),)
     ),
     "sphere": Family(lambda xp, y, a: [_square(y) - 1], 3, _unit, constraint=True),
     "big sphere": Family(

@@ -12,7 +12,6 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body
-from ..thinned import some_of
 from .conformance_table import (
     ADDITIVE,
     EXPLICIT,
@@ -117,7 +116,6 @@ every_solver = pytest.mark.parametrize(
         for name in TABLE
     ],
 )
-EXPLICIT_ONES = [name for name, kind in TABLE.items() if kind in (EXPLICIT, MULTISTEP)]
 
 
 @every_solver
@@ -143,25 +141,6 @@ def test_every_solver_stays_on_the_manifold(name):
     assert largest(drift_of(sol, manifold)) <= 4e-15
     moved = jax.tree.map(lambda y, start: jnp.abs(y[-1] - start), sol.ys, y0)
     assert largest(moved) > 1e-2
-
-
-@eqx.filter_jit
-def on_the_rigid_body(solver, step):
-    return dfx.diffeqsolve(
-        dfx.ODETerm(rigid_body), solver, 0.0, 1.0, step, OMEGA0, max_steps=2000
-    ).ys[-1]
-
-
-@some_of("name", EXPLICIT_ONES, ids=EXPLICIT_ONES, period=6)
-def test_projection_makes_the_error_no_worse_than_thrice(name):
-    """It is the wrapped method that is projected, not another."""
-    inner = public_solvers()[name]()
-    exact = on_the_rigid_body(dfx.Dopri8(), jnp.array(0.001))
-
-    def error(solver):
-        return jnp.max(jnp.abs(on_the_rigid_body(solver, jnp.array(0.02)) - exact))
-
-    assert error(dfc.ManifoldProjection(inner, RIGID_BODY)) <= 3 * error(inner) + 1e-14
 
 
 @pytest.mark.slow

@@ -5,16 +5,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import KEPLER, OMEGA0, RIGID_BODY, drift_of, kepler, largest, rigid_body, solve
+from ..problems import RIGID_BODY, drift_of, largest, rigid_body, solve
 from ..thinned import combinations, some_of
 
 SYSTEMS = ["rigid-body", "kepler", "point-vortices", "conservative-lorenz", "double-pendulum"]
-SOLVERS = {"rk4": dfc.RK4(), "tsit5": dfx.Tsit5(), "dopri8": dfx.Dopri8(), "euler": dfx.Euler()}
+SOLVERS = {"dopri8": dfx.Dopri8(), "euler": dfx.Euler()}
 STEP = {"rigid-body": 0.02, "kepler": 0.02, "double-pendulum": 0.02}
 LIMIT = {jnp.float64: 4e-15, jnp.float32: 1e-6}
 
@@ -43,7 +41,7 @@ CASES = combinations(
 )
 
 
-@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=20)
+@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=10)
 def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
     system = dfc.systems.get(name)
     step = jnp.asarray(STEP.get(name, 0.05), dtype)
@@ -58,9 +56,9 @@ def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
 
 @some_of(
     "name,solver",
-    [(name, solver) for name in ("kepler", "rigid-body") for solver in (dfc.RK4(), dfx.Tsit5())],
-    ids=["kepler-rk4", "kepler-tsit5", "rigid-body-rk4", "rigid-body-tsit5"],
-    period=4,
+    [("kepler", dfc.RK4()), ("rigid-body", dfx.Tsit5())],
+    ids=["kepler-rk4", "rigid-body-tsit5"],
+    period=2,
 )
 def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
     """Where the solution without projection does not."""
@@ -80,14 +78,8 @@ def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
     assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
-SLOWER = ("point-vortices", "double-pendulum", "conservative-lorenz", "kepler")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOWER else n for n in SYSTEMS]
-)
-def test_drift_does_not_grow_over_a_million_steps(name):
-    system = dfc.systems.get(name)
+def test_drift_does_not_grow_over_a_million_steps():
+    system = dfc.systems.get("rigid-body")
     saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 2e4, 20))
     sol = solve(
         system.vector_field,
@@ -132,57 +124,10 @@ def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
     np.testing.assert_allclose(sol.ys["q"][-1], exact, atol=2e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("solver", "projection"),
-    [
-        (dfc.RK4(), dfc.Newton()),
-        (dfx.Dopri8(), dfc.SimplifiedNewton()),
-        (dfc.RK4(), dfc.SimplifiedNewton()),
-        (dfx.Dopri8(), dfc.Newton()),
-    ],
-    ids=["rk4-newton", "dopri8-simplified", "rk4-simplified", "dopri8-newton"],
-)
-def test_a_manifold_with_parallel_gradients_everywhere(solver, projection):
-    """On a circular Kepler orbit the energy is the least that the angular momentum allows."""
-    y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
-    solver = dfc.ManifoldProjection(solver, KEPLER, projection=projection)
-    sol = solve(
-        kepler, solver, y0, t1=20.0, dt0=0.05, saveat=dfx.SaveAt(ts=jnp.linspace(0, 20, 41))
-    )
-    assert largest(drift_of(sol, KEPLER)) <= 4e-15
-    exact = jnp.stack([jnp.cos(sol.ts), jnp.sin(sol.ts)], axis=-1)
-    np.testing.assert_allclose(sol.ys[0], exact, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    "projection",
-    [dfc.Newton(), pytest.param(dfc.SimplifiedNewton(), marks=pytest.mark.slow)],
-    ids=["newton", "simplified"],
-)
-def test_at_and_near_a_steady_rotation(projection):
+def test_at_and_near_a_steady_rotation():
     """About the middle axis, which is unstable: there all gradients are parallel."""
     for y0 in ([0.0, 1.5, 0.0], [1e-6, 1.5, 1e-5], [1e-3, 1.5, 0.0]):
-        solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY, projection=projection)
+        solver = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY, projection=dfc.Newton())
         saveat = dfx.SaveAt(t0=True, steps=True)
         sol = solve(rigid_body, solver, jnp.array(y0), t1=10.0, dt0=0.01, saveat=saveat)
         assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
-
-
-def test_lanes_at_the_edge_of_roundoff_end():
-    """The condition of a loop, if it is evaluated twice, can round to both sides: these lanes of
-    damped Newton then never ended."""
-    y = jnp.array(
-        [
-            [0.99952252, 1.05, 0.96807988],
-            [0.97147934, 1.0, 0.96797569],
-            [0.96050583, 1.03526333, 1.03431697],
-            [0.96081344, 1.04361267, 0.96227781],
-            [1.02015507, 0.96404424, 1.00744554],
-            [1.01, 1.0, 0.96601538],
-            [1.001, 0.99999, 0.96288143],
-        ]
-    )
-    value = {name: entry.fn(0, OMEGA0, None) for name, entry in RIGID_BODY.items()}
-    _, info = jax.jit(jax.vmap(lambda y: dfc.project(RIGID_BODY, y, value=value)))(y)
-    assert jnp.all(info.result == optx.RESULTS.successful)

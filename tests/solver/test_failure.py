@@ -65,11 +65,6 @@ def test_statistics_name_the_entry_that_failed(bad):
     assert dfc.entry_name({bad: jump, "kept": kept}, worst) == f"manifold['{bad}']"
 
 
-def test_where_nothing_failed_there_is_no_worst():
-    sol = run(dfc.FirstIntegral(square), saveat=dfx.SaveAt(t1=True, solver_state=True))
-    assert dfc.statistics(sol).worst == -1
-
-
 def test_each_lane_of_a_batch_has_its_own_result():
     def lane(jump):
         def fn(t, y, args):
@@ -108,25 +103,9 @@ def test_an_inaccurate_function_is_kept_as_well_as_it_can_be():
     assert np.max(np.abs(squares - 1.25)) < 1e-10
 
 
-def test_contradicting_constraints_are_not_reached(errors_raise):
-    manifold = (
-        dfc.FirstIntegral(square, value=1.0),
-        dfc.FirstIntegral(square, value=1.1),
-    )
-    with pytest.raises(eqx.EquinoxRuntimeError, match=NOT_REACHED):
-        run(manifold)
-
-
 def test_the_list_of_messages_is_the_same_whatever_was_solved():
     run(OUT_OF_REACH, throw=False)
     assert fresh.interpreter()["messages"] == len(dfx.RESULTS._index_to_message)
-
-
-def test_diffrax_has_the_list_that_messages_are_added_to():
-    assert isinstance(getattr(dfx.RESULTS, "_index_to_message", None), list), (
-        "diffrax has no list `RESULTS._index_to_message` any more: find out how this version "
-        "keeps its messages, and change `_solver/diffrax_private.py`."
-    )
 
 
 # ---- The start ----
@@ -152,31 +131,6 @@ def test_what_cannot_start_ends_at_once(manifold, message):
 def test_what_a_vector_field_does_not_conserve_is_kept_on_demand():
     sol = run(dfc.FirstIntegral(lambda t, y, args: y[1]), max_correction=None)
     assert np.all(sol.ys[:, 1] == 0)
-
-
-TIMES = {"t0": 2.0, "t1": 1.0, "dt0": -0.1}
-
-
-@pytest.mark.parametrize(
-    ("fn", "rate", "options"),
-    [
-        (lambda t, y, args: square(t, y, args) + t**2, lambda t, y, args: 2 * t, TIMES),
-        (lambda t, y, args: y[0] * jnp.cos(t) - y[1] * jnp.sin(t), None, TIMES),
-    ],
-    ids=["balance-backwards", "in-time-backwards"],
-)
-def test_what_changes_with_time_and_is_conserved_may_start(fn, rate, options):
-    sol = run(dfc.FirstIntegral(fn, rate=rate), throw=False, **options)
-    assert sol.result == dfx.RESULTS.successful
-
-
-def test_one_lane_that_cannot_start_leaves_the_others_alone():
-    unit = dfc.Constraint(lambda t, y, args: square(t, y, args) - 1)
-    y0 = jnp.array([[1.0, 0.0], [1.001, 0.0], [0.0, 1.0]])
-    batch = jax.jit(jax.vmap(lambda y0: run(unit, y0=y0, throw=False)))(y0)
-    np.testing.assert_array_equal(dfx.is_okay(batch.result), [True, False, True])
-    for i in (0, 2):
-        np.testing.assert_allclose(batch.ys[i], run(unit, y0=y0[i]).ys, rtol=1e-14)
 
 
 def spoilt(t, y, args):
@@ -266,30 +220,20 @@ def test_max_correction_makes_an_adaptive_solve_take_smaller_steps():
     assert sol.stats["num_rejected_steps"] > 0
 
 
-def test_max_correction_lets_roundoff_pass():
-    """At an equilibrium the step has length zero, but the correction need not."""
-    sol = run(
-        WELL,
-        y0=jnp.array([1.0, 0.0]) + 1e-12,
-        vector_field=double_well,
-        max_correction=0.1,
-        t1=10.0,
-    )
-    assert sol.result == dfx.RESULTS.successful
-
-
 def swing(t, y, args):
     return jnp.stack([y[1], -jnp.sin(y[0])])
 
 
 @pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()], ids=["fixed", "adaptive"])
-def test_a_pendulum_that_keeps_its_squared_angle_is_told_within_100_steps(solver):
+def test_a_pendulum_that_keeps_its_squared_angle_or_momentum_is_told_within_100_steps(solver):
     adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
     fixed = isinstance(solver, dfc.RK4)
-    for fn in (lambda t, y, args: y[0] ** 2, lambda t, y, args: y[1]):
+    either = dfc.FirstIntegral(lambda t, y, square: jnp.where(square, y[0] ** 2, y[1]))
+    for square_is_kept in (True, False):
         sol = run(
-            dfc.FirstIntegral(fn),
+            either,
             solver,
+            args=jnp.array(square_is_kept),
             vector_field=swing,
             t1=10.0,
             stepsize_controller=dfx.ConstantStepSize() if fixed else adaptive,
@@ -306,12 +250,5 @@ def test_a_first_projection_may_be_as_long_as_a_given_value_needs():
 
 
 def test_no_limit_is_no_limit_at_an_equilibrium():
-    for limit in (None, float("inf")):
-        sol = run(WELL, y0=jnp.array([1.0, 0.0]), vector_field=double_well, max_correction=limit)
-        assert sol.result == dfx.RESULTS.successful
-
-
-@pytest.mark.parametrize("bad", [0, -1])
-def test_wrong_every_is_refused(bad):
-    with pytest.raises(ValueError, match="every"):
-        dfc.ManifoldProjection(dfc.RK4(), WELL, every=bad)
+    sol = run(WELL, y0=jnp.array([1.0, 0.0]), vector_field=double_well, max_correction=None)
+    assert sol.result == dfx.RESULTS.successful

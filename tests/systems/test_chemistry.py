@@ -132,13 +132,12 @@ def moved_back(y, noise):
     return dfc.project(system.manifold, y * noise, value=value, projection=PROJECTION)
 
 
-@pytest.mark.parametrize("count", [10**4, pytest.param(10**6, marks=pytest.mark.slow)])
-def test_no_concentration_is_negative_and_the_balances_hold(count):
+def test_no_concentration_is_negative_and_the_balances_hold():
     """Many states, up to a factor of two off, with species that are negative.
 
     Where the negative one holds nearly all of an element, the projection may fail, and says so.
     """
-    keys = jr.split(jr.key(0), 4)
+    keys, count = jr.split(jr.key(0), 4), 10**4
     y = jnp.array(POLLU_60) * jnp.exp(jr.normal(keys[0], (count, 20)))
     noise = jnp.exp(jr.uniform(keys[1], (count, 20), minval=-0.7, maxval=0.7))
     noise = jnp.where(jr.uniform(keys[2], (count, 20)) < 0.02, -0.1, noise)

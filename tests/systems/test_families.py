@@ -1,7 +1,5 @@
 """Facts about single systems, from their sources."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -12,47 +10,9 @@ import diffrax_conserve as dfc
 from diffrax_conserve import check_invariance, systems
 
 
-def test_double_pendulum_energy_is_the_formula_with_its_bracket():
-    y = jnp.array([0.3, -0.5, 0.2, 0.7])
-    a, b, p, q = y
-    kinetic = (p**2 + 2 * q**2 - 2 * p * q * np.cos(a - b)) / (2 * (1 + np.sin(a - b) ** 2))
-    expected = kinetic - 9.81 * (2 * np.cos(a) + np.cos(b))
-    np.testing.assert_allclose(systems.DoublePendulum().energy(0.0, y, None), expected)
-
-
-def test_double_pendulum_energy_is_that_of_two_masses_in_the_plane():
-    system = systems.DoublePendulum(masses=(1.3, 0.6), lengths=(0.8, 1.7), gravity=3.7)
-
-    def positions(theta):
-        x = jnp.cumsum(system.lengths * jnp.sin(theta))
-        return x, -jnp.cumsum(system.lengths * jnp.cos(theta))
-
-    theta, p = jnp.array([0.3, -0.5]), jnp.array([0.2, 0.7])
-    rates = system.vector_field(0.0, jnp.concatenate([theta, p]), None)[:2]
-    (_, height), velocity = jax.jvp(positions, (theta,), (rates,))
-    kinetic = jnp.sum(system.masses * (velocity[0] ** 2 + velocity[1] ** 2)) / 2
-    total = kinetic + 3.7 * jnp.sum(system.masses * height)
-    np.testing.assert_allclose(system.energy(0.0, jnp.concatenate([theta, p]), None), total)
-
-
-def test_vortex_energy_is_the_sum_over_pairs():
-    system = systems.PointVortices(strengths=(1.0, -0.5, 2.0, 0.3))
-    y, gamma = np.asarray(system.y0), system.strengths
-    pairs = itertools.combinations(range(4), 2)
-    total = sum(gamma[i] * gamma[j] * np.log(np.linalg.norm(y[i] - y[j])) for i, j in pairs)
-    np.testing.assert_allclose(system.energy(0.0, system.y0, None), -total / (2 * np.pi))
-
-
-def test_vortices_move_as_the_energy_says():
-    system = systems.PointVortices(strengths=(1.0, -0.5, 2.0, 0.3))
-    gradient = jax.grad(system.energy, argnums=1)(0.0, system.y0, None)
-    rotated = jnp.stack([gradient[:, 1], -gradient[:, 0]], axis=1) / system.strengths[:, None]
-    np.testing.assert_allclose(system.vector_field(0.0, system.y0, None), rotated, rtol=1e-13)
-
-
-@pytest.mark.parametrize("n", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 7))])
-def test_sampled_vortices_lie_apart_in_the_annulus(n):
-    system = systems.PointVortices(strengths=np.ones(n))
+def test_sampled_vortices_lie_apart_in_the_annulus():
+    n = 3
+    system = systems.PointVortices()
     ys = jax.jit(jax.vmap(lambda key: system.sample(key)))(jr.split(jr.key(0), 500))
     r = np.linalg.norm(ys, axis=-1)
     assert r.min() >= 0.5
@@ -71,23 +31,10 @@ def test_laplace_runge_lenz_vector_is_conserved_but_redundant():
     np.testing.assert_allclose(length, 1.7**2 + 2 * h * l**2)
 
 
-def test_solar_system_is_at_rest_about_its_centre_of_mass():
-    system = systems.OuterSolarSystem()
-    for y in (system.y0, system.sample(jr.key(0))):
-        assert np.abs(system.linear_momentum(0.0, y, None)).max() < 1e-19
-        assert np.abs(system.centre_of_mass(0.0, y, None)).max() < 1e-14
-
-
 def test_solar_system_has_the_positions_of_its_source():
     q, v = systems.OuterSolarSystem().y0
     np.testing.assert_allclose(q[1] - q[0], [-3.5023653, -3.8169847, -1.5507963])
     np.testing.assert_allclose(v[5] - v[0], [0.00276725, -0.00170702, -0.00136504])
-
-
-def test_jupiter_returns_after_its_year():
-    q, _ = systems.OuterSolarSystem().reference(jnp.linspace(0.0, 4332.6, 5))
-    jupiter = q[:, 1] - q[:, 0]
-    assert np.linalg.norm(jupiter[4] - jupiter[0]) < 0.01 * np.linalg.norm(jupiter[0])
 
 
 def test_centre_of_mass_is_a_first_integral_that_depends_on_time():
@@ -97,19 +44,6 @@ def test_centre_of_mass_is_a_first_integral_that_depends_on_time():
     ys = (ys[0], ys[1] + 0.001)  # a frame in which it moves
     ts = jnp.linspace(-1e3, 1e3, 20)
     assert check_invariance(system.vector_field, centre, ys, t=ts).ok
-
-
-def test_henon_heiles_escapes_over_its_saddle():
-    system = systems.HenonHeiles(coupling=2.0)
-    saddle = (jnp.array([0.0, 0.5]), jnp.zeros(2))
-    np.testing.assert_allclose(system.energy(0.0, saddle, None), 1 / 24)
-    np.testing.assert_allclose(system.vector_field(0.0, saddle, None)[1], 0.0, atol=1e-15)
-
-
-def test_sampled_stars_cannot_escape():
-    system = systems.HenonHeiles()
-    ys = jax.vmap(system.sample)(jr.split(jr.key(0), 500))
-    assert jax.vmap(lambda y: system.energy(0.0, y, None))(ys).max() < 1 / 6
 
 
 def test_toda_traces_begin_with_henons_integral():
@@ -122,13 +56,6 @@ def test_toda_traces_begin_with_henons_integral():
     np.testing.assert_allclose(traces[0], henon)
 
 
-def test_toda_lattice_conserves_as_many_integrals_as_it_has_particles():
-    system = systems.TodaLattice(particles=5)
-    report = check_invariance(system.vector_field, system.manifold, system.sample)
-    assert report.ok
-    assert system.higher_traces(0.0, system.y0, None).shape == (3,)
-
-
 def test_a_ring_of_two_is_refused():
     with pytest.raises(ValueError, match="at least 3 particles"):
         systems.TodaLattice(particles=2)
@@ -139,18 +66,6 @@ def test_predators_and_prey_rest_at_their_equilibrium():
     rest = jnp.array([4 / 5, 2 / 3])
     np.testing.assert_allclose(system.vector_field(0.0, rest, None), 0.0, atol=1e-15)
     np.testing.assert_allclose(jax.grad(system.first_integral, 1)(0.0, rest, None), 0.0, atol=1e-15)
-
-
-def test_predators_starve_and_prey_grows_and_together_they_circle():
-    system = systems.LotkaVolterra(alpha=2.0, beta=3.0, gamma=4.0, delta=5.0)
-
-    def f(y):
-        return system.vector_field(0.0, y, None)
-
-    np.testing.assert_allclose(f(jnp.array([1.0, 0.0])), [-2.0, 0.0])
-    np.testing.assert_allclose(f(jnp.array([0.0, 1.0])), [0.0, 4.0])
-    frequencies = np.linalg.eigvals(jax.jacobian(f)(jnp.array([4 / 5, 2 / 3])))
-    np.testing.assert_allclose(frequencies**2, [-8.0, -8.0])
 
 
 def test_pendulum_energy_is_conserved_only_on_the_constraints():

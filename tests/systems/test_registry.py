@@ -22,16 +22,6 @@ def test_every_exported_system_is_listed():
     assert len(exported) == 15
 
 
-def test_the_systems_of_the_paper_come_first():
-    assert systems.names()[:5] == (
-        "harmonic-oscillator",
-        "rigid-body",
-        "double-pendulum",
-        "conservative-lorenz",
-        "point-vortices",
-    )
-
-
 @pytest.mark.parametrize(
     ("wrong", "right"),
     [("keplar", "kepler"), ("Rigid_Body", "rigid-body"), ("lorenz", "conservative-lorenz")],
