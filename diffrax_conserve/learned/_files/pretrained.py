@@ -3,11 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from .._networks.deeponet import DeepONet
-from .._networks.pinn import PINN
-from .._networks.repeated import Repeated
-from .._networks.transformed import Transformed
-from .save import load
+from .save import Network, load
 
 _SUFFIX = ".network"
 
@@ -32,7 +28,7 @@ def pretrained_path(name: str) -> Path:
     return folder / f"{name}{_SUFFIX}"
 
 
-def load_pretrained(name: str) -> PINN | DeepONet | Transformed | Repeated:
+def load_pretrained(name: str) -> Network:
     """A network that comes with the package.
 
     For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,

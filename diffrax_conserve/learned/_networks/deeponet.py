@@ -64,7 +64,6 @@ class DeepONet(AbstractFlowMap):
     core: AbstractCore
     layer: ConservativeLayer | None
     max_step: float = eqx.field(static=True)
-    sizes: Sizes = eqx.field(static=True)
     shift: Float[Array, " k"]
     scale: Float[Array, " k"]
     normalise: bool = eqx.field(static=True)
@@ -104,9 +103,9 @@ class DeepONet(AbstractFlowMap):
         else:
             self.domain, seen, m = _framed(frame, states, layer)
         dtype, n = vectors.dtype, seen.shape[1]
-        self.sizes = Sizes(width, depth, latent, find_activation(activation))
+        sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core.create(n + known, m, self.sizes, dtype, key)
+        self.core = core.create(n + known, m, sizes, dtype, key)
         self.args_domain = args_domain
         self.layer = layer
         self.taylor = taylor

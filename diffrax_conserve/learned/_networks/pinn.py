@@ -13,10 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import Sizes
 from .flat import as_state, flatten, stacked_vectors
 from .layer import ConservativeLayer
-from .mlp import MLP, Activation, check_sizes, find_activation
+from .mlp import MLP, Activation, check_sizes
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 
@@ -120,7 +119,6 @@ class PINN(eqx.Module):
     layer: ConservativeLayer | None
     y0s: Y
     edges: tuple[float, ...] = eqx.field(static=True)  # the starts of the windows, and the end
-    sizes: Sizes = eqx.field(static=True)
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
 
@@ -148,7 +146,6 @@ class PINN(eqx.Module):
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
         y0 = as_state(y0)
         dtype = working_dtype(y0)
-        self.sizes = Sizes(width, depth, 0, find_activation(activation))
         n = flatten(y0).size
 
         def net(key: PRNGKeyArray) -> MLP:
@@ -205,26 +202,11 @@ class PINN(eqx.Module):
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
         """A network with the same options and these windows."""
-        width, depth, _, activation = self.sizes
-        found = jtu.tree_map(jnp.asarray, (nets, y0s, self.scale))
-
-        def build() -> PINN:
-            return PINN(
-                self.y0,
-                edges[0],
-                edges[-1],
-                windows=tuple(edges[1:-1]),
-                width=width,
-                depth=depth,
-                activation=activation,
-                normalise=self.normalise,
-                key=jr.key(0),
-            )
-
-        # Only the structure of the network is needed.
-        other = eqx.filter_eval_shape(build)
-        other = eqx.tree_at(lambda m: (m.nets, m.y0s, m.scale), other, found)
-        return eqx.tree_at(lambda m: m.layer, other, self.layer, is_leaf=lambda x: x is None)
+        nets, y0s = jtu.tree_map(jnp.asarray, (nets, y0s))
+        other = object.__new__(PINN)
+        for name, value in {**vars(self), "nets": nets, "y0s": y0s, "edges": tuple(edges)}.items():
+            object.__setattr__(other, name, value)
+        return other
 
     def _index(self, t: RealScalarLike) -> IntScalarLike:
         if self.windows == 1:
