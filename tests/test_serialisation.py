@@ -114,7 +114,7 @@ def test_the_info(path):
     found = dfc.learned.read_info(path)
     assert found["info"] == {"system": "lorenz", "errors": [1.0, 2.0]}
     assert found["network"]["DeepONet"]["max_step"] == 0.25
-    assert set(found) == {"info", "network", "versions"}
+    assert set(found) == {"info", "network"}
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])

@@ -8,7 +8,6 @@ renamed is another format.
 """
 
 import dataclasses
-import inspect
 import math
 from typing import Any
 
@@ -26,9 +25,8 @@ from .._networks.domain import Box, FramedBox
 from .._networks.layer import ConservativeLayer
 from .._networks.mlp import ACTIVATIONS, MLP
 from .._networks.pinn import PINN
-from .._networks.repeated import Repeated
 from .._networks.taylor import Taylor
-from .._networks.transformed import BoxCox, Transformed
+from .._networks.wrappers import BoxCox, Repeated, Transformed
 
 _NETWORKS = (PINN, DeepONet, Repeated, Transformed, BoxCox, Product, Concatenated, Gated, MLP)
 _PARTS = (Box, FramedBox, ConservativeLayer, Taylor, FirstIntegral, Constraint)
@@ -59,7 +57,7 @@ def describe(x: Any, arrays: list[np.ndarray]) -> Any:
         return {type(x).__name__: [describe(item, arrays) for item in x]}
     if type(x) is dict and all(isinstance(key, str) for key in x):
         return {"dict": {key: describe(x[key], arrays) for key in x}}
-    if eqx.is_array(x) and x.dtype.name in _DTYPES:
+    if isinstance(x, jax.Array) and x.dtype.name in _DTYPES:
         arrays.append(np.asarray(x))
         return {"array": [x.dtype.name, *x.shape]}
     if names := [name for name, function in ACTIVATIONS.items() if function is x]:
@@ -93,12 +91,10 @@ def _fields(kind: Any) -> list[str]:
     return [field.name for field in dataclasses.fields(kind)]
 
 
-def _method(system: Any, name: Any) -> Any:
-    """The method called `name` of a system of the catalogue."""
-    if not isinstance(name, str) or name.startswith("_") or type(system) not in _SYSTEMS:
-        return None
-    found = getattr(system, name, None)
-    return found if inspect.isroutine(getattr(type(system), name, None)) else None
+def _method(system: Any, name: str) -> Any:
+    """The public method called `name` of a system of the catalogue, or `None`."""
+    known = type(system) in _SYSTEMS and not name.startswith("_")
+    return getattr(system, name) if known and callable(getattr(type(system), name, 0)) else None
 
 
 class Reader:
@@ -109,18 +105,16 @@ class Reader:
         self.used, self.arrays = 0, 0
 
     def build(self, described: Any) -> Any:
-        if not isinstance(described, dict):
-            if described is not None and type(described) not in (bool, int, float, str):
-                raise ValueError(f"{described!r:.50} describes nothing")
-            if type(described) is int and abs(described) > _INTEGER_MAX:
-                raise ValueError(f"the number {described:.3g} is too large")
+        if type(described) is int and abs(described) > _INTEGER_MAX:
+            raise ValueError(f"the number {described:.3g} is too large")
+        if described is None or type(described) in (bool, int, float, str):
             return described
+        assert isinstance(described, dict)
         ((kind, content),) = described.items()
         match kind:
-            case "list":
-                return [self.build(item) for item in content]
-            case "tuple":
-                return tuple(self.build(item) for item in content)
+            case "list" | "tuple":
+                items = [self.build(item) for item in content]
+                return items if kind == "list" else tuple(items)
             case "dict":
                 return {key: self.build(item) for key, item in content.items()}
             case "array":
@@ -129,9 +123,7 @@ class Reader:
                 return ACTIVATIONS[content]
             case "method":
                 name, system = content
-                if (method := _method(self.build(system), name)) is None:
-                    raise ValueError(f"there is no method {name!r:.50}")
-                return method
+                return _method(self.build(system), name)
             case "given":
                 return self._part(*content)
         return self._module(_CLASSES[kind], content)
@@ -147,15 +139,12 @@ class Reader:
         return part
 
     def _array(self, name: str, *shape: int) -> jax.Array:
-        if name not in _DTYPES or not all(type(n) is int and n >= 0 for n in shape):
-            raise ValueError(f"there is no array of dtype {name!r:.20} and shape {shape!r:.50}")
-        dtype = np.dtype(jnp.dtype(name))
+        dtype, count = np.dtype(jnp.dtype(_DTYPES[_DTYPES.index(name)])), math.prod(shape)
+        self.arrays += 1
         # The factors of an empty array could be of any size.
         size = math.prod(max(n, 1) for n in shape) * dtype.itemsize
-        self.arrays += 1
-        if size > len(self.data) + dtype.itemsize or self.arrays > _ARRAYS_MAX:
+        if min(shape, default=0) < 0 or size > 8 + len(self.data) or self.arrays > _ARRAYS_MAX:
             raise ValueError("its arrays are larger than the file, or too many")
-        count = math.prod(shape)
         found = np.frombuffer(self.data, dtype, count, self.used).reshape(shape)
         self.used += count * dtype.itemsize
         return jnp.asarray(found)
@@ -173,27 +162,26 @@ class Reader:
 
 def check(model: Any) -> None:
     """Raises unless `model` is a network whose arrays fit together. Nothing is computed."""
-    inner = model
-    while isinstance(inner, Repeated | Transformed):
-        if isinstance(inner, Transformed) and not isinstance(inner.transformation, BoxCox):
-            raise ValueError("it is in unknown coordinates")
-        inner = inner.flow_map
-    layer, taylor = (getattr(inner, name, None) for name in ("layer", "taylor"))
-    if not isinstance(layer, ConservativeLayer | None) or not isinstance(taylor, Taylor | None):
-        raise ValueError("a part of the network is something else")
-    # A polynomial of high order takes long to trace.
-    bare = eqx.tree_at(lambda m: (m.layer,), inner, (None,), is_leaf=lambda x: x is None)
-    if isinstance(inner, PINN):
-        if any(len(x) != inner.windows for x in jax.tree.leaves((inner.nets, inner.y0s))):
+    while isinstance(model, Repeated | Transformed):
+        if not isinstance(getattr(model, "transformation", BoxCox()), BoxCox):
+            raise TypeError("it is in unknown coordinates")
+        model = model.flow_map
+    if isinstance(model, PINN):
+        if any(len(x) != model.windows for x in jax.tree.leaves((model.nets, model.y0s))):
             raise ValueError("it has not one network for each window")
-        like, found = inner.y0, eqx.filter_eval_shape(bare, inner.t0)
+        kinds, like, arguments = {"layer": ConservativeLayer}, model.y0, (model.t0,)
+    elif not isinstance(model, DeepONet):
+        raise TypeError(f"`model` is a {type(model).__name__}, but must be a `PINN` or `DeepONet`")
     else:
-        domain = Box | FramedBox
-        if not (isinstance(inner, DeepONet) and isinstance(inner.domain, domain)):
-            raise TypeError("`save` writes a `PINN`, or a `DeepONet`")
-        bare = eqx.tree_at(lambda m: m.taylor, bare, None, is_leaf=lambda x: x is None)
-        args = [] if inner.args_domain is None else [inner.args_domain.lower]
-        like = inner.state
-        found = eqx.filter_eval_shape(bare, like, *args, inner.max_step)
+        kinds, like = {"layer": ConservativeLayer, "taylor": Taylor}, model.state
+        known = () if model.args_domain is None else (model.args_domain.lower,)
+        arguments = (like, *known, model.max_step)
+    for name, kind in kinds.items():
+        if not isinstance(getattr(model, name), kind | None):
+            raise TypeError(f"its `{name}` is something else")
+    # A polynomial of high order takes long to trace.
+    where = lambda m: [getattr(m, name) for name in kinds]  # noqa: E731
+    bare = eqx.tree_at(where, model, [None] * len(kinds), is_leaf=lambda x: x is None)
+    found = eqx.filter_eval_shape(bare, *arguments)
     if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, like):
         raise ValueError("the output is not of the shape of a state")

@@ -5,7 +5,6 @@ with the description of the network, and the bytes of its arrays.
 """
 
 import hashlib
-import importlib.metadata
 import json
 import os
 from pathlib import Path
@@ -16,16 +15,14 @@ from .._networks.deeponet import DeepONet
 from .._networks.frame import MakeFrame
 from .._networks.layer import ConservativeLayer
 from .._networks.pinn import PINN
-from .._networks.repeated import Repeated
 from .._networks.taylor import Taylor
-from .._networks.transformed import Transformed
+from .._networks.wrappers import Repeated, Transformed
 from .describe import NotGiven, Reader, check, describe
 
 PathLike = str | os.PathLike[str]
 Network = PINN | DeepONet | Transformed | Repeated
 
 _MAGIC, _VERSION = b"diffrax-conserve network ", 4
-_PACKAGES = ("diffrax-conserve", "diffrax", "equinox", "jax")
 
 
 def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) -> None:
@@ -66,9 +63,8 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     path, arrays = _file(path), []
     network = describe(model, arrays)
     check(model)
-    header = {"network": network, "versions": _versions(), "info": info or {}}
     try:
-        text = json.dumps(header, allow_nan=False).encode()
+        text = json.dumps({"network": network, "info": info or {}}, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"`info` must hold only what JSON can express, but {error}. Convert arrays by "
@@ -131,8 +127,8 @@ def read_info(path: PathLike) -> dict[str, Any]:
 
     **Returns:**
 
-    A dictionary with the `info` that was given to [`diffrax_conserve.save`][], the `versions` of
-    the packages that wrote it, and the description of the `network`.
+    A dictionary with the `info` that was given to [`diffrax_conserve.save`][], and the description
+    of the `network`.
 
     **Raises:**
 
@@ -154,15 +150,64 @@ def read_info(path: PathLike) -> dict[str, Any]:
     return _read(path)[0]
 
 
+def pretrained_path(name: str) -> Path:
+    """The file of a network that comes with the package.
+
+    **Arguments:**
+
+    - `name`: as for [`diffrax_conserve.load_pretrained`][].
+
+    **Raises:**
+
+    `ValueError` for an unknown name; the message lists the known names.
+    """
+    folder = Path(__file__).parents[2] / "pretrained"
+    known = {file.stem: file for file in sorted(folder.glob("*.network"))}
+    if name not in known:
+        raise ValueError(
+            f"There is no pretrained network called {name!r}. There are: {', '.join(known)}."
+        )
+    return known[name]
+
+
+def load_pretrained(name: str) -> Network:
+    """A network that comes with the package.
+
+    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
+    trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
+    trained by [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of
+    eccentricities up to 0.6 and semi-major axes from 0.8, for steps of up to 0.5; `pollu` and
+    `robertson` are flow maps of stiff chemistry.
+    [`diffrax_conserve.learned.read_info`][] returns the command that made the network and its
+    measured errors.
+
+    **Arguments:**
+
+    - `name`: such as `"rigid-body"` or `"rigid-body-conservative"`.
+
+    **Raises:**
+
+    `ValueError` for an unknown name; the message lists the known names.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        pinn = dfc.load_pretrained("rigid-body")
+        pinn(1.0)
+        ```
+    """
+    return load(pretrained_path(name))
+
+
 def _read(path: PathLike) -> tuple[Any, bytes]:
     """The header of a file, and the bytes of the arrays."""
     first, _, rest = _file(path).read_bytes().partition(b"\n")
     version, _, digest = first.removeprefix(_MAGIC).partition(b" ")
     if not first.startswith(_MAGIC) or not version.isdigit():
-        if first and _MAGIC.startswith(first[: len(_MAGIC)]):
-            raise ValueError(f"The file {path} is truncated: it ends in its first line.")
         raise ValueError(
-            f"The file {path} does not hold a network that `diffrax_conserve.save` wrote."
+            f"{path} does not hold a network that `diffrax_conserve.save` wrote, or is truncated."
         )
     if version != b"%d" % _VERSION:
         raise ValueError(
@@ -178,8 +223,8 @@ def _read(path: PathLike) -> tuple[Any, bytes]:
     text, _, body = rest.partition(b"\n")
     try:
         header = json.loads(text)
-        if set(header) != {"network", "versions", "info"}:
-            raise ValueError("its second line is not a description of a network")
+        if set(header) != {"network", "info"}:
+            raise ValueError("its second line does not describe a network")
     except (ValueError, TypeError, RecursionError) as error:
         raise _malformed(path, error) from error
     return header, body
@@ -200,10 +245,3 @@ def _file(path: Any) -> Path:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is a folder or a device, but it must be a file.")
     return path
-
-
-def _versions() -> dict[str, str]:
-    try:
-        return {name: importlib.metadata.version(name) for name in _PACKAGES}
-    except importlib.metadata.PackageNotFoundError:  # imported from a folder, not installed
-        return {}

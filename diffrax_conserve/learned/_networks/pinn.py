@@ -140,21 +140,17 @@ class PINN(eqx.Module):
         check_sizes(width=width, depth=depth)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
-        self.edges = _edges(float(t0), float(t1), windows)
-        count = self.windows
         if slope is not None and not slope > 0:
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
-        y0 = as_state(y0)
-        dtype = working_dtype(y0)
-        n = flatten(y0).size
+        y0, self.edges = as_state(y0), _edges(float(t0), float(t1), windows)
+        dtype, n, count = working_dtype(y0), flatten(y0).size, self.windows
 
         def net(key: PRNGKeyArray) -> MLP:
             return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
 
         self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
         self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
-        self.layer = layer
-        self.normalise = normalise
+        self.layer, self.normalise = layer, normalise
         self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
 
     def __call__(self, t: RealScalarLike) -> Y:
@@ -189,16 +185,12 @@ class PINN(eqx.Module):
 
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
         """A window with the options of this network."""
-        dtype = self.scale.dtype
+        start, length = (jnp.asarray(t, self.scale.dtype) for t in (start, end - start))
+        scale, normalise = self.scale, self.normalise
         return Window(
-            net=net,
-            layer=self.layer,
-            y0=y0,
-            start=jnp.asarray(start, dtype),
-            length=jnp.asarray(end - start, dtype),
-            scale=self.scale,
-            normalise=self.normalise,
-        )
+            net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale,
+            normalise=normalise,
+        )  # fmt: skip
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
         """A network with the same options and these windows."""
