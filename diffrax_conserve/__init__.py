@@ -47,14 +47,14 @@ from ._solver.rk4 import RK4 as RK4
 from ._solver.statistics import ProjectionStatistics as ProjectionStatistics
 from ._solver.statistics import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
-from .learned import PINN as PINN
-from .learned import DeepONet as DeepONet
-from .learned import DeepONetSolver as DeepONetSolver
-from .learned import PINNSolver as PINNSolver
-from .learned import RandomFeatureSolver as RandomFeatureSolver
-from .learned import fit as fit
-from .learned import load as load
-from .learned import load_pretrained as load_pretrained
-from .learned import save as save
+from .learned._files.save import load as load
+from .learned._files.save import load_pretrained as load_pretrained
+from .learned._files.save import save as save
+from .learned._networks.deeponet import DeepONet as DeepONet
+from .learned._networks.pinn import PINN as PINN
+from .learned._solvers.flow_map_solver import DeepONetSolver as DeepONetSolver
+from .learned._solvers.pinn_solver import PINNSolver as PINNSolver
+from .learned._solvers.random_features import RandomFeatureSolver as RandomFeatureSolver
+from .learned._training.fit import fit as fit
 
 __version__ = "0.1.0"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.random as jr
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._solvers.sweeps import Picard
 
 LORENZ = dfc.systems.ConservativeLorenz()
 SMALL = dict(width=8, depth=2)
@@ -17,7 +18,7 @@ CORES = {
     "concatenated": dfc.learned.Concatenated,
     "gated": dfc.learned.Gated,
 }
-SWEEPS = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
+SWEEPS = {"picard": Picard(), "newton": dfc.learned.NewtonSweep()}
 
 
 @eqx.filter_jit
@@ -74,6 +75,18 @@ class Within(eqx.Module):
 
     def __call__(self, y0, h):
         return self.flow_map(y0, h)
+
+
+class Scale(eqx.Module):
+    """States in other units."""
+
+    scale: jax.Array
+
+    def __call__(self, y):
+        return y / self.scale
+
+    def inverse(self, z):
+        return z * self.scale
 
 
 def driven(t, y, args):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -40,6 +41,7 @@ NETWORKS = {
     "framed": vortices(taylor=dfc.learned.Taylor(VORTICES.vector_field)),
     "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
     "transformed": dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.125)),
+    "family": flow_map(args_domain=dfc.learned.Box({"a": 0.5}, {"a": jnp.array(1.5)})),
     "both": dfc.learned.Repeated(dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.0)), 2),
 }
 
@@ -89,8 +91,9 @@ def test_a_vector_field_of_the_users_own_is_given_again(path):
     taylor = dfc.learned.Taylor(oscillator, 3)
     network = dfc.DeepONet(EAST[None], 1.0, key=jr.key(0), taylor=taylor, **SMALL)
     dfc.save(path, network)
-    with pytest.raises(ValueError, match=r"taylor=Taylor\(vector_field, 3\)"):
-        dfc.load(path)
+    for wrong in ({}, dict(taylor=dfc.learned.Taylor(oscillator, 2))):
+        with pytest.raises(ValueError, match=r"taylor=Taylor\(vector_field, 3\)"):
+            dfc.load(path, **wrong)
     assert eqx.tree_equal(dfc.load(path, taylor=taylor), network)
 
 
@@ -110,10 +113,8 @@ def test_the_info(path):
     dfc.save(path, NETWORKS["deeponet"], info={"system": "lorenz", "errors": [1.0, 2.0]})
     found = dfc.learned.read_info(path)
     assert found["info"] == {"system": "lorenz", "errors": [1.0, 2.0]}
-    assert found["kind"] == "DeepONet"
-    assert found["config"]["max_step"] == 0.25
-    assert found["config"]["depth"] == 3
-    assert set(found["versions"]) >= {"diffrax-conserve", "jax"}
+    assert found["network"]["DeepONet"]["max_step"] == 0.25
+    assert set(found) == {"info", "network"}
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
@@ -130,16 +131,19 @@ def test_arrays_keep_their_dtype(path, dtype):
 def test_the_file_is_no_pickle(path):
     dfc.save(path, NETWORKS["pinn"])
     first, header, _ = path.read_bytes().split(b"\n", 2)
-    assert first.startswith(b"diffrax-conserve network 3 ")
-    assert json.loads(header)["kind"] == "PINN"
+    assert first.startswith(b"diffrax-conserve network 4 ")
+    assert set(json.loads(header)["network"]) == {"PINN"}
 
 
 # ---- What cannot be saved ----
 
 
 def test_what_cannot_be_saved(path):
-    with pytest.raises(ValueError, match="activation"):
+    with pytest.raises(TypeError, match="activation"):
         dfc.save(path, solution(activation=lambda x: x))
+    function = dfc.learned.FlowMap(lambda y0, h: y0, 1.0)
+    with pytest.raises(TypeError, match="a file cannot describe"):
+        dfc.save(path, dfc.learned.Repeated(function, 2))
     with pytest.raises(ValueError, match="JSON"):
         dfc.save(path, NETWORKS["pinn"], info={"array": np.ones(3)})
     with pytest.raises(ValueError, match="JSON"):
@@ -216,22 +220,33 @@ def test_a_foreign_file(path):
             dfc.load(path)
 
 
-def test_a_file_of_a_newer_version(path, content):
-    path.write_bytes(content.replace(b"network 3 ", b"network 4 ", 1))
-    with pytest.raises(ValueError, match=r"newer version .* Upgrade"):
-        dfc.load(path)
-
-
-@pytest.mark.parametrize("version", [b"0", b"1", b"2"])
-def test_a_file_from_before_the_first_release(path, content, version):
-    path.write_bytes(content.replace(b"network 3 ", b"network %s " % version, 1))
-    with pytest.raises(ValueError, match=r"before the first release"):
+@pytest.mark.parametrize("version", [b"3", b"5", b"12"])
+def test_a_file_of_another_version(path, content, version):
+    path.write_bytes(content.replace(b"network 4 ", b"network %s " % version, 1))
+    with pytest.raises(ValueError, match=f"has format {version.decode()}, .* upgrade .* changelog"):
         dfc.load(path)
 
 
 def test_a_missing_file(path):
     with pytest.raises(FileNotFoundError):
         dfc.load(path)
+
+
+@pytest.mark.parametrize("path", [None, 0, 3, b"a.network"])
+def test_what_is_no_path(path, monkeypatch):
+    """An integer would be an open file, and 0 the standard input."""
+    # As users see it: the run-time type checker of the suite would answer first.
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    for function in (dfc.load, dfc.learned.read_info, lambda p: dfc.save(p, NETWORKS["pinn"])):
+        with pytest.raises(TypeError, match="`path` is"):
+            function(path)
+
+
+@pytest.mark.parametrize("path", ["/", "/dev/zero"])
+def test_what_is_no_file(path):
+    for function in (dfc.load, dfc.learned.read_info, lambda p: dfc.save(p, NETWORKS["pinn"])):
+        with pytest.raises(ValueError, match="is a folder or a device"):
+            function(path)
 
 
 # ---- The networks of the package ----
@@ -247,7 +262,7 @@ def test_every_pretrained_network(name, kind):
     file = dfc.learned.pretrained_path(name)
     info = dfc.learned.read_info(file)["info"]
     system = dfc.systems.get(info["system"])
-    assert file.stat().st_size < 150_000
+    assert file.stat().st_size < 200_000
     assert (network.layer is not None) == (kind == "conservative")
     assert info["command"].startswith("python benchmarks/learned/paper.py")
     assert info["errors"]["plain"]["largest_state_error"] > 0

@@ -26,6 +26,7 @@ import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._solvers.sweeps import Picard
 
 OUT = Path(__file__).parent.parent / "results" / "sweeps.json"
 FLOW_MAPS = ("conservative-lorenz", "double-pendulum", "point-vortices")
@@ -155,7 +156,7 @@ def sweeps(name, size):
     h, y0s = jnp.asarray(network.max_step), states_of(system, size.states)
     expected = exact(system, h, y0s)
     rows, classical = [], {}
-    kinds = {"picard": dfc.learned.Picard(), "newton": dfc.learned.NewtonSweep()}
+    kinds = {"picard": Picard(), "newton": dfc.learned.NewtonSweep()}
     for sweep, numbers in (("picard", size.picard), ("newton", size.newton)):
         for k in numbers:
             solver = dfc.DeepONetSolver(network, corrections=k, sweep=kinds[sweep])

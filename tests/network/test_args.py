@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import unchecked
+from ..learned import Scale, unchecked
 
 BOX = dfc.learned.Box(
     {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
@@ -83,7 +83,7 @@ def test_what_wraps_a_flow_map_hands_args_on(wrap):
             outer = dfc.learned.Repeated(inner, 2)
             expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
         case "transformed":
-            outer = dfc.learned.Transformed(inner, dfc.learned.Scale(jnp.array([2.0, 4.0])))
+            outer = dfc.learned.Transformed(inner, Scale(jnp.array([2.0, 4.0])))
             expected = inner(Y0 / jnp.array([2.0, 4.0]), ARGS, 0.4) * jnp.array([2.0, 4.0])
         case "function":
             function = lambda y0, args, h: inner(y0, args, h)  # noqa: E731

@@ -243,7 +243,6 @@ def test_a_step_that_is_too_long(transform, errors_raise):
 def test_a_solve_backwards_in_time(errors_raise):
     message = refusal(lambda: solve(FLOW, t1=-1.0, dt0=-0.125).ys)
     assert "backwards in time" in message
-    assert "from 0 to 0.25" in message
 
 
 def test_a_largest_step_that_is_an_array(errors_raise):
@@ -266,7 +265,57 @@ def test_a_pinn_from_another_initial_state(errors_raise):
 @pytest.mark.parametrize(("t0", "t1"), [(0.0, 3.0), (0.0, -1.0)])
 def test_a_pinn_outside_its_interval(t0, t1, errors_raise):
     message = refusal(lambda: solve(FOLLOW, t0=t0, t1=t1, dt0=float(np.sign(t1))).ys)
-    assert "from 0 to 2 " in message
+    assert "outside the interval that the PINN was trained for" in message
+
+
+class Broken(eqx.Module):
+    """A flow map that is not finite from the second step on."""
+
+    max_step: float = 0.25
+
+    def __call__(self, y0, h):
+        return jnp.where(jnp.max(jnp.abs(y0)) > 1.2, jnp.nan, y0 + h)
+
+
+CASES = {
+    "backwards": (FLOW, dict(t1=-1.0, dt0=-0.25), "backwards in time"),
+    "too long": (FLOW, dict(t1=2.0, dt0=0.5), "a step is longer"),
+    "another field": (
+        dfc.DeepONetSolver(flow_map(taylor=dfc.learned.Taylor(lambda t, y, args: 2 * y))),
+        {},
+        "not trained for this vector field",
+    ),
+    "not a number": (FLOW, dict(y0=LORENZ.y0 * jnp.nan), "not finite"),
+    "no longer a number": (unchecked(Broken()), {}, "not finite"),
+    "another start": (FOLLOW, dict(y0=LORENZ.y0 + 0.125), "not the state that the PINN has"),
+    "outside": (FOLLOW, dict(t1=3.0), "outside the interval"),
+    "no number to start from": (FOLLOW, dict(y0=LORENZ.y0 * jnp.nan), "not the state"),
+}
+
+
+@pytest.mark.parametrize("adaptive", [False, True])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_nothing_raises_in_a_batch(case, adaptive, errors_raise):
+    """Every lane ends by itself, with its own result: an exception would end all of them."""
+    solver, options, text = case
+    if adaptive and (solver is FOLLOW or "longer" in text):
+        pytest.skip("no error estimate, or tried again with a shorter step")
+    options = {"y0": LORENZ.y0, "t1": 1.0, "dt0": 0.25} | options
+    if adaptive:
+        options["stepsize_controller"] = dfx.PIDController(rtol=1.0, atol=1.0, dtmin=1e-3)
+    else:
+        options["stepsize_controller"] = dfx.ConstantStepSize()
+    options = dict(t0=0.0, max_steps=16, throw=False) | options
+
+    def lane(y0):
+        return solve(solver, **(options | {"y0": y0}))
+
+    one = lane(options["y0"])
+    both = jax.vmap(lane)(jnp.stack([options["y0"], LORENZ.y0]))
+    for result in (one.result, jax.tree.map(lambda x: x[0], both.result)):
+        assert result != dfx.RESULTS.successful
+        # A controller rejects what is not finite, and tries smaller steps.
+        assert adaptive and text == "not finite" or text in dfx.RESULTS[result]
 
 
 def test_roundoff_in_the_times_is_not_refused():

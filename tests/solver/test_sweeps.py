@@ -25,7 +25,8 @@ BOTH = pytest.mark.parametrize("sweep", SWEEPS)
 def step(solver, y0, h=0.25, *, term=TERM, t0=0.0, args=None):
     """The state after one step, and the error estimate."""
     t0, t1 = jnp.asarray(t0), jnp.asarray(t0 + h)
-    y1, error, *_ = solver.step(term, t0, t1, y0, args, None, False)
+    state = solver.init(term, t0, t1, y0, args)
+    y1, error, *_ = solver.step(term, t0, t1, y0, args, state, False)
     return y1, error
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._training.data import as_data
 
-from ..learned import EAST, oscillator
+from ..learned import EAST, Scale, oscillator
 
 KEY = jr.key(5)
 Y0S = 2 * jr.normal(jr.key(1), (40, 2))
@@ -124,7 +124,7 @@ def test_what_goes_with_data_and_what_does_not():
 TRANSFORMATIONS = {
     "log": dfc.learned.BoxCox(0.0),
     "box-cox": dfc.learned.BoxCox(0.1),
-    "scale": dfc.learned.Scale(jnp.array([2.0, 1e-8, 30.0])),
+    "scale": Scale(jnp.array([2.0, 1e-8, 30.0])),
 }
 
 

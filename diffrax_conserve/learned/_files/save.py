@@ -1,40 +1,31 @@
-"""Saving and loading networks: `save`, `load` and `read_info`."""
+"""Saving and loading networks: `save`, `load` and `read_info`. No pickle.
 
-import io
-import math
-import operator
-from typing import Any, NamedTuple
+A file is a line `diffrax-conserve network <version> <SHA-256 of all that follows>`, a line of JSON
+with the description of the network, and the bytes of its arrays.
+"""
 
-import equinox as eqx
-import jax
-import jax.tree_util as jtu
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
 
+from ..._replace_file import replace_file
 from .._networks.deeponet import DeepONet
 from .._networks.frame import MakeFrame
 from .._networks.layer import ConservativeLayer
 from .._networks.pinn import PINN
-from .._networks.repeated import Repeated
 from .._networks.taylor import Taylor
-from .._networks.transformed import BoxCox, Transformed
-from .configuration import (
-    PARTS,
-    check_header,
-    check_sizes,
-    describe,
-    network_struct,
-    part_systems,
-    system_structs,
-    versions,
-)
-from .file import PathLike, read, read_leaf, refuse, unpack, unpacked_size, write
+from .._networks.wrappers import Repeated, Transformed
+from .describe import NotGiven, Reader, check, describe
+
+PathLike = str | os.PathLike[str]
+Network = PINN | DeepONet | Transformed | Repeated
+
+_MAGIC, _VERSION = b"diffrax-conserve network ", 4
 
 
-def save(
-    path: PathLike,
-    model: PINN | DeepONet | Transformed | Repeated,
-    *,
-    info: dict[str, Any] | None = None,
-) -> None:
+def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) -> None:
     """Writes a network with its configuration into one file.
 
     The file is replaced atomically: a reader sees either the old or the new one. Its mode is kept,
@@ -46,9 +37,9 @@ def save(
     - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]. A `DeepONet` may
         be wrapped in a [`diffrax_conserve.learned.Transformed`][] with a
         [`diffrax_conserve.learned.BoxCox`][], and in a [`diffrax_conserve.learned.Repeated`][]. A
-        conservative layer, a Taylor polynomial and a frame contain functions, which cannot be
-        stored. If they belong to a system of the catalogue, its name is stored; otherwise pass them
-        again to [`diffrax_conserve.load`][].
+        conservative layer, a Taylor polynomial and a frame contain functions. Those of a system of
+        the catalogue are stored by name; otherwise pass the part again to
+        [`diffrax_conserve.load`][].
     - `info`: further information that JSON can express, such as the system, the sampling domain,
         the recipe and the measured errors. [`diffrax_conserve.learned.read_info`][] returns it.
 
@@ -69,27 +60,19 @@ def save(
         assert dfc.load("pinn.network")(2.0)[0] == pinn(2.0)[0]
         ```
     """
-    repeated = isinstance(model, Repeated)
-    inner = model.flow_map if repeated else model
-    boxcox = {}
-    if isinstance(inner, Transformed) and isinstance(inner.transformation, BoxCox):
-        boxcox = {"boxcox": inner.transformation.exponent}
-        inner = inner.flow_map
-    header = {**describe(inner), **boxcox, "repeats": model.count if repeated else 1}
-    assert isinstance(inner, PINN | DeepONet)
-    arrays = _Contents(eqx.filter(_without(inner), eqx.is_array), part_systems(inner))
-    header["dtypes"] = [x.dtype.name for x in jtu.tree_leaves(arrays)]
-    header |= {"versions": versions(), "info": info or {}}
-    if _shapes(_like(header, inner.frame if isinstance(inner, DeepONet) else None)[0]) != _shapes(
-        arrays
-    ):
+    path, arrays = _file(path), []
+    network = describe(model, arrays)
+    check(model)
+    try:
+        text = json.dumps({"network": network, "info": info or {}}, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(
-            "The arrays of this network are not those that its constructor makes, so that a file "
-            "cannot describe it. Use `equinox.tree_serialise_leaves`."
-        )
-    body = io.BytesIO()
-    eqx.tree_serialise_leaves(body, arrays)
-    write(path, header, body.getvalue())
+            f"`info` must hold only what JSON can express, but {error}. Convert arrays by "
+            "`.tolist()`, and leave NaN and infinity out."
+        ) from error
+    rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
+    first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
+    replace_file(path, lambda temporary: temporary.write_bytes(first + rest))
 
 
 def load(
@@ -98,7 +81,7 @@ def load(
     layer: ConservativeLayer | None = None,
     taylor: Taylor | None = None,
     frame: MakeFrame | None = None,
-) -> PINN | DeepONet | Transformed | Repeated:
+) -> Network:
     """Reads a network that [`diffrax_conserve.save`][] wrote.
 
     **Arguments:**
@@ -118,33 +101,25 @@ def load(
     another version, or needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
     """
     header, body = _read(path)
-    given = {"layer": layer, "taylor": taylor, "frame": frame}
-    for name, part in given.items():
-        _check_part(path, name, header[name], part)
+    given = {"layer": layer, "taylor": taylor, "make": frame}
+    reader = Reader(body, {name: part for name, part in given.items() if part is not None})
     try:
-        like, static = _like(header, frame)
-        needed = sum(math.prod(x.shape) * x.dtype.itemsize for x in jtu.tree_leaves(like))
-        if needed > unpacked_size(header, body):
-            raise ValueError("its arrays are larger than the file")
-        file = io.BytesIO(unpack(header, body))
-        found = eqx.tree_deserialise_leaves(file, like, read_leaf)
-        if file.read(1):
+        model = reader.build(header["network"])
+        if reader.used != len(body):
             raise ValueError("it has data after the last array")
+        check(model)
+    except NotGiven as error:
+        raise ValueError(f"The network in {path} {error}") from None
     except Exception as error:
-        refuse(path, error)
-    model = eqx.combine(found.network, static)
-    for name, part in given.items():
-        if header[name] is not None:
-            part = _part(header[name], name, found.systems) if part is None else part
-            where = operator.attrgetter(_PLACES[name])
-            model = eqx.tree_at(where, model, part, is_leaf=lambda x: x is None)
-    if "boxcox" in header:
-        model = Transformed(model, BoxCox(header["boxcox"]))
-    return model if header["repeats"] == 1 else Repeated(model, header["repeats"])
+        raise _malformed(path, error) from error
+    for name in reader.given:
+        argument = "frame" if name == "make" else name
+        raise ValueError(f"The file {path} needs no {argument}: leave `{argument}` out.")
+    return model
 
 
 def read_info(path: PathLike) -> dict[str, Any]:
-    """The header of a file, without building its network.
+    """What a file says about its network, without building it.
 
     **Arguments:**
 
@@ -152,9 +127,8 @@ def read_info(path: PathLike) -> dict[str, Any]:
 
     **Returns:**
 
-    A dictionary with the `kind` and `config` of the network, its parts (`layer`, `taylor`,
-    `frame`), the `versions` of the packages that wrote it, the `info` that was given to
-    [`diffrax_conserve.save`][], and the entries that describe its arrays.
+    A dictionary with the `info` that was given to [`diffrax_conserve.save`][], and the description
+    of the `network`.
 
     **Raises:**
 
@@ -173,82 +147,101 @@ def read_info(path: PathLike) -> dict[str, Any]:
         python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship
         ```
     """
-    header, _ = _read(path)
-    return header
+    return _read(path)[0]
+
+
+def pretrained_path(name: str) -> Path:
+    """The file of a network that comes with the package.
+
+    **Arguments:**
+
+    - `name`: as for [`diffrax_conserve.load_pretrained`][].
+
+    **Raises:**
+
+    `ValueError` for an unknown name; the message lists the known names.
+    """
+    folder = Path(__file__).parents[2] / "pretrained"
+    known = {file.stem: file for file in sorted(folder.glob("*.network"))}
+    if name not in known:
+        raise ValueError(
+            f"There is no pretrained network called {name!r}. There are: {', '.join(known)}."
+        )
+    return known[name]
+
+
+def load_pretrained(name: str) -> Network:
+    """A network that comes with the package.
+
+    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
+    trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
+    trained by [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of
+    eccentricities up to 0.6 and semi-major axes from 0.8, for steps of up to 0.5; `pollu` and
+    `robertson` are flow maps of stiff chemistry.
+    [`diffrax_conserve.learned.read_info`][] returns the command that made the network and its
+    measured errors.
+
+    **Arguments:**
+
+    - `name`: such as `"rigid-body"` or `"rigid-body-conservative"`.
+
+    **Raises:**
+
+    `ValueError` for an unknown name; the message lists the known names.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        pinn = dfc.load_pretrained("rigid-body")
+        pinn(1.0)
+        ```
+    """
+    return load(pretrained_path(name))
 
 
 def _read(path: PathLike) -> tuple[Any, bytes]:
-    header, body = read(path)
+    """The header of a file, and the bytes of the arrays."""
+    first, _, rest = _file(path).read_bytes().partition(b"\n")
+    version, _, digest = first.removeprefix(_MAGIC).partition(b" ")
+    if not first.startswith(_MAGIC) or not version.isdigit():
+        raise ValueError(
+            f"{path} does not hold a network that `diffrax_conserve.save` wrote, or is truncated."
+        )
+    if version != b"%d" % _VERSION:
+        raise ValueError(
+            f"The file {path} has format {version.decode()[:9]}, but this version of "
+            f"diffrax-conserve reads {_VERSION}. For a newer one upgrade diffrax-conserve; how to "
+            "convert an older one is in the changelog."
+        )
+    if hashlib.sha256(rest).hexdigest().encode() != digest:
+        raise ValueError(
+            f"The file {path} is truncated or damaged: its contents do not match its checksum. "
+            "Copy or train it again."
+        )
+    text, _, body = rest.partition(b"\n")
     try:
-        check_header(header)
-        check_sizes(header, unpacked_size(header, body))
-    except ValueError as error:
-        refuse(path, error)
+        header = json.loads(text)
+        if set(header) != {"network", "info"}:
+            raise ValueError("its second line does not describe a network")
+    except (ValueError, TypeError, RecursionError) as error:
+        raise _malformed(path, error) from error
     return header, body
 
 
-class _Contents(NamedTuple):
-    """The arrays of a file, in this order."""
-
-    network: Any
-    systems: dict[str, Any]  # to which the parts of the network belong
-
-
-def _like(header: Any, frame: MakeFrame | None) -> tuple[_Contents, Any]:
-    """The shapes and dtypes of the arrays of a file, and the static part of its network."""
-    structs = system_structs(header)
-
-    def make_frame(system: Any) -> MakeFrame | None:
-        return frame if frame is not None or system is None else system.frame
-
-    network = _without(network_struct(header, make_frame, structs.get("frame")))
-    own, static = eqx.partition(network, lambda x: isinstance(x, jax.ShapeDtypeStruct))
-    leaves, treedef = jtu.tree_flatten(_Contents(own, structs))
-    dtypes = [jax.dtypes.canonicalize_dtype(name) for name in header["dtypes"]]
-    pairs = zip(leaves, dtypes, strict=True)
-    return treedef.unflatten([jax.ShapeDtypeStruct(x.shape, d) for x, d in pairs]), static
+def _malformed(path: PathLike, error: Exception) -> ValueError:
+    return ValueError(
+        f"The file {path} is malformed, though its checksum is right: "
+        f"{type(error).__name__}, {str(error)[:300]}. `diffrax_conserve.save` does not write such "
+        "files."
+    )
 
 
-def _shapes(contents: _Contents) -> Any:
-    return jtu.tree_map(lambda x: (x.shape, x.dtype), contents)
-
-
-def _check_part(path: PathLike, name: str, found: Any, given: Any) -> None:
-    """Raises if a part is given that the network does not have, or a required part is not given."""
-    what, example = _PARTS[name]
-    if found is None and given is not None:
-        raise ValueError(f"The network in {path} has no {what}: leave `{name}` out.")
-    if found is not None and found["system"] is None and given is None:
-        raise ValueError(
-            f"The network in {path} has a {what}, whose functions no file can hold. Give it "
-            f"again: `load(path, {name}={example.format(**found)})`."
-        )
-
-
-def _part(found: Any, name: str, systems: dict[str, Any]) -> Any:
-    """The layer, Taylor polynomial or frame of a system."""
-    if name == "layer":
-        return ConservativeLayer(systems[name].manifold, steps=found["steps"])
-    if name == "taylor":
-        return Taylor(systems[name].vector_field, found["order"])
-    return systems[name].frame
-
-
-# For each part that contains functions: its name in messages, and an expression that builds it.
-_PARTS = {
-    "layer": ("conservative layer", "ConservativeLayer(manifold, steps={steps})"),
-    "taylor": ("Taylor polynomial", "Taylor(vector_field, {order})"),
-    "frame": ("frame", "frame"),
-}
-# The attribute path of each part in a network.
-_PLACES = {"layer": "layer", "taylor": "taylor", "frame": "domain.make"}
-
-
-def _without(model: PINN | DeepONet) -> Any:
-    """The network without the parts that contain functions."""
-    names = [name for name in PARTS if getattr(model, name, None) is not None]
-
-    def where(model: Any) -> list[Any]:
-        return [operator.attrgetter(_PLACES[name])(model) for name in names]
-
-    return eqx.tree_at(where, model, [None] * len(names)) if names else model
+def _file(path: Any) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"`path` is {path!r}, but it must be the name of a file.")
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is a folder or a device, but it must be a file.")
+    return path

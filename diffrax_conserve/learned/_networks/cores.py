@@ -1,6 +1,6 @@
-"""Architectures for the network of a flow map, with two inputs: the initial state and the step.
+"""Architectures for the network of a flow map.
 
-Each core maps the normalised initial state, a vector of `n` numbers, and the normalised step to a
+A core maps the normalised initial state, a vector of `n` numbers, and the normalised step to a
 vector of `m` numbers.
 """
 
@@ -16,7 +16,7 @@ from .mlp import MLP, Activation
 
 
 class Sizes(NamedTuple):
-    """The sizes and the activation function of a network, from which it can be rebuilt."""
+    """The sizes and the activation function of a network."""
 
     width: int
     depth: int
@@ -55,9 +55,10 @@ class Product(AbstractCore):
     @classmethod
     def create(cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray) -> "Product":
         width, depth, latent, activation = sizes
-        branch_key, trunk_key = jr.split(key)
-        branch = MLP(n, m * latent, width, depth, activation, dtype, key=branch_key)
-        trunk = MLP(1, m * latent, width, depth, activation, dtype, key=trunk_key)
+        branch, trunk = (
+            MLP(k, m * latent, width, depth, activation, dtype, key=one)
+            for k, one in zip((n, 1), jr.split(key), strict=True)
+        )
         return cls(branch, trunk, m)
 
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
@@ -108,15 +109,14 @@ class Gated(AbstractCore):
     @classmethod
     def create(cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray) -> "Gated":
         width, depth, _, activation = sizes
-        keys = jr.split(key, depth + 3)
-
-        def layer(in_size: int, out_size: int, key: PRNGKeyArray) -> MLP:
-            return MLP(in_size, out_size, width, 0, activation, dtype, key=key)
-
-        encoders = layer(n + 1, width, keys[0]), layer(n + 1, width, keys[1])
-        in_sizes = [n + 1, *([width] * (depth - 1))]
-        hidden = tuple(layer(s, width, k) for s, k in zip(in_sizes, keys[3:], strict=True))
-        return cls(encoders, hidden, layer(width, m, keys[2]))
+        # Two encoders, the last layer, and the hidden ones.
+        ins = [n + 1, n + 1, width, n + 1, *([width] * (depth - 1))]
+        outs = [width, width, m, *([width] * depth)]
+        one, two, last, *hidden = (
+            MLP(i, o, width, 0, activation, dtype, key=k)
+            for i, o, k in zip(ins, outs, jr.split(key, depth + 3), strict=True)
+        )
+        return cls((one, two), tuple(hidden), last)
 
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         activation = self.last.activation

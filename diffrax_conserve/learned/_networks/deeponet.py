@@ -13,8 +13,8 @@ from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
 from .cores import AbstractCore, Product, Sizes
 from .domain import Box, FramedBox
-from .flat import as_state, as_states, flatten, stacked_vectors
-from .flow_map import AbstractFlowMap, check_args_domain, checked_args
+from .flat import as_states, flatten, stacked_vectors
+from .flow_map import AbstractFlowMap, checked_args, checked_box
 from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer
 from .mlp import Activation, check_sizes, find_activation
@@ -64,7 +64,6 @@ class DeepONet(AbstractFlowMap):
     core: AbstractCore
     layer: ConservativeLayer | None
     max_step: float = eqx.field(static=True)
-    sizes: Sizes = eqx.field(static=True)
     shift: Float[Array, " k"]
     scale: Float[Array, " k"]
     normalise: bool = eqx.field(static=True)
@@ -90,7 +89,7 @@ class DeepONet(AbstractFlowMap):
         args_domain: Box | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
-        _check_args_domain(args_domain, layer, taylor)
+        _check_parts(layer, frame, taylor, checked_box(args_domain))
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
                 f"`core` is {core!r}, but it must be a class, such as "
@@ -98,26 +97,27 @@ class DeepONet(AbstractFlowMap):
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
-        vectors = _vectors(states)
-        if frame is None:
-            self.domain, seen, m = Box.around(states), vectors, vectors.shape[1]
-        else:
-            self.domain, seen, m = _framed(frame, states, layer)
-        dtype, n = vectors.dtype, seen.shape[1]
-        self.sizes = Sizes(width, depth, latent, find_activation(activation))
+        states = as_states(states)
+        dtype = working_dtype(states)
+        # What the network sees of all states, and the number of functions to be learned.
+        seen = stacked_vectors(jtu.tree_map(lambda x: x.astype(dtype), states))
+        self.domain, m = Box.around(states), seen.shape[1]
+        if frame is not None:
+            check_frame(frame, jtu.tree_map(lambda x: x[0], states))
+            frames = jax.vmap(lambda y: frame_at(frame, y))(states)
+            self.domain = FramedBox.around(frame, states)
+            seen, m = frames.inputs, frames.basis.shape[-1]
+        n = seen.shape[1]
+        sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core.create(n + known, m, self.sizes, dtype, key)
-        self.args_domain = args_domain
-        self.layer = layer
-        self.taylor = taylor
-        self.max_step = float(max_step)
-        self.normalise = normalise
+        self.core = core.create(n + known, m, sizes, dtype, key)
+        self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
+        self.max_step, self.normalise = float(max_step), normalise
+        self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
         if normalise:
             deviation = jnp.std(seen, axis=0)
             self.shift = jnp.mean(seen, axis=0)
             self.scale = jnp.where(deviation > 0, deviation, 1)
-        else:
-            self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state at time `h` after the state `y0`.
@@ -147,7 +147,16 @@ class DeepONet(AbstractFlowMap):
                 f"{start.size}."
             )
         h = jnp.asarray(h).astype(start.dtype)
-        fraction, learned = self._learned(start, y0, h, self._known(args, start.dtype))
+        known = self._known(args, start.dtype)
+        if isinstance(self.domain, Box):
+            fraction = h / self.max_step
+            learned = self.scale * self._network(start, known, h, fraction)
+        else:
+            frame = self.domain.frame(y0)
+            own = (h * frame.clock).astype(start.dtype)
+            fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
+            inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
+            learned = basis @ self._network(inputs, known, own, fraction)
         if self.taylor is not None:
             taylor = dataclasses.replace(self.taylor, args=args[0]) if args else self.taylor
             start = flatten(taylor(y0, h)).astype(start.dtype)
@@ -159,20 +168,6 @@ class DeepONet(AbstractFlowMap):
             return jnp.zeros(0, dtype)
         found = checked_args(self.args_domain, args[0])
         return flatten(self.args_domain.centred(found) if self.normalise else found).astype(dtype)
-
-    def _learned(
-        self, start: Float[Array, " n"], y0: Y, h: Float[Array, ""], known: Float[Array, " p"]
-    ) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-        """The step as a fraction of the longest one, and the output of the network in units of the
-        state."""
-        if isinstance(self.domain, Box):
-            fraction = h / self.max_step
-            return fraction, self.scale * self._network(start, known, h, fraction)
-        frame = self.domain.frame(y0)
-        inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
-        own = (h * frame.clock).astype(start.dtype)
-        fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
-        return fraction, basis @ self._network(inputs, known, own, fraction)
 
     def _network(
         self,
@@ -259,37 +254,17 @@ or if a layer is combined with a frame or an `args_domain`.
 """
 
 
-def _check_args_domain(domain: Any, layer: ConservativeLayer | None, taylor: Taylor | None) -> None:
-    check_args_domain(domain)
-    if domain is not None and layer is not None:
+def _check_parts(
+    layer: ConservativeLayer | None, frame: Any, taylor: Taylor | None, domain: Box | None
+) -> None:
+    if layer is not None and (frame is not None or domain is not None):
         raise ValueError(
-            "A flow map with an `args_domain` cannot have a `layer`, whose manifold has its own "
-            "`args`. Leave it out, and wrap the solver in `diffrax_conserve.ManifoldProjection`."
+            "A flow map with a `frame` or an `args_domain` cannot have a `layer`, whose largest "
+            "correction is in the units of a whole state, and whose manifold has its own `args`. "
+            "Leave it out, and wrap the solver in `diffrax_conserve.ManifoldProjection`."
         )
     if domain is not None and taylor is not None and taylor.args is not None:
         raise ValueError(
             "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
             "`Taylor(vector_field, order)`."
         )
-
-
-def _vectors(states: Y) -> Float[Array, "samples n"]:
-    states = as_states(states)
-    return stacked_vectors(jtu.tree_map(lambda x: x.astype(working_dtype(states)), states))
-
-
-def _framed(
-    frame: MakeFrame, states: Y, layer: ConservativeLayer | None
-) -> tuple[FramedBox, Float[Array, "samples k"], int]:
-    """The domain, the inputs for all states, and the number of functions to be learned."""
-    if layer is not None:
-        raise ValueError(
-            "A flow map with a `frame` cannot have a `layer`, whose largest correction is in the "
-            "units of a whole state. Leave it out, and wrap the solver in "
-            "`diffrax_conserve.ManifoldProjection`."
-        )
-    states = as_state(states)
-    one = jtu.tree_map(lambda x: x[0], states)
-    check_frame(frame, one)
-    frames = jax.vmap(lambda y: frame_at(frame, y))(states)
-    return FramedBox.around(frame, states), frames.inputs, frames.basis.shape[-1]

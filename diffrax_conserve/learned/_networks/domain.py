@@ -1,7 +1,5 @@
 """The states for which a flow map was trained."""
 
-import abc
-from collections.abc import Callable
 from typing import final
 
 import equinox as eqx
@@ -16,24 +14,8 @@ from .flat import as_state, as_states
 from .frame import Frame, MakeFrame, frame_at
 
 
-class AbstractDomain(eqx.Module):
-    """A set of states that `fit` can extend."""
-
-    @abc.abstractmethod
-    def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is in the set."""
-
-    @abc.abstractmethod
-    def extended(self, states: Y) -> "AbstractDomain":
-        """The set extended to include `states`, which are stacked along a leading axis."""
-
-    @abc.abstractmethod
-    def can_include(self, y: Y) -> Bool[Array, ""]:
-        """Whether `extended` would include `y`."""
-
-
 @final
-class Box(AbstractDomain):
+class Box(eqx.Module):
     r"""The states between two corners, $l \le y \le u$ in every component.
 
     The `domain` of a flow map: the option `outside` of [`diffrax_conserve.DeepONetSolver`][]
@@ -76,12 +58,10 @@ class Box(AbstractDomain):
     def extended(self, states: Y) -> "Box":
         """The smallest box around this one and `states`, which are stacked along a leading axis."""
         other = Box.around(states)
-
-        def corner(choose: Callable[..., Array], a: Y, b: Y) -> Y:
-            return jtu.tree_map(lambda x, y: choose(x, y.astype(x.dtype)), a, b)
-
-        lower = corner(jnp.minimum, self.lower, other.lower)
-        return Box(lower, corner(jnp.maximum, self.upper, other.upper))
+        larger = lambda x, y: jnp.maximum(x, y.astype(x.dtype))  # noqa: E731
+        smaller = lambda x, y: jnp.minimum(x, y.astype(x.dtype))  # noqa: E731
+        lower = jtu.tree_map(smaller, self.lower, other.lower)
+        return Box(lower, jtu.tree_map(larger, self.upper, other.upper))
 
     def contains(self, y: Y) -> Bool[Array, ""]:
         """Whether `y` is in the box, its boundary included. NaN is not."""
@@ -125,7 +105,7 @@ Box.__init__.__doc__ = """**Arguments:**
 
 
 @final
-class FramedBox(AbstractDomain):
+class FramedBox(eqx.Module):
     """The states whose frames resemble those of the states with which a flow map was built.
 
     The inputs of the frame are in a box, and its clock is at most the largest one.
@@ -178,3 +158,6 @@ class FramedBox(AbstractDomain):
 
 
 _SLACK = 1e-6
+
+# The domains that `fit` can extend.
+AbstractDomain = Box | FramedBox

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import tree_shapes, working_dtype
+from ..._tree import tree_shapes, tree_sub, working_dtype
 from .domain import Box
 from .flat import stacked_vectors
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
@@ -20,9 +20,6 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
-
-    A flow map of a family of equations is called as `(y0, args, h)`, with the `args` of the vector
-    field, and has an attribute `args_domain`.
 
     [`diffrax_conserve.DeepONet`][] is a flow map. [`diffrax_conserve.learned.FlowMap`][] makes one
     from any function; solvers and [`diffrax_conserve.fit`][] do this automatically for a Module
@@ -35,8 +32,8 @@ class AbstractFlowMap(AbstractTrainable):
     - `order`: the error of one step is $O(h^{q+1})$ with $q$ = `order`, for all weights.
     - `domain`: the states that the flow map has learned, with a method `contains(y)`; or `None`.
     - `layer`: the conservative layer of the network, or `None`.
-    - `args_domain`: the `args` that it has learned, a [`diffrax_conserve.learned.Box`][]. Optional
-        for a subclass that takes no `args`.
+    - `args_domain`: for a family of equations, called as `(y0, args, h)`, the `args` that it has
+        learned, a [`diffrax_conserve.learned.Box`][]. Otherwise `None`, or missing.
     """
 
     # `Any`, so that a subclass may use a more precise type or a property.
@@ -48,17 +45,20 @@ class AbstractFlowMap(AbstractTrainable):
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`.
 
-        `fit` passes `schedule`, the number of iterations of the conservative layer and the weight
-        of the last one.
+        `fit` passes the `schedule` of the conservative layer.
         """
 
-    @abc.abstractmethod
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         """A rate of change of the solution through `y0`, in the units of the loss."""
+        del y0
+        return rate
+
+    def linear_weights(self) -> tuple[Any, ...]:
+        return ()
 
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        """Whether the step from `y0` is within the domain. For a single network: whether `y0`
-        is."""
+        """Whether the step from `y0` is within the domain. For a single network: whether it
+        starts there."""
         del step
         return jnp.asarray(True if self.domain is None else self.domain.contains(y0))
 
@@ -69,7 +69,7 @@ class AbstractFlowMap(AbstractTrainable):
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
         """The differences of states, in the units in which states are compared with data."""
-        return stacked_vectors(jtu.tree_map(lambda a, b: a - b, ys, others))
+        return stacked_vectors(tree_sub(ys, others))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
         times_key, states_key = jr.split(key)
@@ -121,24 +121,17 @@ class FlowMap(AbstractFlowMap):
         domain: Any = None,
         args_domain: Box | None = None,
     ):
-        self.function = function
-        self.max_step = max_step
-        self.order = order
-        self.domain = domain
-        self.args_domain = args_domain
-
-    def __check_init__(self):
-        if not callable(self.function):
-            raise TypeError(f"`function` is {self.function!r}, not a function `(y0, h) -> y`.")
-        if not isinstance(self.order, int) or self.order < 0:
-            raise ValueError(f"`order` is {self.order!r}, but it must be 0 or a positive integer.")
-        if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
+        if not callable(function):
+            raise TypeError(f"`function` is {function!r}, not a function `(y0, h) -> y`.")
+        if not isinstance(order, int) or order < 0:
+            raise ValueError(f"`order` is {order!r}, but it must be 0 or a positive integer.")
+        if domain is not None and not callable(getattr(domain, "contains", None)):
             raise TypeError(
-                f"The `domain` of the flow map is {self.domain!r}, which has no method "
-                "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
-                "method."
+                f"The `domain` of the flow map is {domain!r}, which has no method `contains(y)`. "
+                "Make it a `diffrax_conserve.learned.Box`, or a Module with that method."
             )
-        check_args_domain(self.args_domain)
+        self.function, self.max_step, self.order = function, max_step, order
+        self.domain, self.args_domain = domain, checked_box(args_domain)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
@@ -149,15 +142,8 @@ class FlowMap(AbstractFlowMap):
     def layer(self) -> None:
         """A function has no separate conservative layer."""
 
-    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
-        del y0
-        return rate
-
     def weights(self) -> Any:
         return self.function
-
-    def linear_weights(self) -> tuple[()]:
-        return ()
 
 
 FlowMap.__init__.__doc__ = r"""**Arguments:**
@@ -197,13 +183,14 @@ def args_domain_of(model: Any) -> Box | None:
     return getattr(model, "args_domain", None)
 
 
-def check_args_domain(domain: Any) -> None:
-    """Raises unless `domain` is `None` or a box, from which `fit` can draw."""
-    if domain is not None and not isinstance(domain, Box):
+def checked_box(args_domain: Any) -> Box | None:
+    """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
+    if not isinstance(args_domain, Box | None):
         raise TypeError(
-            f"`args_domain` is {domain!r}, but it must be the smallest and the largest `args`: "
-            "`diffrax_conserve.learned.Box(lower, upper)`."
+            f"`args_domain` is {args_domain!r}, but it must be the smallest and the largest "
+            "`args`: `diffrax_conserve.learned.Box(lower, upper)`."
         )
+    return args_domain
 
 
 def known_args(flow_map: AbstractFlowMap, args: Args) -> tuple[Args, ...]:

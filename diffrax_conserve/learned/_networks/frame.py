@@ -15,8 +15,7 @@ from .flat import flatten
 class Frame(eqx.Module):
     r"""The representation of a state in a moving frame.
 
-    If symmetries such as translations, rotations, permutations or changes of scale map solutions to
-    solutions, a flow map need be learned for only one of the states that they map to each other. A
+    Symmetries such as rotations, permutations or changes of scale map solutions to solutions. A
     *frame* is a function of one state that returns
 
     - `inputs`: a vector of $k$ invariants of the symmetries, which differ for two states unless a
@@ -31,9 +30,8 @@ class Frame(eqx.Module):
 
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
-    and commutes with the symmetries for all weights. States that differ only in scale have the same
-    inputs and different own times; $\tau_{\max}$ is the largest own time of `max_step` among the
-    states with which it was built.
+    and commutes with the symmetries for all weights. $\tau_{\max}$ is the largest own time of
+    `max_step` among the states with which it was built.
 
     Examples are the methods `frame` of [`diffrax_conserve.systems.PointVortices`][] and of
     [`diffrax_conserve.systems.Kepler`][], which return the three as a tuple.
@@ -97,9 +95,8 @@ def check_frame(make: Any, y: Y) -> None:
     made = eqx.filter_eval_shape(make, y)
     if not (isinstance(made, Frame) or (isinstance(made, tuple) and len(made) == 3)):
         raise TypeError(
-            f"`frame` returns a {type(made).__name__}. It must return a "
-            "`diffrax_conserve.learned.Frame`, or a tuple of the same: the invariants of the "
-            "state, a basis that turns with it, and a clock."
+            f"`frame` returns a {type(made).__name__}, but must return a "
+            "`diffrax_conserve.learned.Frame`, or a tuple `(inputs, basis, clock)`."
         )
     inputs, basis = (made.inputs, made.basis) if isinstance(made, Frame) else made[:2]
     n = eqx.filter_eval_shape(flatten, y).size

@@ -13,10 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import Sizes
 from .flat import as_state, flatten, stacked_vectors
 from .layer import ConservativeLayer
-from .mlp import MLP, Activation, check_sizes, find_activation
+from .mlp import MLP, Activation, check_sizes
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 
@@ -120,7 +119,6 @@ class PINN(eqx.Module):
     layer: ConservativeLayer | None
     y0s: Y
     edges: tuple[float, ...] = eqx.field(static=True)  # the starts of the windows, and the end
-    sizes: Sizes = eqx.field(static=True)
     scale: Float[Array, " n"]
     normalise: bool = eqx.field(static=True)
 
@@ -142,22 +140,17 @@ class PINN(eqx.Module):
         check_sizes(width=width, depth=depth)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
-        self.edges = _edges(float(t0), float(t1), windows)
-        count = self.windows
         if slope is not None and not slope > 0:
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
-        y0 = as_state(y0)
-        dtype = working_dtype(y0)
-        self.sizes = Sizes(width, depth, 0, find_activation(activation))
-        n = flatten(y0).size
+        y0, self.edges = as_state(y0), _edges(float(t0), float(t1), windows)
+        dtype, n, count = working_dtype(y0), flatten(y0).size, self.windows
 
         def net(key: PRNGKeyArray) -> MLP:
             return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
 
         self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
         self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
-        self.layer = layer
-        self.normalise = normalise
+        self.layer, self.normalise = layer, normalise
         self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
 
     def __call__(self, t: RealScalarLike) -> Y:
@@ -192,39 +185,20 @@ class PINN(eqx.Module):
 
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
         """A window with the options of this network."""
-        dtype = self.scale.dtype
+        start, length = (jnp.asarray(t, self.scale.dtype) for t in (start, end - start))
+        scale, normalise = self.scale, self.normalise
         return Window(
-            net=net,
-            layer=self.layer,
-            y0=y0,
-            start=jnp.asarray(start, dtype),
-            length=jnp.asarray(end - start, dtype),
-            scale=self.scale,
-            normalise=self.normalise,
-        )
+            net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale,
+            normalise=normalise,
+        )  # fmt: skip
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
         """A network with the same options and these windows."""
-        width, depth, _, activation = self.sizes
-        found = jtu.tree_map(jnp.asarray, (nets, y0s, self.scale))
-
-        def build() -> PINN:
-            return PINN(
-                self.y0,
-                edges[0],
-                edges[-1],
-                windows=tuple(edges[1:-1]),
-                width=width,
-                depth=depth,
-                activation=activation,
-                normalise=self.normalise,
-                key=jr.key(0),
-            )
-
-        # Only the structure of the network is needed.
-        other = eqx.filter_eval_shape(build)
-        other = eqx.tree_at(lambda m: (m.nets, m.y0s, m.scale), other, found)
-        return eqx.tree_at(lambda m: m.layer, other, self.layer, is_leaf=lambda x: x is None)
+        nets, y0s = jtu.tree_map(jnp.asarray, (nets, y0s))
+        other = object.__new__(PINN)
+        for name, value in {**vars(self), "nets": nets, "y0s": y0s, "edges": tuple(edges)}.items():
+            object.__setattr__(other, name, value)
+        return other
 
     def _index(self, t: RealScalarLike) -> IntScalarLike:
         if self.windows == 1:

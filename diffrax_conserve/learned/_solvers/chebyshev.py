@@ -51,24 +51,24 @@ def fractions(count: int, dtype: Any) -> Array:
 
 
 def coefficients(values: PyTree[Array]) -> PyTree[Array]:
-    """The coefficients of the Chebyshev series through `values`, which are stacked over the
-    points."""
-    return jtu.tree_map(lambda v: _apply(to_coefficients(v.shape[0]), v), values)
+    """The coefficients of the series through `values`, which are stacked over the points."""
+    return jtu.tree_map(lambda v: multiply(to_coefficients(v.shape[0]), v), values)
 
 
 def integrals(values: Array) -> Array:
     """The integrals of the polynomial through `values`, from the first point to each point."""
-    return _apply(_integration(values.shape[0]), values)
+    return multiply(_integration(values.shape[0]), values)
 
 
 def at(where: tuple[float, ...], values: Array) -> Array:
     """The polynomial through `values` at the fractions `where`."""
-    return _apply(_evaluation(values.shape[0], where), values)
+    return multiply(_evaluation(values.shape[0], where), values)
 
 
-def _apply(matrix: np.ndarray, values: Array) -> Array:
-    weights = jnp.asarray(matrix, values.dtype)
-    return jnp.tensordot(weights, values, axes=1, precision=lax.Precision.HIGHEST)
+def multiply(table: np.ndarray, x: Array) -> Array:
+    """`table @ x`, never in the reduced precision of accelerators for single-precision products."""
+    weights = jnp.asarray(table, x.dtype)
+    return jnp.tensordot(weights, x, axes=1, precision=lax.Precision.HIGHEST)
 
 
 @ft.cache

@@ -1,7 +1,7 @@
 """A learned flow map as a diffrax solver."""
 
 from collections.abc import Callable
-from typing import ClassVar, final
+from typing import ClassVar, NamedTuple, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -17,31 +17,29 @@ from ..._tree import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import (
+    Refused,
     check_learned_terms,
     check_nodes,
     check_output,
-    refuse_another_field,
-    refuse_backwards,
-    reject_too_long,
+    judged,
+    refused_from_start,
 )
-from .policies import (
-    AbstractPolicy,
-    DomainStatistics,
-    StepResult,
-    as_policy,
-    check_policy,
-    step_of,
-)
-from .sweeps import AbstractSweep, Increment, Path, Picard, correct, estimate, increment
+from .policies import DomainStatistics, Policy, StepResult, check_policy, outcome, step_of
+from .sweeps import Increment, Picard, Sweep, correct, estimate, increment
+
+
+class _State(NamedTuple):
+    refused: Refused  # why the solve was refused from the start
+    statistics: DomainStatistics | None
 
 
 @final
-class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
+class FlowMapSolver(dfx.AbstractSolver[_State]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
     controller (pass it `dtmax=flow_map.max_step` to avoid such attempts) and fails with fixed
-    steps; a solve backwards in time is an error at run time.
+    steps; so does a solve backwards in time.
 
     **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
     $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
@@ -50,29 +48,24 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
 
     with the vector field of the term, at all points in parallel, or by `k` Newton iterations for
     the fixed point, each with a dense linear system of the size of the state times `nodes`. The
-    $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$, and `k` sweeps make a
-    flow map of order $q$ a method of order $q + k$; a Newton iteration squares the error.
+    $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$; a Newton iteration
+    squares it.
 
     **Error estimate.** Without sweeps it is the solution of the differential equation of the error,
-    driven by the defect $u' - f(u)$. This costs 12 states of the flow map and 28 evaluations of
-    $f$, none of which is computed with fixed steps. With sweeps it is the change by the last one,
-    at no extra cost. So [`diffrax.PIDController`][] can control a learned solver. Smaller steps
-    reduce the error of a solve if the error of a step falls faster than its length: with sweeps, or
-    with a flow map of order 1 or more.
+    driven by the defect $u' - f(u)$, for 12 states of the flow map and 28 evaluations of $f$; with
+    sweeps the change by the last one, at no extra cost. With fixed steps it is not computed.
+    Smaller steps reduce the error of a solve with sweeps, or with a flow map of order 1 or more.
 
     **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
     `outside` determines what happens to a step that starts outside `flow_map.domain`, or whose
     estimated error has a component larger than `max_error`.
 
-    Dense output follows the (corrected) path inside the step: it is the polynomial through its
-    states at the `nodes` points, which without sweeps are computed only if dense output, saved
-    times or an event need them. The weights are not copied.
+    Dense output is the polynomial through the (corrected) states at the `nodes` points, which are
+    computed only if something needs them.
 
     Derivatives with respect to the initial state and the weights are those of the computed
-    solution. The `args` of the solve are passed to the sweeps, the error estimate and the solver
-    `outside`, and to a flow map with an `args_domain`; other flow maps have learned one vector
-    field. If `args` are outside that domain, every step is outside. In a
-    [`diffrax_conserve.ManifoldProjection`][] the manifold gets them too.
+    solution. The `args` of the solve are passed to the vector field, and to a flow map with an
+    `args_domain`; outside that domain every step is outside.
 
     !!! example
 
@@ -104,8 +97,8 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
     flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
     nodes: int = option(12, static=True)
     corrections: int = option(0, static=True)
-    sweep: AbstractSweep = option(Picard())
-    outside: AbstractPolicy | None = eqx.field(default=None, kw_only=True, converter=as_policy)
+    sweep: Sweep = option(Picard())
+    outside: Policy | None = option(None)
     max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
 
@@ -124,10 +117,10 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
                 f"`corrections` is {self.corrections!r}, but it must be a number of sweeps: zero "
                 "or a positive integer."
             )
-        if not isinstance(self.sweep, AbstractSweep):
+        if not isinstance(self.sweep, Sweep):
             raise TypeError(
-                f"`sweep` is {self.sweep!r}, but it must be `diffrax_conserve.learned.Picard()` or "
-                "`diffrax_conserve.learned.NewtonSweep()`."
+                f"`sweep` is {self.sweep!r}, but it must be "
+                "`diffrax_conserve.learned.NewtonSweep()`, or left out for Picard's."
             )
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
@@ -155,13 +148,14 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-    ) -> DomainStatistics | None:
+    ) -> _State:
         check_learned_terms(terms, "FlowMapSolver")
         known = known_args(self.flow_map, args)
         check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
-        if self.check_field:
-            refuse_another_field(self.flow_map, known, terms, t0, t1, y0, args)
-        return None if self.outside is None else DomainStatistics.zero(t0)
+        refused = refused_from_start(
+            self.flow_map, known, terms, t0, t1, y0, args, self.check_field
+        )
+        return _State(refused, None if self.outside is None else DomainStatistics.zero(t0))
 
     def step(
         self,
@@ -170,28 +164,29 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: DomainStatistics | None,
+        solver_state: _State,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y, DenseInfo, DomainStatistics | None, dfx.RESULTS]:
+    ) -> tuple[Y, Y, DenseInfo, _State, dfx.RESULTS]:
         del made_jump
         flow_map, known = self.flow_map, known_args(self.flow_map, args)
-        h = refuse_backwards(jnp.asarray(t1 - t0), terms, flow_map.max_step)
+        h, (refused, statistics) = jnp.asarray(t1 - t0), solver_state
         step = self._learned(known, h, y0, increment(terms, t0, t1, y0, args))
-        if self.outside is not None and solver_state is not None:
+        if self.outside is not None and statistics is not None:
             inside = flow_map.inside(y0, *known, h)
             if (box := args_domain_of(flow_map)) is not None:
                 inside &= box.contains(*known)
             accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
-            solver_state = solver_state.add(t0, inside & accurate)
-            step = self.outside(
+            statistics = statistics.add(t0, inside & accurate)
+            step = outcome(
+                self.outside,
                 step,
                 inside,
                 accurate,
                 lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args),
             )
-        step = reject_too_long(step, h, t1, flow_map.max_step)
+        step = judged(step, refused, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
-        return step.y1, step.error, dense_info, solver_state, step.result
+        return step.y1, step.error, dense_info, _State(refused, statistics), step.result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
@@ -200,8 +195,13 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
     ) -> StepResult:
         """The step of the flow map, after the correction sweeps."""
-        _, unravel = ravel_pytree(y0)
-        path = _path(self.flow_map, self.nodes, known, h, y0)
+        start, unravel = ravel_pytree(y0)
+
+        def state(fraction: Array) -> Array:
+            return ravel_pytree(self.flow_map(y0, *known, fraction * h))[0].astype(start.dtype)
+
+        rows = jax.vmap(state)(fractions(self.nodes, h.dtype)[1:])
+        path = jnp.concatenate([start[None], rows])
         if self.corrections == 0:
             y1 = self.flow_map(y0, *known, h)
             y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), y1, y0)
@@ -213,17 +213,6 @@ class FlowMapSolver(dfx.AbstractSolver[DomainStatistics | None]):
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
 
-def _path(flow_map: AbstractFlowMap, nodes: int, known: tuple[Args, ...], h: Array, y0: Y) -> Path:
-    """The states of the flow map at the nodes; the first is the initial state."""
-    start, _ = ravel_pytree(y0)
-
-    def state(fraction: Array) -> Array:
-        return ravel_pytree(flow_map(y0, *known, fraction * h))[0].astype(start.dtype)
-
-    rows = jax.vmap(state)(fractions(nodes, h.dtype)[1:])
-    return jnp.concatenate([start[None], rows])
-
-
 FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.DeepONet`][], any other
@@ -233,26 +222,26 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
     [`diffrax_conserve.learned.Box`][].
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
-- `sweep`: [`diffrax_conserve.learned.Picard`][]`()` or
-    [`diffrax_conserve.learned.NewtonSweep`][]`()`.
+- `sweep`: [`diffrax_conserve.learned.NewtonSweep`][]`()`. Default: Picard's.
 - `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
     counts them, for [`diffrax_conserve.learned.domain_statistics`][];
-    [`diffrax_conserve.learned.Refuse`][]`()` also fails; with
-    [`diffrax_conserve.learned.Replace`][]`(solver)`, or just a diffrax solver, that solver takes
-    them. Default: nothing happens.
+    [`diffrax_conserve.learned.Refuse`][]`()` fails at the first; a diffrax solver takes them itself
+    (in a batch of lanes both compute every step). Default: nothing happens.
 - `max_error`: the largest estimated error of a component, in its own units, of a step that counts
     as inside. Default: only the domain decides.
-- `check_field`: whether to raise an error if the vector field at the initial state differs from the
-    slope of the flow map for $h \to 0$, in the Euclidean norm, by more than 0.1 % if that slope is
-    exact (`order` at least 1), otherwise by more than 75 %. With a Taylor polynomial in the flow
-    map this detects a wrong parameter or another system at once.
+- `check_field`: whether to fail if the vector field at the initial state differs from the slope of
+    the flow map for $h \to 0$, in the Euclidean norm, by more than 0.1 % if that slope is exact
+    (`order` at least 1): this detects a wrong parameter or another system at once. A learned slope
+    may differ by 75 %, and by more where the field changes much within `max_step`, as in stiff
+    equations.
 
 **Raises:**
 
 `TypeError` or `ValueError` if the flow map has another signature or returns another structure than
 that of the state, if a number is invalid, or if `outside` needs a domain that the flow map does not
-have. At run time, an error in a solve backwards in time or of an equation for which the flow map
-was not trained, and a failed result for a step that is too long.
+have. At run time a solve backwards in time or of an equation for which the flow map was not
+trained, a step that is too long, and a state that is not finite end with a failed
+[`result`][diffrax.RESULTS].
 """
 
 # An alias, named after the usual flow map.

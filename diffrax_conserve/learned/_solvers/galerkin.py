@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .chebyshev import multiply
 from .feature_basis import FeatureBasis
 
 Coefficients = Float[Array, "members n"]
@@ -34,7 +34,7 @@ class StepEquations(NamedTuple):
     def states(self, coefficients: Coefficients) -> Float[Array, "points n"]:
         """`u` at the Gauss points."""
         integrals = self.basis.integrals[:, : len(coefficients)]
-        return self.y0 + _multiply(integrals, coefficients)
+        return self.y0 + multiply(integrals, coefficients)
 
     def slopes(self, states: Float[Array, "points n"]) -> Float[Array, "points n"]:
         """`h f` at the Gauss points."""
@@ -47,7 +47,7 @@ class StepEquations(NamedTuple):
     def residual(self, coefficients: Coefficients) -> Coefficients:
         """`d - P h f`."""
         fit = self.basis.fit[: len(coefficients)]
-        return coefficients - _multiply(fit, self.slopes(self.states(coefficients)))
+        return coefficients - multiply(fit, self.slopes(self.states(coefficients)))
 
     def solve_linear(
         self, jacobians: Float[Array, "points n n"], right: Coefficients
@@ -55,7 +55,7 @@ class StepEquations(NamedTuple):
         """`(1 - P h ∂f/∂u Q)⁻¹` applied to `right`, which has one row for each member in use."""
         count, n = right.shape
         fit, integrals = self.basis.fit[:count], self.basis.integrals[:, :count]
-        products = _multiply(
+        products = multiply(
             (fit[:, None, :] * integrals.T[None]).reshape(count * count, -1),
             jacobians.reshape(-1, n * n),
         )
@@ -123,8 +123,8 @@ def error(equations: StepEquations, coefficients: Coefficients) -> Errors:
     at the end is the first row.
     """
     states = equations.states(coefficients)
-    slopes = _multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
-    right = _multiply(equations.basis.fit, equations.slopes(states) - slopes)
+    slopes = multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
+    right = multiply(equations.basis.fit, equations.slopes(states) - slopes)
     return equations.solve_linear(equations.jacobians(states), right)
 
 
@@ -137,9 +137,4 @@ def dense_series(
     is added inside the step, and the end is not changed.
     """
     inside = error.at[0].set(0).at[: len(coefficients)].add(coefficients)
-    return _multiply(equations.basis.series, inside).at[0].add(equations.y0)
-
-
-def _multiply(table: np.ndarray, x: Array) -> Array:
-    """`table @ x`, never in the reduced precision of accelerators for single-precision products."""
-    return jnp.matmul(jnp.asarray(table, x.dtype), x, precision=lax.Precision.HIGHEST)
+    return multiply(equations.basis.series, inside).at[0].add(equations.y0)

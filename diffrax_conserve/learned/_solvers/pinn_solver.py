@@ -5,28 +5,37 @@ from collections.abc import Callable
 from typing import ClassVar, final
 
 import diffrax as dfx
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection.base import option
+from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
 from ..._tree import tree_max, tree_sub, working_dtype
 from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
-from .checks import check_learned_terms, check_nodes, check_output
+from .checks import Refused, check_learned_terms, check_nodes, check_output
+
+_OUTSIDE = register(
+    "a step ends, or the solve starts, outside the interval that the PINN was trained for. Solve "
+    "from `pinn.t0` to `pinn.t1` at most, or train one for a longer interval."
+)
+_ANOTHER_START = register(
+    "`y0` is not the state that the PINN has at the initial time. A PINN is one solution: start "
+    "with `y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or use a `DeepONet`."
+)
 
 
 @final
-class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
+class PINNSolver(dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
     The vector field of the term is not evaluated, because the network was trained for it. Steps may
     have any length; they determine where states are saved, projected or tested for events. The
     solve must start on the network's solution, $y(t_0) = u(t_0)$, and stay inside its interval:
-    another initial state or a time outside is an error at run time. There is no error estimate, so
+    with another initial state or a time outside it fails. There is no error estimate, so
     use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
     Dense output follows the network inside the step: it is the polynomial through its states at
@@ -84,22 +93,16 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-    ) -> Float[Array, "2"]:
-        """The interval of the network, after a check that the solve starts on its solution."""
+    ) -> Refused:
+        """Zero, or why the solve cannot start: it is not on the solution of the network."""
         del t1, args
         check_learned_terms(terms, "PINNSolver")
         check_output(self.pinn, (t0,), y0, "pinn")
-        time = _refuse_outside(jnp.asarray(t0), terms, (self.pinn.t0, self.pinn.t1), self.pinn)
+        time = jnp.asarray(t0) * time_direction(terms, t0)
         state = self.pinn(time)
         tolerance = math.sqrt(jnp.finfo(working_dtype(y0)).eps)
-        interval = jnp.array([self.pinn.t0, self.pinn.t1], time.dtype)
-        return eqx.error_if(
-            interval,
-            ~(tree_max(tree_sub(y0, state)) <= tolerance * tree_max(state)),
-            "`y0` is not the state that the PINN has at the initial time: they differ by more than "
-            f"{tolerance:.1g} of their largest component. A PINN is one solution: start with "
-            "`y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or use a `DeepONet`.",
-        )
+        starts = tree_max(tree_sub(y0, state)) <= tolerance * tree_max(state)
+        return jnp.where(self._covers(time), jnp.where(starts, 0, _ANOTHER_START), _OUTSIDE)
 
     def step(
         self,
@@ -108,20 +111,25 @@ class PINNSolver(dfx.AbstractSolver[Float[Array, "2"]]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: Float[Array, "2"],
+        solver_state: Refused,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, None, DenseInfo, Float[Array, "2"], dfx.RESULTS]:
+    ) -> tuple[Y, None, DenseInfo, Refused, dfx.RESULTS]:
         del args, made_jump
-        interval = (solver_state[0], solver_state[1])
-        end = _refuse_outside(jnp.asarray(t1), terms, interval, self.pinn)
-        start = jnp.asarray(t0 * time_direction(terms, t0), end.dtype)
+        start, end = (jnp.asarray(t) * time_direction(terms, t) for t in (t0, t1))
 
         def state(t: RealScalarLike) -> Y:
             return jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.pinn(t), y0)
 
         coefficients = series(lambda c: state(start + c * (end - start)), self.nodes, end.dtype)
-        dense_info = dict(coefficients=coefficients)
-        return state(end), None, dense_info, solver_state, dfx.RESULTS.successful
+        failed = jnp.where(self._covers(end), 0, _OUTSIDE)
+        result = member(jnp.where(solver_state > 0, solver_state, failed))
+        return state(end), None, dict(coefficients=coefficients), solver_state, result
+
+    def _covers(self, time: Array) -> Array:
+        """Whether the network knows the solution at this time, up to roundoff."""
+        first, last = self.pinn.t0, self.pinn.t1
+        slack = 1e-6 * (last - first) + 8 * jnp.finfo(time.dtype).eps * jnp.abs(time)
+        return (time >= first - slack) & (time <= last + slack)
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
@@ -134,24 +142,7 @@ PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state; at run
-time an error if a time is outside the interval, or `y0` is not the state of the network at the
-initial time.
+`TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state. At run
+time the [`result`][diffrax.RESULTS] is a failure if a time is outside the interval, or `y0` is not
+the state of the network at the initial time, up to the square root of roundoff.
 """
-
-
-def _refuse_outside(
-    t: Array, terms: dfx.AbstractTerm, interval: tuple[RealScalarLike, RealScalarLike], pinn: PINN
-) -> Array:
-    """The time of the vector field for the solver's `t`; a run-time error unless it is in the
-    interval up to roundoff."""
-    time = t * time_direction(terms, t)
-    first, last = interval
-    slack = 1e-6 * (last - first) + 8 * jnp.finfo(time.dtype).eps * jnp.abs(time)
-    return eqx.error_if(
-        time,
-        ~((time >= first - slack) & (time <= last + slack)),
-        f"A step ends, or the solve starts, outside the interval from {pinn.t0:.6g} to "
-        f"{pinn.t1:.6g} that the PINN was trained for. Solve within it, or train one for a longer "
-        "interval.",
-    )

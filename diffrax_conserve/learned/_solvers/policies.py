@@ -1,6 +1,5 @@
 """Policies for steps that a flow map cannot be trusted with."""
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any, final
@@ -23,29 +22,19 @@ _OUTSIDE = register(
     "a step starts outside the domain of the flow map. "
     "`diffrax_conserve.learned.domain_statistics` tells at which time. Train the flow map on "
     "states from there, or let a classical solver take such steps, by "
-    "`outside=diffrax_conserve.learned.Replace(diffrax.Tsit5())`."
+    "`outside=diffrax.Tsit5()`."
 )
 _INACCURATE = register(
     "the estimated error of a step is above `max_error`. "
     "`diffrax_conserve.learned.domain_statistics` tells at which time. Take shorter steps, correct "
     "them by `corrections=...`, or let a classical solver take such steps, by "
-    "`outside=diffrax_conserve.learned.Replace(diffrax.Tsit5())`."
+    "`outside=diffrax.Tsit5()`."
 )
 
 
 @final
 class DomainStatistics(eqx.Module):
-    """The number of accepted steps outside the range that the flow map has learned.
-
-    A step is outside if it starts outside the flow map's `domain`, or if its estimated error is
-    above `max_error`. See the option `outside` of [`diffrax_conserve.DeepONetSolver`][].
-
-    **Attributes:**
-
-    - `num_steps`: the number of steps.
-    - `num_outside`: the number of them that were outside.
-    - `first_outside`: the time at which the first of them started; infinity if there is none.
-    """
+    """What `domain_statistics` returns."""
 
     num_steps: Int[Array, "..."]
     num_outside: Int[Array, "..."]
@@ -85,42 +74,35 @@ class StepResult(eqx.Module):
     result: dfx.RESULTS
 
 
-# The same step by another solver.
-TakeStep = Callable[[dfx.AbstractSolver], StepResult]
-
-
-class AbstractPolicy(eqx.Module):
-    """The treatment of a step that starts outside the domain, or is not accurate enough."""
-
-    @abc.abstractmethod
-    def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
-    ) -> StepResult:
-        """The result of the step, given that of the flow map."""
-
-
 @final
-class Report(AbstractPolicy):
+class Report(eqx.Module):
     """Counts such steps, for [`diffrax_conserve.learned.domain_statistics`][]."""
 
-    def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
-    ) -> StepResult:
-        del inside, accurate, take
-        return step
-
 
 @final
-class Refuse(AbstractPolicy):
+class Refuse(eqx.Module):
     """Fails at the first such step.
 
     A step that is not accurate enough is first rejected by an adaptive controller.
     """
 
-    def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
-    ) -> StepResult:
-        del take
+
+# What becomes of a step that starts outside the domain, or is not accurate enough. A solver takes
+# it.
+Policy = Report | Refuse | dfx.AbstractSolver
+
+
+def outcome(
+    policy: Policy,
+    step: StepResult,
+    inside: Array,
+    accurate: Array,
+    take: Callable[[dfx.AbstractSolver], StepResult],
+) -> StepResult:
+    """The result of a step, given that of the flow map, and `take`, the same step by a solver."""
+    if isinstance(policy, Report):
+        return step
+    if isinstance(policy, Refuse):
         index = jnp.where(inside, _INACCURATE, _OUTSIDE)
         result = dfx.RESULTS.where(inside & accurate, step.result, member(index))
         # The error is infinite only for an inaccurate step: a smaller step may be more accurate,
@@ -128,53 +110,11 @@ class Refuse(AbstractPolicy):
         error = jtu.tree_map(lambda e: jnp.where(accurate, e, jnp.inf), step.error)
         return StepResult(step.y1, error, step.coefficients, result)
 
+    def other() -> StepResult:
+        like = lambda a, b: jnp.asarray(a, jnp.result_type(b))  # noqa: E731
+        return jtu.tree_map(like, take(policy), step)
 
-@final
-class Replace(AbstractPolicy):
-    """Takes such steps with another solver.
-
-    In a batch (`jax.vmap`) both solvers compute every step. Adaptive steps need a solver with an
-    error estimate.
-    """
-
-    solver: dfx.AbstractSolver
-
-    def __check_init__(self):
-        solver, name = self.solver, type(self.solver).__name__
-        if not isinstance(solver, dfx.AbstractSolver):
-            raise TypeError(f"`solver` is {solver!r}, which is not a diffrax solver.")
-        if solver.term_structure is not dfx.AbstractTerm:
-            raise ValueError(
-                f"`solver` is a {name}, which needs several terms, but a learned solver has one. "
-                "Pass a solver of one, for example `diffrax.Tsit5()`."
-            )
-        root_finder = getattr(solver, "root_finder", None)
-        if root_finder is not None and not eqx.is_array_like(getattr(root_finder, "rtol", 0.0)):
-            raise ValueError(
-                f"`solver` is a {name}, whose root finder takes its tolerances from the step-size "
-                "controller; diffrax does not pass these to a nested solver. Give them explicitly, "
-                f"for example `{name}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
-                "norm=optimistix.max_norm))`."
-            )
-
-    def __call__(
-        self, step: StepResult, inside: Array, accurate: Array, take: TakeStep
-    ) -> StepResult:
-        def other() -> StepResult:
-            taken = take(self.solver)
-            return jtu.tree_map(lambda a, b: jnp.asarray(a, jnp.result_type(b)), taken, step)
-
-        return lax.cond(inside & accurate, lambda: jtu.tree_map(jnp.asarray, step), other)
-
-
-Replace.__init__.__doc__ = """**Arguments:**
-
-- `solver`: a diffrax solver.
-
-**Raises:**
-
-`TypeError` or `ValueError` if it is not a solver, or cannot take a step inside another solver.
-"""
+    return lax.cond(inside & accurate, lambda: jtu.tree_map(jnp.asarray, step), other)
 
 
 def step_of(
@@ -197,33 +137,46 @@ def step_of(
     return StepResult(y1, error, coefficients, result)
 
 
-def as_policy(outside: AbstractPolicy | dfx.AbstractSolver | None) -> AbstractPolicy | None:
-    """`outside` as a policy; a diffrax solver becomes `Replace(solver)`."""
-    if isinstance(outside, dfx.AbstractSolver):
-        return Replace(outside)
-    if outside is not None and not isinstance(outside, AbstractPolicy):
-        raise TypeError(
-            f"`outside` is {outside!r}, but it must be `None`, "
-            "`diffrax_conserve.learned.Report()`, `Refuse()`, or `Replace(solver)` with a diffrax "
-            "solver that takes the steps that the flow map cannot, such as `diffrax.Tsit5()`."
-        )
-    return outside
-
-
-def check_policy(outside: AbstractPolicy | None, max_error: Any, domain: Any) -> None:
-    """Raises if a policy is given without a domain or an error bound, or an error bound without a
-    policy."""
+def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
+    """Raises unless `policy` is one, and goes with the domain and the error bound."""
     check_number("max_error", max_error, above=0.0)
-    if outside is None and max_error is not None:
-        raise ValueError(
-            "`max_error` says which steps count as outside, but these are ignored. Pass `outside="
-            "diffrax_conserve.learned.Report()`, `Refuse()` or `Replace(diffrax.Tsit5())` too."
+    if policy is None:
+        if max_error is not None:
+            raise ValueError(
+                "`max_error` says which steps count as outside, but these are ignored. Pass "
+                "`outside=diffrax_conserve.learned.Report()`, `Refuse()` or `diffrax.Tsit5()` too."
+            )
+        return
+    if isinstance(policy, dfx.AbstractSolver):
+        _check_solver(policy)
+    elif not isinstance(policy, Report | Refuse):
+        raise TypeError(
+            f"`outside` is {policy!r}, but it must be `None`, "
+            "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver that takes the "
+            "steps that the flow map cannot, such as `diffrax.Tsit5()`."
         )
-    if outside is not None and max_error is None and domain is None:
+    if max_error is None and domain is None:
         raise ValueError(
-            f"`outside` is {outside!r}, but the flow map does not say what is outside: it has no "
+            f"`outside` is {policy!r}, but the flow map does not say what is outside: it has no "
             "`domain`. Give it one, for example `diffrax_conserve.learned.Box.around(states)` with "
             "the states that it was trained on, or pass `max_error`."
+        )
+
+
+def _check_solver(solver: Any) -> None:
+    """Raises unless a solver can take a step inside another one."""
+    name, root_finder = type(solver).__name__, getattr(solver, "root_finder", None)
+    if solver.term_structure is not dfx.AbstractTerm:
+        raise ValueError(
+            f"`outside` is a {name}, which needs several terms, but a learned solver has one. "
+            "Pass a solver of one, for example `diffrax.Tsit5()`."
+        )
+    if root_finder is not None and not eqx.is_array_like(getattr(root_finder, "rtol", 0.0)):
+        raise ValueError(
+            f"`outside` is a {name}, whose root finder takes its tolerances from the step-size "
+            "controller; diffrax does not pass these to a nested solver. Give them explicitly, "
+            f"for example `{name}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
+            "norm=optimistix.max_norm))`."
         )
 
 
@@ -240,7 +193,13 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
 
     **Returns:**
 
-    A [`diffrax_conserve.learned.DomainStatistics`][].
+    An object with the attributes
+
+    - `num_steps`: the number of accepted steps;
+    - `num_outside`: the number of them that were outside: a step that starts outside the flow map's
+        `domain`, or whose estimated error is above `max_error`;
+    - `fraction_outside`: `num_outside / num_steps`;
+    - `first_outside`: the time at which the first of them started; infinity if there is none.
 
     **Raises:**
 
@@ -270,12 +229,8 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         0.0
         ```
     """
-
     check_solution(sol, "domain_statistics")
-
-    def is_found(x: Any) -> bool:
-        return isinstance(x, DomainStatistics)
-
+    is_found = lambda x: isinstance(x, DomainStatistics)  # noqa: E731
     found = [x for x in jtu.tree_leaves(sol.solver_state, is_leaf=is_found) if is_found(x)]
     if not found:
         raise ValueError(

@@ -57,10 +57,9 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 
     **Conservation.** As a least-squares fit of slopes (a continuous Galerkin method) the solver
     conserves, for any features, the energy of every canonical Hamiltonian system,
-    $y' = J \nabla H(y)$, to the accuracy of the Gauss rule. This soon reaches roundoff, also where
-    the error in the state is large. Solutions of linear equations stay bounded if the exact
-    solution does (to 1e-6 per step). Very stiff components are not damped; in such transients steps
-    become short. To conserve other integrals use [`diffrax_conserve.ManifoldProjection`][].
+    $y' = J \nabla H(y)$, to the accuracy of the Gauss rule, which soon reaches roundoff. Very stiff
+    components are not damped; in such transients steps become short. To conserve other integrals
+    use [`diffrax_conserve.ManifoldProjection`][].
 
     If Newton's method fails, an adaptive solve tries a shorter step, and a solve with fixed steps
     fails. Dense output is the network. Derivatives in forward and reverse mode, of any order, are

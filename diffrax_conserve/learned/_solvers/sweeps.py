@@ -8,7 +8,6 @@ $$u(c_i) = y_0 + h \int_0^{c_i} f(u(c))\,dc,$$
 at all points, where the integral is that of the polynomial through the increments $h f$.
 """
 
-import abc
 from collections.abc import Callable
 from typing import final
 
@@ -44,38 +43,27 @@ def increment(
     return evaluate
 
 
-class AbstractSweep(eqx.Module):
-    """An iteration for the collocation equations of a step."""
-
-    @abc.abstractmethod
-    def __call__(self, increment: Increment, path: Path) -> Path:
-        """The path after one iteration."""
-
-    @abc.abstractmethod
-    def power(self, power: int) -> int:
-        """The power of the step size in the error of the new path, given that of the old one."""
-
-
 @final
-class Picard(AbstractSweep):
+class Picard(eqx.Module):
     r"""The sweep $u \leftarrow y_0 + h \int f(u)$, at all points in parallel."""
 
     def __call__(self, increment: Increment, path: Path) -> Path:
         return path[0] + integrals(jax.vmap(increment)(_fractions(path), path))
 
     def power(self, power: int) -> int:
+        """The power of the step size in the error of the new path, given that of the old one."""
         return power + 1
 
 
 @final
-class NewtonSweep(AbstractSweep):
+class NewtonSweep(eqx.Module):
     """A Newton iteration, with a dense linear system of the size of the state times the nodes."""
 
     def __call__(self, increment: Increment, path: Path) -> Path:
         if jnp.issubdtype(path.dtype, jnp.complexfloating):
             raise TypeError(
                 "`NewtonSweep` needs a real state, but this one is complex. Split it into its real "
-                "and its imaginary part, or use `sweep=diffrax_conserve.learned.Picard()`."
+                "and its imaginary part, or leave `sweep` out."
             )
         count, n = path.shape
         residual = Picard()(increment, path) - path
@@ -92,8 +80,11 @@ class NewtonSweep(AbstractSweep):
         return 2 * power + 1
 
 
+Sweep = Picard | NewtonSweep
+
+
 def correct(
-    sweep: AbstractSweep, increment: Increment, path: Path, count: int
+    sweep: Sweep, increment: Increment, path: Path, count: int
 ) -> tuple[Path, Inexact[Array, " n"]]:
     """The path after `count` sweeps, and the change by the last of them at the end of the step."""
     previous = path

@@ -18,7 +18,7 @@ from ..._custom_types import Args, Manifold
 from .._networks.flow_map import args_domain_of, as_flow_map, restored
 from .._networks.pinn import PINN
 from .._networks.trainable import Sampler
-from .._networks.with_args import OfPairs, PairField, PairSampler
+from .._networks.wrappers import OfPairs, PairField, PairSampler
 from .arguments import (
     check_arguments,
     check_family,

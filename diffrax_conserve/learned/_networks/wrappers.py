@@ -1,0 +1,371 @@
+"""Flow maps that hold another one: in shorter steps, other coordinates, with `args` as states."""
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ..._custom_types import Args, RealScalarLike, Y
+from ..._tree import tree_sub, unflatten
+from .cores import AbstractCore
+from .domain import Box
+from .flat import flatten, stacked_vectors
+from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
+from .mlp import check_sizes
+from .trainable import LayerSchedule, Sampler
+
+_Model = TypeVar("_Model")
+
+
+class AbstractWrapper(AbstractFlowMap):
+    """A flow map of another one, `flow_map`. What a subclass does not define is the other's."""
+
+    flow_map: eqx.AbstractVar[AbstractFlowMap]
+
+    @property
+    def max_step(self) -> RealScalarLike:
+        """The longest step."""
+        return self.flow_map.max_step
+
+    @property
+    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The order of the inner flow map."""
+        return self.flow_map.order
+
+    @property
+    def domain(self) -> Any:
+        """The domain of the inner flow map, or `None`."""
+        return self.flow_map.domain
+
+    @property
+    def args_domain(self) -> Box | None:
+        """The `args_domain` of the inner flow map, or `None`."""
+        return args_domain_of(self.flow_map)
+
+    @property
+    def layer(self) -> Any:
+        """`None`: an inner layer is applied inside."""
+
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        return self.flow_map.inside(y0, *step)
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.flow_map.measure(y0, rate)
+
+    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
+        return self.flow_map.compared(ys, others)
+
+    def weights(self) -> Any:
+        return self.flow_map.weights()
+
+
+@final
+class Repeated(AbstractWrapper):
+    r"""The flow map of steps that are `count` times as long: $u(h) = \Phi_{h/k} \circ \dots \circ
+    \Phi_{h/k}(u_0)$.
+
+    A flow is easier to learn over shorter steps. If the longest step is prescribed, learn a
+    fraction of it and repeat that. Train the inner flow map: the repeated one has no weights of its
+    own. It costs as much as `count` steps of the inner one.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("conservative-lorenz")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        half = dfc.DeepONet(states, 0.125, key=jax.random.key(1))
+        flow_map = dfc.learned.Repeated(half, 2)
+        assert flow_map.max_step == 0.25
+        ```
+    """
+
+    flow_map: AbstractFlowMap
+    count: int = eqx.field(static=True)
+
+    def __init__(self, flow_map: AbstractFlowMap | Callable[..., Any], count: int):
+        self.flow_map = as_flow_map(flow_map)
+        self.count = count
+
+    def __check_init__(self):
+        check_sizes(count=self.count)
+
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
+
+        def once(y: Y, each: Any) -> tuple[Y, None]:
+            return self.flow_map(y, *each, schedule=schedule), None
+
+        return self._scan(once, y0, step)
+
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        """Whether every inner step is within the domain."""
+
+        def once(carry: tuple[Y, Array], each: Any) -> tuple[tuple[Y, Array], None]:
+            y, inside = carry
+            return (self.flow_map(y, *each), inside & self.flow_map.inside(y, *each)), None
+
+        return self._scan(once, (y0, True), step)[1]
+
+    def _scan(self, once: Callable[..., Any], start: Any, step: Any) -> Any:
+        each = (*step[:-1], jnp.asarray(step[-1]) / self.count)
+        start = jtu.tree_map(jnp.asarray, start)
+        return lax.scan(lambda carry, _: once(carry, each), start, length=self.count)[0]
+
+    def slope(self, y0: Y, *args: Args) -> Y:
+        return self.flow_map.slope(y0, *args)
+
+    @property
+    def max_step(self) -> RealScalarLike:
+        """The longest step."""
+        return self.count * self.flow_map.max_step
+
+    def weights(self) -> tuple[()]:
+        return ()
+
+
+Repeated.__init__.__doc__ = r"""**Arguments:**
+
+- `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that
+    [`diffrax_conserve.DeepONetSolver`][] takes.
+- `count`: the number of inner steps in one step.
+
+**Raises:**
+
+`ValueError` or `TypeError` if an argument is not of this kind.
+"""
+
+
+@final
+class BoxCox(eqx.Module):
+    r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
+
+    Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
+    of zero is finite. With an exponent of 0 it is the logarithm, for positive states. Exponents
+    such as 1/4 or 1/8 are computed by square roots, at a tenth of the cost of other powers.
+    """
+
+    exponent: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self):
+        if not 0 <= self.exponent <= 1:
+            raise ValueError(f"`exponent` must be from 0 to 1, but is {self.exponent}.")
+
+    def __call__(self, y: Y) -> Y:
+        p = self.exponent
+        return jtu.tree_map(lambda x: (_root(x, p) - 1) / p if p else jnp.log(x), y)
+
+    def inverse(self, z: Y) -> Y:
+        p = self.exponent
+        if p == 0:
+            return jtu.tree_map(jnp.exp, z)
+        # An integer power is a product of a few factors.
+        power = round(1 / p) if 1 / p == round(1 / p) else 1 / p
+        return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** power, z)
+
+
+def _root(x: Array, exponent: float) -> Array:
+    """`x` to a positive power, by square roots if the exponent is a power of 1/2."""
+    halvings = -math.log2(exponent)
+    if halvings != round(halvings):
+        return x**exponent
+    for _ in range(round(halvings)):
+        x = jnp.sqrt(x)
+    return x
+
+
+BoxCox.__init__.__doc__ = r"""**Arguments:**
+
+- `exponent`: $\lambda$, from 0 to 1.
+
+**Raises:**
+
+`ValueError` if `exponent` is outside this range.
+"""
+
+
+@final
+class Transformed(AbstractWrapper):
+    r"""A flow map in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
+
+    Chemical concentrations that span ten orders of magnitude are learned as powers or logarithms,
+    so that small ones count and none is negative. The initial state is exact. Both data losses and
+    defects are measured in these coordinates.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+        import jax
+
+        system = dfc.systems.get("pollu")
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
+        boxcox = dfc.learned.BoxCox(0.1)
+        inner = dfc.DeepONet(boxcox(states), 2.0, width=8, depth=1, key=jax.random.key(1))
+        flow_map = dfc.learned.Transformed(inner, boxcox)
+        assert (flow_map(states[0], 1.0) >= 0).all()
+        ```
+    """
+
+    flow_map: AbstractFlowMap
+    transformation: Any
+
+    def __init__(self, flow_map: AbstractFlowMap | Callable[..., Any], transformation: Any):
+        self.flow_map = as_flow_map(flow_map)
+        self.transformation = transformation
+
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
+        y0 = jtu.tree_map(jnp.asarray, y0)
+        z0 = self.transformation(y0)
+        z1 = self.flow_map(z0, *step, schedule=schedule)
+        there = self.transformation.inverse(z1)
+
+        def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
+            # Where the step changes nothing, the roundoff of the transformation and its inverse is
+            # removed. The derivatives are those of `y`.
+            exact = lax.stop_gradient(y0) + (y - lax.stop_gradient(y))
+            return jnp.where(z0 == z1, exact, y).astype(y0.dtype)
+
+        return jtu.tree_map(component, y0, there, z0, z1)
+
+    @property
+    def domain(self) -> Any:
+        """The states whose coordinates are in the domain of the inner flow map, or `None`."""
+        return None if self.flow_map.domain is None else self
+
+    def contains(self, y: Y) -> Bool[Array, ""]:
+        """Whether `y` is in the domain."""
+        return self.flow_map.domain.contains(self.transformation(y))
+
+    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
+        return self.flow_map.inside(self.transformation(y0), *step)
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
+        return flatten(jax.jvp(self.transformation, (y0,), (unflatten(rate, y0),))[1])
+
+    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
+        return stacked_vectors(tree_sub(*(jax.vmap(self.transformation)(y) for y in (ys, others))))
+
+
+Transformed.__init__.__doc__ = """**Arguments:**
+
+- `flow_map`: the flow map of the coordinates.
+- `transformation`: [`diffrax_conserve.learned.BoxCox`][], or your own Module, called as `(y) -> z`,
+    with a method `inverse(z)`.
+"""
+
+
+@final
+class OfPairs(AbstractWrapper):
+    """A family of flow maps as a single flow map of the pairs `(y, args)`, with constant `args`.
+
+    For `fit`, `args` are then a part of the state.
+    """
+
+    flow_map: AbstractFlowMap
+
+    def __init__(self, flow_map: AbstractFlowMap):
+        self.flow_map = flow_map
+
+    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
+        """The pair a time `h` after the pair `y0`, with `step` = `h`."""
+        y0, args = y0
+        return self.flow_map(y0, args, *step, schedule=schedule), args
+
+    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
+        # The last part is the rate of `args`, which is zero.
+        return self.flow_map.measure(y0[0], rate[: flatten(y0[0]).size])
+
+    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
+        return self.flow_map.compared(ys[0], others[0])
+
+    def linear_weights(self) -> Any:
+        return self.flow_map.linear_weights()
+
+    @property
+    def domain(self) -> None:
+        """`None`: `fit` does not extend the domain of a family."""
+
+    @property
+    def args_domain(self) -> None:
+        """`None`: `args` are part of the state."""
+
+
+@final
+class PairField(eqx.Module):
+    """The vector field of the pairs."""
+
+    vector_field: Callable[..., Any]
+
+    def __call__(self, t: RealScalarLike, y: Any, args: None) -> Any:
+        del args
+        y, args = y
+        return self.vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
+
+
+@final
+class PairSampler(eqx.Module):
+    """Draws a state, and `args` from their domain."""
+
+    sample: Sampler
+    domain: Box
+
+    def __call__(self, key: PRNGKeyArray) -> tuple[Any, Any]:
+        state_key, args_key = jr.split(key)
+        return self.sample(state_key), self.domain.sample(args_key)
+
+
+def single_precision(flow_map: _Model) -> _Model:
+    r"""The same flow map, whose network is evaluated in float32.
+
+    A network computes in the precision of its weights. In $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S
+    G$ only $G$ is rounded to float32, about $10^{-7} S$. The state, the step, the polynomial and
+    the normalisation of the inputs stay in their own precision, and so does a projection. If the
+    network's own error is larger than this rounding, nothing is lost. On a CPU evaluation takes
+    about half as long, and a file about half the space.
+
+    Convert a network after training: its training needs the precision of the state.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        flow_map = dfc.load_pretrained("conservative-lorenz")
+        faster = dfc.learned.single_precision(flow_map)
+        solver = dfc.DeepONetSolver(faster)
+        ```
+
+    **Arguments:**
+
+    - `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that contains some, such as a
+        [`diffrax_conserve.learned.Repeated`][] or a solver.
+
+    **Raises:**
+
+    `TypeError` if it contains no `DeepONet`.
+    """
+
+    def is_core(x: Any) -> bool:
+        return isinstance(x, AbstractCore)
+
+    def single(x: Any) -> Any:
+        return x.astype(jnp.float32) if eqx.is_array(x) and x.dtype == jnp.float64 else x
+
+    if not any(map(is_core, jtu.tree_leaves(flow_map, is_leaf=is_core))):
+        raise TypeError(
+            f"`flow_map` is {flow_map!r}, which contains no `DeepONet`. Only the network of a "
+            "`DeepONet` can be evaluated in another precision than that of the state."
+        )
+    rounded = lambda x: jtu.tree_map(single, x) if is_core(x) else x  # noqa: E731
+    return jtu.tree_map(rounded, flow_map, is_leaf=is_core)
