@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import AbstractCore, Product, Sizes
+from .cores import AbstractCore, Concatenated, Sizes
 from .domain import Box, FramedBox
 from .flat import as_state, as_states, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, check_args_domain, checked_args
@@ -78,10 +78,10 @@ class DeepONet(AbstractFlowMap):
         max_step: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        width: int = 40,
-        depth: int = 4,
+        width: int = 24,
+        depth: int = 2,
         latent: int = 20,
-        core: type[AbstractCore] = Product,
+        core: type[AbstractCore] = Concatenated,
         activation: str | Activation = "tanh",
         normalise: bool = True,
         taylor: Taylor | None = None,

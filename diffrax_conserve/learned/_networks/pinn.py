@@ -132,10 +132,10 @@ class PINN(eqx.Module):
         *,
         key: PRNGKeyArray,
         windows: int | Sequence[float] = 1,
-        width: int = 40,
-        depth: int = 4,
+        width: int = 30,
+        depth: int = 1,
         activation: str | Activation = "tanh",
-        slope: float | None = None,
+        slope: float | None = 2.0,
         normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):

@@ -18,7 +18,8 @@ from ..._projection.project import project
 from ..._tree import tree_all_finite
 from .._networks.domain import AbstractDomain
 from .._networks.flow_map import AbstractFlowMap
-from .._networks.trainable import Points, Sampler
+from .._networks.trainable import Points
+from .states import as_sampler
 
 # A function from steps, each given by an initial state and a length, to the squared norms of the
 # defects at their ends.
@@ -72,18 +73,13 @@ class Pool(eqx.Module):
         ```
     """
 
-    sample: Sampler
+    sample: Any = eqx.field(converter=as_sampler)
     manifold: Manifold | None = eqx.field(kw_only=True, default=None)
     mean_steps: RealScalarLike = eqx.field(kw_only=True, default=20)
     max_defect: RealScalarLike = eqx.field(kw_only=True, default=1.0)
     keep: Callable[[Any], Bool[Array, ""]] | None = eqx.field(kw_only=True, default=None)
 
     def __check_init__(self):
-        if not callable(self.sample):
-            raise TypeError(
-                f"`sample` is {self.sample!r}, but it must be a function from a random key to an "
-                "initial state. For given states write `Pool(FromStates(states))`."
-            )
         if self.manifold is not None:
             check_manifold(self.manifold)
             refuse_rates(self.manifold, "a `Pool`")
@@ -99,7 +95,8 @@ class Pool(eqx.Module):
 
 Pool.__init__.__doc__ = r"""**Arguments:**
 
-- `sample`: a function from a random key to an initial state of a solve.
+- `sample`: a function from a random key to an initial state of a solve, or such states, stacked
+    along a leading axis.
 - `manifold`: the manifold to which states are projected; each keeps its initial values of the
     integrals. Default: no projection.
 - `mean_steps`: the mean number of steps before a state is replaced by a new one. Steps have random
@@ -160,8 +157,3 @@ def domain_of(flow_map: Any) -> AbstractDomain | None:
     """The domain of a flow map, if `fit` can extend it, otherwise `None`."""
     domain = flow_map.domain
     return domain if isinstance(domain, AbstractDomain) else None
-
-
-def with_domain(model: Any, domain: AbstractDomain | None) -> Any:
-    """`model` with this domain; unchanged for `None`."""
-    return model if domain is None else eqx.tree_at(lambda m: m.domain, model, domain)

@@ -16,12 +16,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike
-from .defect import squared_norms
-from .loss import Loss
+
+# A function from the squared norm of the defect at each point, and a typical squared norm of `f`,
+# to a loss.
+Loss = Callable[[Float[Array, " points"], Float[Array, ""]], Float[Array, ""]]
+
+
+def squared_norms(vectors: Float[Array, "points n"]) -> Float[Array, " points"]:
+    """The squared norms of vectors stacked along a leading axis."""
+    return jnp.sum(jnp.square(vectors), axis=1)
 
 
 class LeastSquares(NamedTuple):
@@ -103,11 +111,23 @@ class SPRING(eqx.Module):
         r, jacobian, loss = problem.rows(weights)
         running = jnp.where(jnp.isfinite(state.loss), 0.95 * state.loss + 0.05 * loss, loss)
         zeta = self.momentum * state.update
-        gram = jacobian @ jacobian.T + self.damping * running * jnp.eye(r.size, dtype=r.dtype)
-        factor = jsl.cho_factor(gram, lower=True)
-        update = zeta - jacobian.T @ jsl.cho_solve(factor, r + jacobian @ zeta)
-        length = jnp.minimum(1, (1 - fraction) / 0.6).astype(r.dtype)
+        damping, target = self.damping * running, r + jacobian @ zeta
+        # Both are the same update; the smaller matrix is factored.
+        if weights.size < r.size:
+            update = zeta - _solve(jacobian.T @ jacobian, damping, jacobian.T @ target)
+        else:
+            update = zeta - jacobian.T @ _solve(jacobian @ jacobian.T, damping, target)
+        length = jnp.asarray(_LENGTH(fraction), r.dtype)
         return weights + length * update, SpringState(update, running), loss
+
+
+_LENGTH = optax.linear_schedule(1.0, 0.0, 0.6, transition_begin=0.4)  # pyright: ignore
+
+
+def _solve(gram: Array, damping: Array, rhs: Array) -> Array:
+    """The solution of `(gram + damping I) x = rhs`."""
+    matrix = gram + damping * jnp.eye(rhs.size, dtype=rhs.dtype)
+    return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), rhs)
 
 
 SPRING.__init__.__doc__ = r"""**Arguments:**

@@ -1,5 +1,4 @@
-"""The state of a training, from which another call of `fit` or another process can continue it, and
-its log."""
+"""The state of a training, from which another call of `fit` or another process can continue it."""
 
 import dataclasses
 import hashlib
@@ -21,28 +20,6 @@ from .objective import Carry
 
 
 @final
-class FitState(eqx.Module):
-    """The state of a training, `log.state` of [`diffrax_conserve.learned.FitLog`][].
-
-    Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are not part of the interface.
-    """
-
-    model: Any  # as it was given
-    carry: Carry  # of the present network
-    checked: np.ndarray  # of that network
-    criteria: np.ndarray
-    past: "Past"
-    trained: int = 0  # number of trainings that have ended
-    finished: int = 0
-    windows: "Windows | None" = None  # of a PINN
-
-    @property
-    def done(self) -> int:
-        """The number of epochs of the present network."""
-        return int(self.checked[-1]) if self.checked.size else 0
-
-
-@final
 class Windows(eqx.Module):
     """The windows of a PINN in training, stacked in numpy arrays, because their number may
     change."""
@@ -51,58 +28,68 @@ class Windows(eqx.Module):
     y0s: Any
     edges: np.ndarray
     errors: np.ndarray  # of each window alone; infinity if it is not trained
-    halvings: np.ndarray  # how often each one's original window was cut
-    slope: float  # of the first weights; 0 for none
     present: int = 0  # index of the one in training
-    attempt: int = 0  # number of its earlier trainings
-    given_up: int = 0  # whether a window has finally failed
     passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
     tightening: float = 1.0  # by which the limit of a window's error is divided
 
 
 @final
-class Past(eqx.Module):
-    """The records of the networks before the present one, and the values of the worst of them."""
+class FitState(eqx.Module):
+    """The state of a training, `log.state` of [`diffrax_conserve.learned.FitLog`][].
 
-    losses: np.ndarray
-    checked: np.ndarray
-    criteria: np.ndarray
-    best_epoch: int = 0
-    best: float = -1.0
+    Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are not part of the interface.
+    """
+
+    model: Any  # as it was given
+    carry: Carry  # of the present network
+    windows: Windows | None  # of a PINN
+    # The records of all networks, and of those before the present one the values of the worst.
+    losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))  # without the present ones
+    checked: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0, int))
+    criteria: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
+    worst: float = -1.0
+    worst_epoch: int = 0
     skipped: int = 0
+    done: int = -1  # epochs of the present network; -1 if it was not evaluated
+    trained: int = 0  # number of trainings that have ended
+    finished: int = 0
 
-    @classmethod
-    def empty(cls) -> "Past":
-        return cls(np.zeros(0), np.zeros(0, int), np.zeros(0))
+    def compared(self, criterion: float) -> "FitState":
+        """This state with one more comparison in its records."""
+        checked = np.append(self.checked, self.losses.size + self.done)
+        criteria = np.append(self.criteria, criterion)
+        return dataclasses.replace(self, checked=checked, criteria=criteria)
 
-    def and_then(self, carry: Carry, checked: np.ndarray, criteria: np.ndarray) -> "Past":
-        """These records with that of one more network."""
-        before = self.losses.size
-        worse = float(carry.best) > self.best
-        return Past(
-            np.concatenate([self.losses, np.asarray(carry.losses)]),
-            np.concatenate([self.checked, before + checked]),
-            np.concatenate([self.criteria, criteria]),
-            before + int(carry.best_epoch) if worse else self.best_epoch,
-            max(float(carry.best), self.best),
-            self.skipped + int(carry.skipped),
+    def closed(self) -> "FitState":
+        """This state with all of its present network in the records."""
+        best, before = float(self.carry.best), self.losses.size
+        worse = best > self.worst
+        return dataclasses.replace(
+            self,
+            losses=np.concatenate([self.losses, np.asarray(self.carry.losses)]),
+            worst=best if worse else self.worst,
+            worst_epoch=before + int(self.carry.best_epoch) if worse else self.worst_epoch,
+            skipped=self.skipped + int(self.carry.skipped),
+            done=-1,
+            trained=self.trained + 1,
         )
 
-
-def continued(state: FitState, epochs: int, first: FitState) -> FitState:
-    """The given `state`, if a training can be continued from it; `first` is that of a new
-    training."""
-    if jtu.tree_structure(state.carry.weights) != jtu.tree_structure(first.carry.weights):
-        raise ValueError("`state` is that of a training of another kind of network.")
-    if state.done < epochs and (state.windows is None or state.windows.errors.size == 1):
-        return dataclasses.replace(state, finished=0)
-    if state.finished or state.done >= epochs:
-        raise ValueError(
-            f"The training whose `state` was given has made all its {state.done} epochs, and the "
-            f"recipe has {epochs}. Give one with more, such as "
-            "`dataclasses.replace(recipe, epochs=...)`; a `PINN` of several windows cannot go on."
-        )
-    return state
+    def continued(self, epochs: int, first: "FitState") -> "FitState":
+        """This state, if a training of so many epochs can go on from it; `first` is that of a new
+        training."""
+        if jtu.tree_structure(self.carry.weights) != jtu.tree_structure(first.carry.weights):
+            raise ValueError("`state` is that of a training of another kind of network.")
+        several = self.windows is not None and self.windows.errors.size > 1
+        if self.done >= epochs or (self.finished and several):
+            raise ValueError(
+                f"The training whose `state` was given has made all its {self.done} epochs, and "
+                f"the recipe has {epochs}. Give one with more, such as "
+                "`dataclasses.replace(recipe, epochs=...)`; a `PINN` of several windows cannot go "
+                "on."
+            )
+        losses = self.carry.losses[:epochs]
+        losses = jnp.concatenate([losses, jnp.full(epochs - losses.size, jnp.nan, losses.dtype)])
+        return dataclasses.replace(self, finished=0, carry=self.carry._replace(losses=losses))
 
 
 def fingerprint(given: Any, recipe: Any) -> str:
@@ -130,7 +117,10 @@ def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
 
 
 def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
-    """The state in a file; `like` is the first state of the same training."""
+    """The state in a file; `like` is the first state of the same training.
+
+    `equinox.tree_deserialise_leaves` does not serve, because the number of windows may differ.
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
@@ -146,7 +136,7 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
     return treedef.unflatten([_as(x, y) for x, y in zip(found, leaves, strict=True)])
 
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def _is_key(x: Any) -> bool:
@@ -168,45 +158,3 @@ def _as(found: np.ndarray, like: Any) -> Any:
     if found.dtype.kind == "V":  # numpy does not know bfloat16
         found = found.view(like.dtype)
     return jnp.asarray(found)
-
-
-@final
-class FitLog(eqx.Module):
-    """The record of a training.
-
-    **Attributes:**
-
-    - `error`: the estimated error of the solution, for each leaf of the state relative to its
-        largest component. For a `PINN` it is the largest error in the whole interval; for a flow
-        map the root mean square error of its longest step, over states from `sample`. The estimate
-        solves the differential equation of the error, driven by the defect. Infinity if no estimate
-        is possible or a window was not trained.
-    - `errors`: for each window of a `PINN`, the error that this window alone causes.
-    - `losses`: the training loss at each epoch, before its update.
-    - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points with all iterations of the
-        conservative layer, so that epochs with different numbers of iterations are comparable. With
-        a [`diffrax_conserve.learned.Pool`][] it is the loss on its states for the next epoch, the
-        same states for both models.
-    - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
-        those of the worst.
-    - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
-        best model so far, with a new state of the optimiser.
-    - `ended`: the reason why the training ended: `"epochs"`, `"target"`, `"seconds"` or
-        `"interrupt"`.
-    - `seconds`, `compile_seconds`: the wall times of the training and of the compilation.
-    - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
-    """
-
-    error: float
-    errors: np.ndarray
-    losses: np.ndarray
-    checked: np.ndarray
-    criteria: np.ndarray
-    best_epoch: int
-    best: float
-    skipped: int
-    ended: str
-    seconds: float
-    compile_seconds: float
-    state: Any

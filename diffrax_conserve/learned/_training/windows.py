@@ -1,4 +1,8 @@
-"""The windows of a PINN: each starts at the end of the previous one, and is judged by its error."""
+"""The windows of a PINN: each starts at the end of the previous one, and is judged by its error.
+
+A window whose error is too large is cut in halves, which are trained from new weights. So the
+windows become short where the solution changes fast, as the steps of an adaptive solver do.
+"""
 
 import dataclasses
 import warnings
@@ -18,12 +22,19 @@ from ..._projection.project import project
 from .._networks.flat import flatten
 from .._networks.mlp import MLP, fresh, initial_slope
 from .._networks.pinn import PINN, Window
-from .objective import Objective
-from .path_error import relative, window_errors
+from .errors import PathErrors, relative, window_errors
+from .loop import FitLog, Loop
 from .state import FitState, Windows
-from .trainer import Trainer
 
 _project = eqx.filter_jit(project)
+# A solution with a larger error than this, relative to its largest component, counts as wrong.
+_WRONG = 1e-4
+# The error that is aimed at without a `target`; in single precision `_WRONG`.
+_AIM = 1e-7
+# A safety factor: errors of windows add up, and later windows may amplify them.
+_GROWTH = 20
+# The number of times that all windows may be trained again, to smaller errors.
+_PASSES = 3
 
 
 class WindowEnds(NamedTuple):
@@ -47,141 +58,106 @@ class WindowEnds(NamedTuple):
         return found if bool(info.result == optx.RESULTS.successful) else y
 
 
-def windows_of(pinn: PINN) -> Windows:
-    """The windows of an untrained network."""
-    nets, y0s = jtu.tree_map(np.asarray, (pinn.nets, pinn.y0s))
-    count, slope = pinn.windows, initial_slope(pinn.window(0).net)
-    errors, halvings = np.full(count, np.inf), np.zeros(count, int)
-    return Windows(nets, y0s, np.array(pinn.edges), errors, halvings, slope or 0.0)
-
-
 def train_windows(
-    trainer: Trainer, state: FitState, ends: WindowEnds | None
-) -> tuple[FitState, Windows, str]:
-    """Trains the windows one after the other; windows that fail are trained again, then in
-    halves. If errors grow too much from window to window, they are all trained to a smaller one."""
-    objective, _ = trainer.start(_present(trainer, state), state)
+    loop: Loop, pinn: PINN, manifold: Manifold | None, given: FitState | None
+) -> tuple[Any, FitLog]:
+    """Trains the windows one after the other, and estimates the error of the whole solution."""
+    ends = WindowEnds.of(pinn, manifold, loop.problem.args)
+    count = pinn.windows
+    nets, y0s = jtu.tree_map(np.asarray, (pinn.nets, pinn.y0s))
+    windows = Windows(nets, y0s, np.array(pinn.edges), np.full(count, np.inf))
+    state = loop.begin(pinn, pinn.window(0), windows, given)
+    given_pinn, ended = state.model, "epochs"
 
-    def close(objective: Objective, state: FitState) -> bool:
-        window = eqx.combine(state.carry.best_weights, objective.static)
-        return trainer.target is not None and _own_error(trainer, state.model, window) <= _limit(
-            trainer, state.model, state.windows
+    def own(window: Window) -> float:
+        return _own_error(loop, given_pinn, window)
+
+    found, carry = state.windows, state.carry
+    while not state.finished:
+        assert found is not None
+        objective, first = loop.start(_window(given_pinn, found, found.present), state)
+        if state.done < 0:
+            state = dataclasses.replace(state, carry=first)
+        limit = float(_limits(loop, given_pinn, found)[found.present])
+        state, carry, ended = loop.train(
+            objective,
+            state,
+            lambda carry, of=objective, limit=limit: own(of.best(carry)) <= limit,
+            own,
         )
-
-    try:
-        while not state.finished:
-            state, ended = trainer.rounds(objective, state, close, _worst)
-            window = eqx.combine(state.carry.best_weights, objective.static)
-            judged = _judged(trainer, state, window, ends)
-            if ended in ("seconds", "interrupt"):
-                # `judged` is returned but not stored in `state`: a continued training judges the
-                # window at its end.
-                return state, judged, ended
-            following = _next(trainer, state, judged)
-            if not following.finished:
-                objective, carry = trainer.start(_present(trainer, following), following)
-                following = dataclasses.replace(following, carry=carry)
-            # A single assignment, so that an interrupt leaves a consistent state.
-            state = following
-            trainer.save(state)
-    except KeyboardInterrupt:
-        if not state.trained:
-            raise
-        ended = "interrupt"
-    else:
-        ended = "epochs"
-    assert state.windows is not None
-    return state, state.windows, ended
-
-
-def _present(trainer: Trainer, state: FitState) -> Window:
-    """The window that is trained next, with new weights at the second attempt."""
-    found = state.windows
+        found = _judged(loop, given_pinn, found, objective.best(carry), ends)
+        if ended in ("seconds", "interrupt"):
+            # `found` is returned but not stored in `state`: a continued training judges the
+            # window at its end.
+            break
+        state = _next(loop, state, found)
+        found, ended = state.windows, "epochs"
+        loop.save(state)
     assert found is not None
-    k = found.present
+    loop.save(state, always=True)
+    along = _errors_along(loop, given_pinn, found)
+    trained = given_pinn.cut(found.edges.tolist(), found.nets, found.y0s)
+    if not max(along) <= _wrong(loop):
+        _warn(loop, given_pinn, found, along)
+    if ended == "epochs" and loop.target is not None and max(along) <= loop.target:
+        ended = "target"
+    return trained, loop.log(state, carry, ended, max(along), found.errors)
+
+
+def _window(pinn: PINN, found: Windows, k: int) -> Window:
     net, y0 = jtu.tree_map(lambda x: jnp.asarray(x[k]), (found.nets, found.y0s))
-    if found.attempt:
-        key = jr.fold_in(trainer.network_key(state), 1)
-        net = _fresh(net, found, int(found.halvings[k]), key)
-    return state.model.window_of(net, y0, found.edges[k], found.edges[k + 1])
+    return pinn.window_of(net, y0, found.edges[k], found.edges[k + 1])
 
 
-def _judged(trainer: Trainer, state: FitState, window: Window, ends: WindowEnds | None) -> Windows:
+def _judged(
+    loop: Loop, pinn: PINN, found: Windows, window: Window, ends: WindowEnds | None
+) -> Windows:
     """All windows, with the present one replaced by `window` if that is better."""
-    found = state.windows
-    assert found is not None
-    k, error = found.present, _own_error(trainer, state.model, window)
+    k, error = found.present, _own_error(loop, pinn, window)
     if found.errors[k] <= error:
         return found
     nets, y0s = jtu.tree_map(lambda x, new: _put(x, k, new), found.nets, window.net), found.y0s
     if k + 1 < found.errors.size:
-        t = window.start + window.length
-        end = window(t)
+        t, end = _end(window)
         end = end if ends is None else ends(t, end)
         y0s = jtu.tree_map(lambda x, new: _put(x, k + 1, new), y0s, end)
     return dataclasses.replace(found, nets=nets, y0s=y0s, errors=_put(found.errors, k, error))
 
 
-def _next(trainer: Trainer, state: FitState, found: Windows) -> FitState:
-    """The state for the next training: the same window again, its first half, the next window, or
+def _next(loop: Loop, state: FitState, found: Windows) -> FitState:
+    """The state for the next training: of the first half of the window, of the next window, or of
     the first that is not accurate enough for the whole solution."""
-    k, retries = found.present, trainer.recipe.retries
-    limit = _limit(trainer, state.model, found)
-    failed = not found.errors[k] <= limit and not found.given_up and retries
-    if failed and found.attempt == 0:
-        found = dataclasses.replace(found, attempt=1)
-    elif failed and found.halvings[k] < retries:
-        found = _halved(found, trainer.network_key(state))
-    else:
-        # After a window that has finally failed, the others start at a wrong state and are not
-        # retried.
-        found = dataclasses.replace(found, given_up=int(bool(found.given_up or failed)))
-        again = None
-        if k + 1 < found.errors.size:
-            again = dataclasses.replace(found, present=k + 1, attempt=0)
-        elif not found.given_up and found.passes < retries:
-            again = _tightened(trainer, state.model, found)
-        if again is None:
-            return dataclasses.replace(state, windows=found, finished=1)
-        found = again
-    return dataclasses.replace(
-        state,
-        windows=found,
-        past=state.past.and_then(state.carry, state.checked, state.criteria),
-        trained=state.trained + 1,
-        checked=np.zeros(0, int),
-        criteria=np.zeros(0),
-    )
+    k, pinn = found.present, state.model
+    retries, length = loop.problem.recipe.retries, found.edges[k + 1] - found.edges[k]
+    failed = ~(found.errors <= _limits(loop, pinn, found))
+    # After a window that has finally failed the others start at a wrong state.
+    lost = bool(np.any(failed[:k]))
+    shortest = (pinn.t1 - pinn.t0) / pinn.windows / 2**retries
+    following: Windows | None = None
+    if failed[k] and not lost and retries and length > 1.5 * shortest:
+        following = _halved(loop, state, found)
+    elif k + 1 < failed.size:
+        following = dataclasses.replace(found, present=k + 1)
+    elif not lost and not failed[k] and retries and found.passes < _PASSES:
+        following = _tightened(loop, pinn, found)
+    if following is None:
+        return dataclasses.replace(state, windows=found, finished=1)
+    return dataclasses.replace(state.closed(), windows=following)
 
 
-def _tightened(trainer: Trainer, given: PINN, found: Windows) -> Windows | None:
-    """The windows with a smaller limit, if the solution is right but not within the target."""
-    along = _errors_along(trainer, given.cut(found.edges.tolist(), found.nets, found.y0s))
-    error, target = max(along), trainer.target
-    if target is None or not target < error < _WRONG:
-        return None
-    tightening = found.tightening * 2 * error / target
-    # At least one window is trained again.
-    tightening = max(tightening, 2 * _limit(trainer, given) / np.max(found.errors))
-    k = int(np.flatnonzero(found.errors > _limit(trainer, given) / tightening)[0])
-    errors = found.errors.copy()
-    errors[k + 1 :] = np.inf  # these will start elsewhere
-    return dataclasses.replace(
-        found,
-        errors=errors,
-        present=k,
-        attempt=0,
-        passes=found.passes + 1,
-        tightening=float(tightening),
-    )
-
-
-def _halved(found: Windows, key: PRNGKeyArray) -> Windows:
+def _halved(loop: Loop, state: FitState, found: Windows) -> Windows:
     """The windows with the present one cut in halves."""
-    k, edges = found.present, found.edges
+    k, edges, pinn = found.present, found.edges, state.model
+    middle = (edges[k] + edges[k + 1]) / 2
     net = jtu.tree_map(lambda x: jnp.asarray(x[k]), found.nets)
-    depth = int(found.halvings[k]) + 1
-    halves = [_fresh(net, found, depth, key) for key in jr.split(jr.fold_in(key, 2))]
+    # In a shorter window the state changes less, and so do the outputs.
+    size = (middle - edges[k]) * pinn.windows / (pinn.t1 - pinn.t0)
+
+    def half(key: PRNGKeyArray) -> MLP:
+        new = fresh(net, initial_slope(pinn.window(0).net), 1.0, key)
+        return eqx.tree_at(lambda net: net.weights[-1], new, size * new.weights[-1])
+
+    halves = [half(key) for key in jr.split(jr.fold_in(loop.network_key(state), 2))]
 
     def cut(x: np.ndarray, first: Any, second: Any) -> np.ndarray:
         return np.concatenate([x[:k], np.stack([first, second]), x[k + 1 :]])
@@ -190,16 +166,29 @@ def _halved(found: Windows, key: PRNGKeyArray) -> Windows:
         found,
         nets=jtu.tree_map(cut, found.nets, *halves),
         y0s=jtu.tree_map(lambda x: np.insert(x, k, x[k], axis=0), found.y0s),
-        edges=np.insert(edges, k + 1, (edges[k] + edges[k + 1]) / 2),
+        edges=np.insert(edges, k + 1, middle),
         errors=cut(found.errors, np.inf, np.inf),
-        halvings=cut(found.halvings, depth, depth),
-        attempt=0,
     )
 
 
-def _fresh(net: MLP, found: Windows, halvings: int, key: PRNGKeyArray) -> MLP:
-    """New weights. In a shorter window the state changes less, and so do the outputs."""
-    return fresh(net, found.slope or None, 0.5**halvings, key)
+def _tightened(loop: Loop, pinn: PINN, found: Windows) -> Windows | None:
+    """The windows with smaller limits, if the solution is about right but not accurate enough."""
+    error, aim = max(_errors_along(loop, pinn, found)), _aim(loop, pinn)
+    if not aim < error < 100 * _WRONG:
+        return None
+    limits = _limits(loop, pinn, found)
+    # At least one window is trained again.
+    factor = max(2 * error / aim, 2 * float(np.min(limits / found.errors)))
+    k = int(np.flatnonzero(found.errors > limits / factor)[0])
+    errors = found.errors.copy()
+    errors[k:] = np.inf  # these will start elsewhere
+    return dataclasses.replace(
+        found,
+        errors=errors,
+        present=k,
+        passes=found.passes + 1,
+        tightening=found.tightening * factor,
+    )
 
 
 def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
@@ -208,69 +197,67 @@ def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
     return values
 
 
-def _worst(objective: Objective, state: FitState) -> float:
-    """The largest error of the trained windows."""
-    del objective
-    assert state.windows is not None
-    errors = state.windows.errors
-    return float(np.max(errors, where=np.isfinite(errors), initial=0))
+def _wrong(loop: Loop) -> float:
+    """The error above which a solution is wrong."""
+    return _WRONG if loop.target is None else loop.target
 
 
-def _limit(trainer: Trainer, given: PINN, found: Windows | None = None) -> float:
-    """The error of a single window above which it has failed."""
-    if trainer.target is None:
-        return _WRONG
-    tightening = 1.0 if found is None else found.tightening
-    return trainer.target / (_GROWTH * given.windows * tightening)
+def _aim(loop: Loop, pinn: PINN) -> float:
+    if loop.target is not None:
+        return loop.target
+    return _AIM if pinn.scale.dtype == jnp.float64 else _WRONG
 
 
-# A solution with a larger error than this, relative to its largest component, counts as wrong.
-_WRONG = 1e-4
-# A safety factor: errors of windows add up, and later windows may amplify them.
-_GROWTH = 4
+def _limits(loop: Loop, pinn: PINN, found: Windows) -> np.ndarray:
+    """For each window the error above which it has failed, in proportion to its length."""
+    aim = _aim(loop, pinn) if loop.problem.recipe.retries else _wrong(loop)
+    share = np.diff(found.edges) / (pinn.t1 - pinn.t0)
+    return share * aim / (_GROWTH * found.tightening)
 
 
-def _own_error(trainer: Trainer, pinn: PINN, window: Window) -> float:
+def _own_error(loop: Loop, pinn: PINN, window: Window) -> float:
     """The largest error of a window alone, relative to the larger of the solution in it and the
     initial state."""
-    none = jnp.zeros_like(pinn.scale)
-    assert trainer.vector_field is not None
-    found = window_errors(window, trainer.vector_field, trainer.args, none, trainer.substeps)
+    found = _path_errors(loop, window, jnp.zeros_like(pinn.scale))
     size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(pinn.y0))))
     return relative(found.largest[0], size, pinn.y0)
 
 
-def _errors_along(trainer: Trainer, pinn: PINN) -> list[float]:
+def _errors_along(loop: Loop, pinn: PINN, found: Windows) -> list[float]:
     """The largest error of the solution in each window, with what earlier windows add to it."""
-    error, largest, sizes = jnp.zeros_like(pinn.scale), [], []
-    assert trainer.vector_field is not None
-    for k in range(pinn.windows):
-        window = pinn.window(k)
-        found = window_errors(window, trainer.vector_field, trainer.args, error, trainer.substeps)
-        largest.append(np.asarray(found.largest[0]))
-        sizes.append(np.asarray(found.size[0]))
-        if k + 1 < pinn.windows:
-            # The next window starts at another state, but the exact solution is continuous.
-            end = flatten(window(window.start + window.length))
-            error = found.end[0] + end - flatten(pinn.window(k + 1).y0)
+    error, largest, sizes, end = jnp.zeros_like(pinn.scale), [], [], None
+    for k in range(found.errors.size):
+        window = _window(pinn, found, k)
+        if end is not None:
+            # The window starts at another state, but the exact solution is continuous.
+            error = error + flatten(end) - flatten(window.y0)
+        path = _path_errors(loop, window, error)
+        largest.append(np.asarray(path.largest[0]))
+        sizes.append(np.asarray(path.size[0]))
+        error, (_, end) = path.end[0], _end(window)
     size = np.max(sizes, axis=0)
     return [relative(e, size, pinn.y0) for e in largest]
 
 
-def solution_error(trainer: Trainer, given: PINN, pinn: PINN, found: Windows) -> float:
-    """The largest error in the whole interval, with a warning if it is not small."""
-    along = _errors_along(trainer, pinn)
-    wrong = trainer.target if trainer.target is not None else _WRONG
-    if not max(along) <= wrong:
-        _warn(pinn, found.errors, along, _limit(trainer, given, found), wrong)
-    return max(along)
+def _path_errors(loop: Loop, window: Window, initial: Array) -> PathErrors:
+    problem = loop.problem
+    assert problem.vector_field is not None
+    substeps = 2 * problem.recipe.points
+    return window_errors(window, problem.vector_field, problem.args, initial, substeps)
 
 
-def _warn(pinn: PINN, errors: np.ndarray, along: list[float], limit: float, wrong: float) -> None:
+@eqx.filter_jit
+def _end(window: Window) -> tuple[Array, Any]:
+    t = window.start + window.length
+    return t, window(t)
+
+
+def _warn(loop: Loop, pinn: PINN, found: Windows, along: list[float]) -> None:
     """Warns, with the window that is wrong and its error."""
-    failed = np.flatnonzero(~(errors <= limit))
+    errors = found.errors
+    failed = np.flatnonzero(~(errors <= _limits(loop, pinn, found)))
     k = int(failed[0]) if failed.size else int(np.argmax(along))
-    first, last = pinn.edges[k], pinn.edges[k + 1]
+    first, last = found.edges[k], found.edges[k + 1]
     if np.isinf(errors[k]):
         fault = "was not trained, or its error cannot be estimated"
     elif failed.size:
@@ -279,8 +266,8 @@ def _warn(pinn: PINN, errors: np.ndarray, along: list[float], limit: float, wron
         fault = "is where errors of earlier windows have grown largest"
     warnings.warn(
         f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of the "
-        f"largest component, above {wrong:.2g}. Window {k} of {pinn.windows}, from {first:.6g} to "
-        f"{last:.6g}, {fault}. Use more windows, more `width` or more `epochs`, or a recipe with "
-        "`retries`.",
+        f"largest component, above {_wrong(loop):.2g}. Window {k} of {errors.size}, from "
+        f"{first:.6g} to {last:.6g}, {fault}. Use more windows, more `width` or more `epochs`, or "
+        "a recipe with `retries`.",
         stacklevel=4,
     )

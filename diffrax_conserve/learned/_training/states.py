@@ -13,6 +13,8 @@ from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_all_finite
+from .._networks.flat import as_states
+from .._networks.trainable import Sampler
 
 
 def reachable_states(
@@ -31,8 +33,7 @@ def reachable_states(
     In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
     such states. Solutions rarely stay in the region from which initial states are drawn: between 73
     % and 98 % of the trajectories leave the paper's boxes and annuli. Pass the result as `states`
-    to [`diffrax_conserve.DeepONet`][], and through [`diffrax_conserve.learned.FromStates`][] as
-    `sample` to [`diffrax_conserve.fit`][].
+    to [`diffrax_conserve.DeepONet`][], and as `sample` to [`diffrax_conserve.fit`][].
 
     **Arguments:**
 
@@ -180,7 +181,7 @@ _MAX_STEPS = 10_000
 
 @final
 class FromStates(eqx.Module):
-    """A sampler for [`diffrax_conserve.fit`][] that draws from given states, with replacement."""
+    """Draws from given states, with replacement."""
 
     states: Y
 
@@ -190,7 +191,6 @@ class FromStates(eqx.Module):
         return jtu.tree_map(lambda x: x[index], self.states)
 
 
-FromStates.__init__.__doc__ = """**Arguments:**
-
-- `states`: the states, stacked along a leading axis.
-"""
+def as_sampler(sample: Any) -> Sampler | None:
+    """A function as it is; for stacked states one that draws from them."""
+    return sample if sample is None or callable(sample) else FromStates(as_states(sample))

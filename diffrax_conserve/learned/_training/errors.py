@@ -28,7 +28,7 @@ from .._networks.pinn import Window
 from .._networks.trainable import AbstractTrainable, Points, Sampler
 from .._solvers.sweeps import rk4_errors
 from .data import Data
-from .defect import VectorField
+from .objective import VectorField
 
 
 class PathErrors(NamedTuple):
