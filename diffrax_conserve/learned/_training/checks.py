@@ -131,13 +131,11 @@ _SLOW = 3.0
 @eqx.filter_jit
 def _rate_of_change(problem: Problem) -> Array:
     """The median of `|f' f| / |f|`."""
-    field, sample = problem.vector_field, problem.sample
-    assert field is not None
+    sample = problem.sample
     assert sample is not None
 
     def at(key: PRNGKeyArray) -> Array:
-        rate = lambda y: field(0.0, y, problem.args)  # noqa: E731
-        y = sample(key)
+        y, rate = sample(key), lambda y: problem.field(0.0, y)
         first, second = jax.jvp(rate, (y,), (rate(y),))
         return tree_norm(second) / jnp.maximum(tree_norm(first), 1e-30)
 
@@ -214,12 +212,10 @@ def _check_field(given: Given, key: PRNGKeyArray) -> None:
     """Raises unless the vector field fits the states, is finite, and for a flow map is
     autonomous."""
     network, problem = given
-    field, args = problem.vector_field, problem.args
-    assert field is not None
     starts = network.starts(problem.draw(network, key))
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
-    check_output(lambda y: field(starts.ts[0], y, args), (y0,), y0, "vector_field")
-    now = _rates(field, starts.ts, starts.y0s, args)
+    check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
+    now = np.asarray(_rates(problem, starts.ts, starts.y0s))
     wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
     if wrong.size:
         y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
@@ -228,8 +224,8 @@ def _check_field(given: Given, key: PRNGKeyArray) -> None:
             f"example at {y0}. Draw states at which it is."
         )
     if isinstance(network, AbstractFlowMap):
-        later = _rates(field, starts.ts + 0.618 * network.max_step, starts.y0s, args)
-        change, size = np.max(np.abs(later - now)), np.max(np.abs(now))
+        later = _rates(problem, starts.ts + 0.618 * network.max_step, starts.y0s)
+        change, size = np.max(np.abs(np.asarray(later) - now)), np.max(np.abs(now))
         if not change <= 1e-3 * size:
             raise ValueError(
                 f"`vector_field` depends on time: from t = 0 to {0.618 * network.max_step:.3g} it "
@@ -238,13 +234,9 @@ def _check_field(given: Given, key: PRNGKeyArray) -> None:
             )
 
 
-def _rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> np.ndarray:
-    return np.asarray(_stacked_rates(vector_field, ts, y0s, args))
-
-
 @eqx.filter_jit
-def _stacked_rates(vector_field: VectorField, ts: Array, y0s: Y, args: Args) -> Array:
-    return stacked_vectors(jax.vmap(vector_field, in_axes=(0, 0, None))(ts, y0s, args))
+def _rates(problem: Problem, ts: Array, y0s: Y) -> Array:
+    return stacked_vectors(jax.vmap(problem.field)(ts, y0s))
 
 
 def _check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:

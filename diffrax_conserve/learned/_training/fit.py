@@ -14,7 +14,7 @@ from .._networks.flow_map import restored
 from .._networks.pinn import PINN
 from .._networks.with_args import OfPairs
 from .checks import check_limits, checked
-from .errors import data_error, step_error
+from .errors import flow_map_error
 from .loop import FitLog, Loop, Progress
 from .objective import Carry, VectorField
 from .recipe import Recipe
@@ -147,15 +147,11 @@ def fit(
 
 
 def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
-    problem, state = loop.problem, loop.begin(flow_map, flow_map, None, given)
-    objective, _ = loop.start(state.model, state)
+    problem, state = loop.problem, loop.begin((flow_map,), given)
+    objective, state = loop.start(state)
 
     def error(network: Any) -> float:
-        if problem.vector_field is None:
-            assert problem.data is not None
-            return data_error(network, problem.data, loop.key)
-        assert problem.sample is not None
-        return step_error(network, problem.vector_field, problem.args, problem.sample, loop.key)
+        return flow_map_error(network, problem, loop.key)
 
     def close(carry: Carry) -> bool:
         return loop.target is not None and float(carry.best) <= loop.target
@@ -167,4 +163,4 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
         state = dataclasses.replace(state, finished=finished)
     loop.save(state, always=True)
     trained = objective.best(carry)
-    return trained, loop.log(state, carry, ended, error(trained), ())
+    return trained, loop.log(state, carry, ended, error(trained))

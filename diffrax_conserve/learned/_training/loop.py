@@ -14,7 +14,6 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from .._networks.trainable import AbstractTrainable
 from .objective import Carry, Objective, Problem, advance, start
 from .state import FitState, read_checkpoint, write_checkpoint
 
@@ -85,21 +84,21 @@ class Loop:
     saved: float = -math.inf  # time of the last save; `saving` is its duration
     saving: float = 0.0
 
-    def begin(self, model: Any, network: AbstractTrainable, windows: Any, state: Any) -> FitState:
+    def begin(self, networks: tuple[Any, ...], given: FitState | None) -> FitState:
         """The first state of the training: the given one, that of a checkpoint, or a new one."""
-        recipe = self.problem.recipe
-        _, carry = start(self.problem, network, self.key)
-        first = FitState(model, carry, windows)
-        found = state
-        if found is None and self.checkpoint is not None and self.checkpoint.exists():
-            found = read_checkpoint(self.checkpoint, first, self.mark)
-            if found.finished:
-                return found
-        return first if found is None else found.continued(recipe.epochs, first)
+        _, carry = start(self.problem, networks[0], self.key)
+        first = FitState(networks, (math.inf,) * len(networks), carry)
+        if given is None and self.checkpoint is not None and self.checkpoint.exists():
+            given = read_checkpoint(self.checkpoint, first, self.mark)
+            if given.finished:
+                return given
+        return first if given is None else given.continued(self.problem.recipe.epochs, first)
 
-    def start(self, model: AbstractTrainable, state: FitState) -> tuple[Objective, Any]:
-        """The constants of the training of the present network, and its first carry."""
-        return start(self.problem, model, self.network_key(state))
+    def start(self, state: FitState) -> tuple[Objective, FitState]:
+        """The constants of the training of the present network, and its first state."""
+        model, key = state.networks[state.present], self.network_key(state)
+        objective, carry = start(self.problem, model, key)
+        return objective, dataclasses.replace(state, carry=carry) if state.done < 0 else state
 
     def network_key(self, state: FitState) -> PRNGKeyArray:
         return self.key if state.trained == 0 else jr.fold_in(self.key, state.trained)
@@ -186,7 +185,14 @@ class Loop:
         self.saved = time.perf_counter()
         self.saving = self.saved - begun
 
-    def log(self, state: FitState, carry: Carry, ended: str, error: float, errors: Any) -> FitLog:
+    def log(
+        self,
+        state: FitState,
+        carry: Carry,
+        ended: str,
+        error: float,
+        errors: tuple[float, ...] = (),
+    ) -> FitLog:
         """The log of a training that ends with `state` and `carry`."""
         found = dataclasses.replace(state, carry=carry).closed()
         return FitLog(
@@ -221,9 +227,8 @@ class Loop:
         """Calls the function `progress`, or prints a line."""
         if self.progress is False:
             return
-        epochs, windows = self.problem.recipe.epochs, state.windows
-        networks = 1 if windows is None else windows.errors.size - windows.present
-        done, total = state.losses.size + state.done, state.losses.size + networks * epochs
+        rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
+        done, total = state.losses.size + state.done, state.losses.size + rest
         # Before the first epoch there is no loss yet.
         loss = float(state.carry.losses[state.done - 1]) if state.done else state.criteria[-1]
         best = float(state.carry.best)

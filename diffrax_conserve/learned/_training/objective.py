@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from ..._custom_types import Args, RealScalarLike
 from ..._tree import tree_all_finite, tree_sub
 from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
-from .data import Data, draw_points, mismatch
+from .data import Data
 from .pool import Pool, domain_of, moved
 from .recipe import Recipe
 from .second_order import LeastSquares, SecondOrder, squared_norms
@@ -38,10 +38,36 @@ class Problem(eqx.Module):
     data: Data | None
     recipe: Recipe
 
+    def field(self, t: Any, y: Any) -> Any:
+        """The vector field with its `args`."""
+        assert self.vector_field is not None
+        return self.vector_field(t, y, self.args)
+
     def draw(self, model: AbstractTrainable, key: PRNGKeyArray) -> Points:
-        """New collocation points."""
-        recipe = self.recipe
-        return draw_points(model, recipe.times, self.sample, self.data, recipe.points, key)
+        """New collocation points, and as many pairs of the data."""
+        count, times = self.recipe.points, self.recipe.times
+        if self.data is None:
+            return model.draw(times, self.sample, count, key)
+        pairs = self.data.draw(count, jr.fold_in(key, 1))
+        if self.sample is None:
+            return Points(pairs.hs, pairs.y0s, pairs)
+        return model.draw(times, self.sample, count, key)._replace(pairs=pairs)
+
+    def defects(
+        self, model: AbstractTrainable, points: Points, schedule: LayerSchedule
+    ) -> Float[Array, "points n"]:
+        """`du/dt - f(t, u)` at every point, as vectors in the units of the model."""
+        ts, ones = points.ts, jnp.ones_like(points.ts)
+        y, rates = jax.jvp(lambda ts: model.states(points, ts, schedule), (ts,), (ones,))
+        return model.measured(points, tree_sub(rates, jax.vmap(self.field)(ts, y)))
+
+    def typical(self, model: AbstractTrainable, points: Points) -> Float[Array, ""]:
+        """The median of `|f|²` over the initial states."""
+        if self.vector_field is None:
+            return jnp.ones(())
+        starts = model.starts(points)
+        rates = jax.vmap(self.field)(starts.ts, starts.y0s)
+        return jnp.median(squared_norms(model.measured(starts, rates)))
 
 
 class Carry(NamedTuple):
@@ -76,11 +102,11 @@ class Objective(eqx.Module):
     ) -> Float[Array, "points n"]:
         model, problem, rows = eqx.combine(weights, self.static), self.problem, []
         if problem.vector_field is not None:
-            rows.append(defects(model, problem.vector_field, problem.args, points, schedule))
+            rows.append(problem.defects(model, points, schedule))
         if problem.data is not None:
             # Both are relative, so that neither dominates because of its units.
             rows = [row / jnp.sqrt(self.typical) for row in rows]
-            rows.append(mismatch(model, points.pairs, problem.data.deviation, schedule))
+            rows.append(problem.data.mismatch(model, points.pairs, schedule))
         return rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=1)
 
     def loss(self, weights: Any, points: Points, schedule: LayerSchedule) -> Float[Array, ""]:
@@ -94,17 +120,14 @@ class Objective(eqx.Module):
 
     def complete(self) -> LayerSchedule:
         """The schedule with all iterations of the conservative layer."""
-        return jnp.asarray(self.steps()), jnp.ones(())
-
-    def steps(self) -> int:
         layer = self.static.layer
-        return 0 if layer is None else layer.steps
+        return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
-        if self.steps() == 0:
+        layer, recipe = self.static.layer, self.problem.recipe
+        if layer is None or layer.steps == 0:
             return jnp.zeros_like(epoch), jnp.ones(())
-        recipe = self.problem.recipe
-        p, s = recipe.schedule(epoch, recipe.epochs, self.steps())
+        p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
     def best(self, carry: Carry) -> Any:
@@ -125,11 +148,6 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
         clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
         optimiser = optax.chain(clip, optimiser)
-    typical = jnp.ones(())
-    if problem.vector_field is not None:
-        starts = model.starts(points)
-        rates = _field(problem.vector_field, problem.args, starts.ts, starts.y0s)
-        typical = jnp.median(squared_norms(model.measured(starts, rates)))
     linear = model.linear_weights()
     last = _marked(model, model.linear_weights, jtu.tree_map(lambda _: True, linear))
     last = eqx.filter(last, trained)
@@ -150,25 +168,8 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     )
     # No array is weakly typed, because the compiled epochs return none that is.
     carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
+    typical = problem.typical(model, points)
     return Objective(problem, static, optimiser, points, typical, linear, key), carry
-
-
-def defects(
-    model: AbstractTrainable,
-    vector_field: VectorField,
-    args: Args,
-    points: Points,
-    schedule: LayerSchedule,
-) -> Float[Array, "points n"]:
-    """`du/dt - f(t, u)` at every point, as vectors in the units of the model."""
-    y, derivative = jax.jvp(
-        lambda ts: model.states(points, ts, schedule), (points.ts,), (jnp.ones_like(points.ts),)
-    )
-    return model.measured(points, tree_sub(derivative, _field(vector_field, args, points.ts, y)))
-
-
-def _field(vector_field: VectorField, args: Args, ts: Array, ys: Any) -> Any:
-    return jax.vmap(vector_field, in_axes=(0, 0, None))(ts, ys, args)
 
 
 def _marked(model: AbstractTrainable, where: Callable[[], Any], marks: Any) -> Any:

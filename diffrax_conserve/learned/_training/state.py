@@ -20,29 +20,21 @@ from .objective import Carry
 
 
 @final
-class Windows(eqx.Module):
-    """The windows of a PINN in training, stacked in numpy arrays, because their number may
-    change."""
-
-    nets: Any
-    y0s: Any
-    edges: np.ndarray
-    errors: np.ndarray  # of each window alone; infinity if it is not trained
-    present: int = 0  # index of the one in training
-    passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
-    tightening: float = 1.0  # by which the limit of a window's error is divided
-
-
-@final
 class FitState(eqx.Module):
     """The state of a training, `log.state` of [`diffrax_conserve.learned.FitLog`][].
 
     Pass it to [`diffrax_conserve.fit`][] as `state`. Its contents are not part of the interface.
     """
 
-    model: Any  # as it was given
+    networks: tuple[Any, ...]  # the flow map as it was given, or the windows of a PINN
+    errors: tuple[float, ...]  # of each window alone; infinity if it is not trained
     carry: Carry  # of the present network
-    windows: Windows | None  # of a PINN
+    present: int = 0  # its index
+    done: int = -1  # its epochs; -1 if it was not evaluated
+    trained: int = 0  # number of trainings that have ended
+    finished: int = 0
+    passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
+    tightening: float = 1.0  # by which the limit of a window's error is divided
     # The records of all networks, and of those before the present one the values of the worst.
     losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))  # without the present ones
     checked: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0, int))
@@ -50,9 +42,6 @@ class FitState(eqx.Module):
     worst: float = -1.0
     worst_epoch: int = 0
     skipped: int = 0
-    done: int = -1  # epochs of the present network; -1 if it was not evaluated
-    trained: int = 0  # number of trainings that have ended
-    finished: int = 0
 
     def compared(self, criterion: float) -> "FitState":
         """This state with one more comparison in its records."""
@@ -79,8 +68,7 @@ class FitState(eqx.Module):
         training."""
         if jtu.tree_structure(self.carry.weights) != jtu.tree_structure(first.carry.weights):
             raise ValueError("`state` is that of a training of another kind of network.")
-        several = self.windows is not None and self.windows.errors.size > 1
-        if self.done >= epochs or (self.finished and several):
+        if self.done >= epochs or (self.finished and len(self.networks) > 1):
             raise ValueError(
                 f"The training whose `state` was given has made all its {self.done} epochs, and "
                 f"the recipe has {epochs}. Give one with more, such as "
@@ -106,7 +94,8 @@ def fingerprint(given: Any, recipe: Any) -> str:
 def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
     """Writes `state` atomically."""
     leaves = jtu.tree_leaves(state)
-    header = json.dumps({"format": _FORMAT, "mark": mark, "leaves": len(leaves)})
+    count = len(state.networks)
+    header = json.dumps({"format": _FORMAT, "mark": mark, "leaves": len(leaves), "count": count})
     arrays: dict[str, Any] = {f"x{i}": _plain(leaf) for i, leaf in enumerate(leaves)}
 
     def write(path: Path) -> None:
@@ -117,10 +106,7 @@ def write_checkpoint(path: Path, state: FitState, mark: str) -> None:
 
 
 def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
-    """The state in a file; `like` is the first state of the same training.
-
-    `equinox.tree_deserialise_leaves` does not serve, because the number of windows may differ.
-    """
+    """The state in a file; `like` is the first state of the same training."""
     try:
         with np.load(path, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
@@ -132,6 +118,8 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
             f"The checkpoint {path} is of another training: its network, its key or its recipe "
             "differs. Give the same arguments, or another file."
         )
+    count = header["count"]
+    like = dataclasses.replace(like, networks=like.networks[:1] * count, errors=(0.0,) * count)
     leaves, treedef = jtu.tree_flatten(like)
     return treedef.unflatten([_as(x, y) for x, y in zip(found, leaves, strict=True)])
 

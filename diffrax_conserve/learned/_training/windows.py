@@ -6,7 +6,8 @@ windows become short where the solution changes fast, as the steps of an adaptiv
 
 import dataclasses
 import warnings
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,15 +17,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PRNGKeyArray
 
-from ..._custom_types import Args, Manifold
+from ..._custom_types import Manifold
 from ..._manifold import conserved_values
 from ..._projection.project import project
 from .._networks.flat import flatten
-from .._networks.mlp import MLP, fresh, initial_slope
+from .._networks.mlp import fresh, initial_slope
 from .._networks.pinn import PINN, Window
-from .errors import PathErrors, relative, window_errors
+from .errors import relative, window_errors
 from .loop import FitLog, Loop
-from .state import FitState, Windows
+from .state import FitState
 
 _project = eqx.filter_jit(project)
 # A solution with a larger error than this, relative to its largest component, counts as wrong.
@@ -37,164 +38,143 @@ _GROWTH = 20
 _PASSES = 3
 
 
-class WindowEnds(NamedTuple):
-    """The manifold to which the ends of the windows are projected."""
-
-    manifold: Manifold
-    values: Any
-    args: Args
-
-    @classmethod
-    def of(cls, pinn: PINN, manifold: Manifold | None, args: Args) -> "WindowEnds | None":
-        if manifold is None:
-            if pinn.layer is None:
-                return None
-            manifold, args = pinn.layer.manifold, pinn.layer.args
-        return cls(manifold, conserved_values(manifold, pinn.t0, pinn.y0, args), args)
-
-    def __call__(self, t: Array, y: Any) -> Any:
-        found, info = _project(self.manifold, y, t=t, args=self.args, value=self.values)
-        # The end of a window that has not learned the solution may be too far from the manifold.
-        return found if bool(info.result == optx.RESULTS.successful) else y
-
-
 def train_windows(
     loop: Loop, pinn: PINN, manifold: Manifold | None, given: FitState | None
 ) -> tuple[Any, FitLog]:
     """Trains the windows one after the other, and estimates the error of the whole solution."""
-    ends = WindowEnds.of(pinn, manifold, loop.problem.args)
-    count = pinn.windows
-    nets, y0s = jtu.tree_map(np.asarray, (pinn.nets, pinn.y0s))
-    windows = Windows(nets, y0s, np.array(pinn.edges), np.full(count, np.inf))
-    state = loop.begin(pinn, pinn.window(0), windows, given)
-    given_pinn, ended = state.model, "epochs"
+    place = _projection(loop, pinn, manifold)
+    state = loop.begin(tuple(map(pinn.window, range(pinn.windows))), given)
+    shown, carry, ended = state, state.carry, "epochs"
 
     def own(window: Window) -> float:
-        return _own_error(loop, given_pinn, window)
+        return _own_error(loop, pinn, window)
 
-    found, carry = state.windows, state.carry
     while not state.finished:
-        assert found is not None
-        objective, first = loop.start(_window(given_pinn, found, found.present), state)
-        if state.done < 0:
-            state = dataclasses.replace(state, carry=first)
-        limit = float(_limits(loop, given_pinn, found)[found.present])
+        objective, state = loop.start(state)
+        limit = _limits(loop, pinn, state)[state.present]
         state, carry, ended = loop.train(
             objective,
             state,
             lambda carry, of=objective, limit=limit: own(of.best(carry)) <= limit,
             own,
         )
-        found = _judged(loop, given_pinn, found, objective.best(carry), ends)
+        window = objective.best(carry)
+        shown = _judged(state, window, own(window), place)
         if ended in ("seconds", "interrupt"):
-            # `found` is returned but not stored in `state`: a continued training judges the
-            # window at its end.
+            # A continued training judges the window at its end.
             break
-        state = _next(loop, state, found)
-        found, ended = state.windows, "epochs"
+        state, ended = _next(loop, pinn, shown), "epochs"
+        shown = state
         loop.save(state)
-    assert found is not None
     loop.save(state, always=True)
-    along = _errors_along(loop, given_pinn, found)
-    trained = given_pinn.cut(found.edges.tolist(), found.nets, found.y0s)
+    along = _errors_along(loop, pinn, shown)
     if not max(along) <= _wrong(loop):
-        _warn(loop, given_pinn, found, along)
+        _warn(loop, pinn, shown, along)
     if ended == "epochs" and loop.target is not None and max(along) <= loop.target:
         ended = "target"
-    return trained, loop.log(state, carry, ended, max(along), found.errors)
+    nets, y0s = jtu.tree_map(
+        lambda *xs: jnp.stack(xs), *[(window.net, window.y0) for window in shown.networks]
+    )
+    trained = pinn.cut(_edges(pinn, shown).tolist(), nets, y0s)
+    return trained, loop.log(state, carry, ended, max(along), shown.errors)
 
 
-def _window(pinn: PINN, found: Windows, k: int) -> Window:
-    net, y0 = jtu.tree_map(lambda x: jnp.asarray(x[k]), (found.nets, found.y0s))
-    return pinn.window_of(net, y0, found.edges[k], found.edges[k + 1])
+def _edges(pinn: PINN, state: FitState) -> np.ndarray:
+    return np.array([*(float(window.start) for window in state.networks), pinn.t1])
+
+
+def _projection(loop: Loop, pinn: PINN, manifold: Manifold | None) -> Callable[[Array, Any], Any]:
+    """The projection of the ends of windows to the manifold through the initial state."""
+    args = loop.problem.args
+    if manifold is None:
+        if pinn.layer is None:
+            return lambda t, y: y
+        manifold, args = pinn.layer.manifold, pinn.layer.args
+    values = conserved_values(manifold, pinn.t0, pinn.y0, args)
+
+    def projected(t: Array, y: Any) -> Any:
+        found, info = _project(manifold, y, t=t, args=args, value=values)
+        # The end of a window that has not learned the solution may be too far from the manifold.
+        return found if bool(info.result == optx.RESULTS.successful) else y
+
+    return projected
+
+
+def _replaced(state: FitState, k: int, windows: list[Window], errors: list[float]) -> FitState:
+    """The state with these windows in the place of as many of its own, from the `k`th on."""
+    networks, old = list(state.networks), list(state.errors)
+    networks[k : k + 1], old[k : k + 1] = windows, errors
+    return dataclasses.replace(state, networks=tuple(networks), errors=tuple(old))
 
 
 def _judged(
-    loop: Loop, pinn: PINN, found: Windows, window: Window, ends: WindowEnds | None
-) -> Windows:
-    """All windows, with the present one replaced by `window` if that is better."""
-    k, error = found.present, _own_error(loop, pinn, window)
-    if found.errors[k] <= error:
-        return found
-    nets, y0s = jtu.tree_map(lambda x, new: _put(x, k, new), found.nets, window.net), found.y0s
-    if k + 1 < found.errors.size:
-        t, end = _end(window)
-        end = end if ends is None else ends(t, end)
-        y0s = jtu.tree_map(lambda x, new: _put(x, k + 1, new), y0s, end)
-    return dataclasses.replace(found, nets=nets, y0s=y0s, errors=_put(found.errors, k, error))
+    state: FitState, window: Window, error: float, place: Callable[[Array, Any], Any]
+) -> FitState:
+    """The state with `window` in the place of the present one, if that is better."""
+    k = state.present
+    if state.errors[k] <= error:
+        return state
+    state = _replaced(state, k, [window], [error])
+    if k + 1 < len(state.networks):
+        y0 = place(*_end(window))
+        following = eqx.tree_at(lambda w: w.y0, state.networks[k + 1], y0)
+        state = _replaced(state, k + 1, [following], [state.errors[k + 1]])
+    return state
 
 
-def _next(loop: Loop, state: FitState, found: Windows) -> FitState:
+def _next(loop: Loop, pinn: PINN, state: FitState) -> FitState:
     """The state for the next training: of the first half of the window, of the next window, or of
     the first that is not accurate enough for the whole solution."""
-    k, pinn = found.present, state.model
-    retries, length = loop.problem.recipe.retries, found.edges[k + 1] - found.edges[k]
-    failed = ~(found.errors <= _limits(loop, pinn, found))
+    k, retries = state.present, loop.problem.recipe.retries
+    failed = ~(np.array(state.errors) <= _limits(loop, pinn, state))
     # After a window that has finally failed the others start at a wrong state.
     lost = bool(np.any(failed[:k]))
     shortest = (pinn.t1 - pinn.t0) / pinn.windows / 2**retries
-    following: Windows | None = None
-    if failed[k] and not lost and retries and length > 1.5 * shortest:
-        following = _halved(loop, state, found)
+    following: FitState | None = None
+    if failed[k] and not lost and retries and state.networks[k].length > 1.5 * shortest:
+        following = _halved(loop, pinn, state)
     elif k + 1 < failed.size:
-        following = dataclasses.replace(found, present=k + 1)
-    elif not lost and not failed[k] and retries and found.passes < _PASSES:
-        following = _tightened(loop, pinn, found)
-    if following is None:
-        return dataclasses.replace(state, windows=found, finished=1)
-    return dataclasses.replace(state.closed(), windows=following)
+        following = dataclasses.replace(state, present=k + 1)
+    elif not lost and not failed[k] and retries and state.passes < _PASSES:
+        following = _tightened(loop, pinn, state)
+    return dataclasses.replace(state, finished=1) if following is None else following.closed()
 
 
-def _halved(loop: Loop, state: FitState, found: Windows) -> Windows:
-    """The windows with the present one cut in halves."""
-    k, edges, pinn = found.present, found.edges, state.model
-    middle = (edges[k] + edges[k + 1]) / 2
-    net = jtu.tree_map(lambda x: jnp.asarray(x[k]), found.nets)
+def _halved(loop: Loop, pinn: PINN, state: FitState) -> FitState:
+    """The state with the present window cut in halves, of new weights."""
+    k = state.present
+    window, edges = state.networks[k], _edges(pinn, state)[k : k + 2]
+    middle = edges.mean()
     # In a shorter window the state changes less, and so do the outputs.
-    size = (middle - edges[k]) * pinn.windows / (pinn.t1 - pinn.t0)
+    size = float(middle - edges[0]) * pinn.windows / (pinn.t1 - pinn.t0)
 
-    def half(key: PRNGKeyArray) -> MLP:
-        new = fresh(net, initial_slope(pinn.window(0).net), 1.0, key)
-        return eqx.tree_at(lambda net: net.weights[-1], new, size * new.weights[-1])
+    def half(key: PRNGKeyArray, first: float, last: float) -> Window:
+        net = fresh(window.net, initial_slope(pinn.window(0).net), 1.0, key)
+        net = eqx.tree_at(lambda net: net.weights[-1], net, size * net.weights[-1])
+        return pinn.window_of(net, window.y0, first, last)
 
-    halves = [half(key) for key in jr.split(jr.fold_in(loop.network_key(state), 2))]
-
-    def cut(x: np.ndarray, first: Any, second: Any) -> np.ndarray:
-        return np.concatenate([x[:k], np.stack([first, second]), x[k + 1 :]])
-
-    return dataclasses.replace(
-        found,
-        nets=jtu.tree_map(cut, found.nets, *halves),
-        y0s=jtu.tree_map(lambda x: np.insert(x, k, x[k], axis=0), found.y0s),
-        edges=np.insert(edges, k + 1, middle),
-        errors=cut(found.errors, np.inf, np.inf),
-    )
+    first_key, second_key = jr.split(jr.fold_in(loop.network_key(state), 2))
+    halves = [half(first_key, edges[0], middle), half(second_key, middle, edges[1])]
+    return _replaced(state, k, halves, [np.inf, np.inf])
 
 
-def _tightened(loop: Loop, pinn: PINN, found: Windows) -> Windows | None:
-    """The windows with smaller limits, if the solution is about right but not accurate enough."""
-    error, aim = max(_errors_along(loop, pinn, found)), _aim(loop, pinn)
+def _tightened(loop: Loop, pinn: PINN, state: FitState) -> FitState | None:
+    """The state with smaller limits, if the solution is about right but not accurate enough."""
+    error, aim = max(_errors_along(loop, pinn, state)), _aim(loop, pinn)
     if not aim < error < 100 * _WRONG:
         return None
-    limits = _limits(loop, pinn, found)
-    # At least one window is trained again.
-    factor = max(2 * error / aim, 2 * float(np.min(limits / found.errors)))
-    k = int(np.flatnonzero(found.errors > limits / factor)[0])
-    errors = found.errors.copy()
-    errors[k:] = np.inf  # these will start elsewhere
+    limits, errors = _limits(loop, pinn, state), np.array(state.errors)
+    # At least one window is trained again, and those after it, which start elsewhere.
+    factor = max(2 * error / aim, 2 * float(np.min(limits / errors)))
+    k = int(np.flatnonzero(errors > limits / factor)[0])
+    errors[k:] = np.inf
     return dataclasses.replace(
-        found,
-        errors=errors,
+        state,
+        errors=tuple(errors.tolist()),
         present=k,
-        passes=found.passes + 1,
-        tightening=found.tightening * factor,
+        passes=state.passes + 1,
+        tightening=state.tightening * factor,
     )
-
-
-def _put(values: np.ndarray, index: int, value: Any) -> np.ndarray:
-    values = values.copy()
-    values[index] = value
-    return values
 
 
 def _wrong(loop: Loop) -> float:
@@ -208,42 +188,33 @@ def _aim(loop: Loop, pinn: PINN) -> float:
     return _AIM if pinn.scale.dtype == jnp.float64 else _WRONG
 
 
-def _limits(loop: Loop, pinn: PINN, found: Windows) -> np.ndarray:
+def _limits(loop: Loop, pinn: PINN, state: FitState) -> np.ndarray:
     """For each window the error above which it has failed, in proportion to its length."""
     aim = _aim(loop, pinn) if loop.problem.recipe.retries else _wrong(loop)
-    share = np.diff(found.edges) / (pinn.t1 - pinn.t0)
-    return share * aim / (_GROWTH * found.tightening)
+    share = np.diff(_edges(pinn, state)) / (pinn.t1 - pinn.t0)
+    return share * aim / (_GROWTH * state.tightening)
 
 
 def _own_error(loop: Loop, pinn: PINN, window: Window) -> float:
     """The largest error of a window alone, relative to the larger of the solution in it and the
     initial state."""
-    found = _path_errors(loop, window, jnp.zeros_like(pinn.scale))
+    found = window_errors(window, loop.problem, jnp.zeros_like(pinn.scale))
     size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(pinn.y0))))
     return relative(found.largest[0], size, pinn.y0)
 
 
-def _errors_along(loop: Loop, pinn: PINN, found: Windows) -> list[float]:
+def _errors_along(loop: Loop, pinn: PINN, state: FitState) -> list[float]:
     """The largest error of the solution in each window, with what earlier windows add to it."""
-    error, largest, sizes, end = jnp.zeros_like(pinn.scale), [], [], None
-    for k in range(found.errors.size):
-        window = _window(pinn, found, k)
-        if end is not None:
-            # The window starts at another state, but the exact solution is continuous.
-            error = error + flatten(end) - flatten(window.y0)
-        path = _path_errors(loop, window, error)
+    error, largest, sizes, end = jnp.zeros_like(pinn.scale), [], [], pinn.y0
+    for window in state.networks:
+        # The window may start at another state, but the exact solution is continuous.
+        error = error + flatten(end) - flatten(window.y0)
+        path = window_errors(window, loop.problem, error)
         largest.append(np.asarray(path.largest[0]))
         sizes.append(np.asarray(path.size[0]))
         error, (_, end) = path.end[0], _end(window)
     size = np.max(sizes, axis=0)
     return [relative(e, size, pinn.y0) for e in largest]
-
-
-def _path_errors(loop: Loop, window: Window, initial: Array) -> PathErrors:
-    problem = loop.problem
-    assert problem.vector_field is not None
-    substeps = 2 * problem.recipe.points
-    return window_errors(window, problem.vector_field, problem.args, initial, substeps)
 
 
 @eqx.filter_jit
@@ -252,12 +223,11 @@ def _end(window: Window) -> tuple[Array, Any]:
     return t, window(t)
 
 
-def _warn(loop: Loop, pinn: PINN, found: Windows, along: list[float]) -> None:
+def _warn(loop: Loop, pinn: PINN, state: FitState, along: list[float]) -> None:
     """Warns, with the window that is wrong and its error."""
-    errors = found.errors
-    failed = np.flatnonzero(~(errors <= _limits(loop, pinn, found)))
+    errors, edges = np.array(state.errors), _edges(pinn, state)
+    failed = np.flatnonzero(~(errors <= _limits(loop, pinn, state)))
     k = int(failed[0]) if failed.size else int(np.argmax(along))
-    first, last = found.edges[k], found.edges[k + 1]
     if np.isinf(errors[k]):
         fault = "was not trained, or its error cannot be estimated"
     elif failed.size:
@@ -267,7 +237,7 @@ def _warn(loop: Loop, pinn: PINN, found: Windows, along: list[float]) -> None:
     warnings.warn(
         f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of the "
         f"largest component, above {_wrong(loop):.2g}. Window {k} of {errors.size}, from "
-        f"{first:.6g} to {last:.6g}, {fault}. Use more windows, more `width` or more `epochs`, or "
-        "a recipe with `retries`.",
+        f"{edges[k]:.6g} to {edges[k + 1]:.6g}, {fault}. Use more windows, more `width` or more "
+        "`epochs`, or a recipe with `retries`.",
         stacklevel=4,
     )
