@@ -78,7 +78,7 @@ class DeepONet(AbstractFlowMap):
         max_step: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        width: int = 24,
+        width: int = 32,
         depth: int = 2,
         latent: int = 20,
         core: type[AbstractCore] = Concatenated,

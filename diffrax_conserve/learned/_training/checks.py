@@ -1,6 +1,6 @@
 """The checks of the arguments of `fit`, made before compilation."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,13 +32,6 @@ from .state import FitState
 from .states import as_sampler
 
 
-class Given(NamedTuple):
-    """The arguments of `fit` in the form in which the training uses them."""
-
-    network: Any  # a flow map, or the first window of a PINN
-    problem: Problem
-
-
 def checked(
     model: Any,
     vector_field: VectorField | None,
@@ -48,8 +41,9 @@ def checked(
     args: Args,
     recipe: Recipe | None,
     manifold: Manifold | None,
-) -> Given:
-    """The network and the problem; raises unless the arguments fit."""
+) -> tuple[Any, Problem]:
+    """The flow map, or the first window of a PINN, and the problem; raises unless the arguments
+    fit."""
     _check_types(vector_field, key, data, recipe)
     _check_manifold(model, manifold)
     recipe = second_order(model) if recipe is None else recipe
@@ -59,18 +53,18 @@ def checked(
                 "A `PINN` has one initial state, its own: leave `sample` out, and `data`, from "
                 "which only a flow map is trained."
             )
-        given = Given(model.window(0), Problem(vector_field, args, None, None, recipe))
+        network, problem = model.window(0), Problem(vector_field, args, None, None, recipe)
     else:
-        given = _of_flow_map(model, vector_field, sample, data, args, recipe)
+        network, problem = _of_flow_map(model, vector_field, sample, data, args, recipe)
     if vector_field is None:
-        return given
-    _check_field(given, jr.split(key)[0])
-    return given._replace(network=_with_taylor(given))
+        return network, problem
+    _check_field(network, problem, jr.split(key)[0])
+    return _with_taylor(network, problem), problem
 
 
 def _of_flow_map(
     model: Any, field: Any, sample: Any, data: Any, args: Args, recipe: Recipe
-) -> Given:
+) -> tuple[AbstractFlowMap, Problem]:
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
             f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
@@ -104,12 +98,11 @@ def _of_flow_map(
         sample = found.sample
     if isinstance(sample, Pool):
         _check_pool(sample, flow_map, args, recipe)
-    return Given(flow_map, Problem(field, args, sample, found, recipe))
+    return flow_map, Problem(field, args, sample, found, recipe)
 
 
-def _with_taylor(given: Given) -> Any:
+def _with_taylor(network: Any, problem: Problem) -> Any:
     """The network, if it is a DeepONet with the Taylor polynomial of the recipe."""
-    network, problem = given
     family = isinstance(network, OfPairs)
     inner, field = network.flow_map if family else network, problem.vector_field
     order = problem.recipe.taylor
@@ -208,10 +201,9 @@ def _check_family(sample: Any, args: Args) -> None:
         )
 
 
-def _check_field(given: Given, key: PRNGKeyArray) -> None:
+def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
     """Raises unless the vector field fits the states, is finite, and for a flow map is
     autonomous."""
-    network, problem = given
     starts = network.starts(problem.draw(network, key))
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
     check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")

@@ -47,10 +47,10 @@ def fit(
     For a network with a conservative layer, the recipe's schedule determines the number of
     iterations of the layer in $u$.
 
-    From `data` a flow map learns from pairs of states, one step of any length apart, which are
-    drawn along the trajectories. The loss is that of the differences, each component relative to
-    the root mean square change by a step. With a vector field the squared defect is added, relative
-    to the median of $|f|^2$.
+    From `data` a flow map learns pairs of states along the trajectories, one step of any length
+    apart. The loss is that of the differences, each component relative to the root mean square
+    change by a step. With a vector field the squared defect is added, relative to the median of
+    $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
     estimates the error of its solution.

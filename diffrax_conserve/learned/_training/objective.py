@@ -141,16 +141,13 @@ class Objective(eqx.Module):
 @eqx.filter_jit
 def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tuple[Objective, Carry]:
     recipe, (points_key, key) = problem.recipe, jr.split(key)
-    trained = _marked(model, model.weights, jtu.tree_map(eqx.is_inexact_array, model.weights()))
+    trained = _marked(model, "weights", eqx.is_inexact_array)
     weights, static = eqx.partition(model, trained)
     points = problem.draw(model, points_key)
     optimiser = recipe.optimiser
     if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
-        clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
-        optimiser = optax.chain(clip, optimiser)
-    linear = model.linear_weights()
-    last = _marked(model, model.linear_weights, jtu.tree_map(lambda _: True, linear))
-    last = eqx.filter(last, trained)
+        optimiser = optax.chain(optax.clip_by_global_norm(recipe.max_gradient_norm), optimiser)
+    last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     domain = domain_of(model) if isinstance(problem.sample, Pool) else None
@@ -172,12 +169,13 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     return Objective(problem, static, optimiser, points, typical, linear, key), carry
 
 
-def _marked(model: AbstractTrainable, where: Callable[[], Any], marks: Any) -> Any:
-    """`model` with `marks` at the place that the method `where` returns, and `False` elsewhere."""
+def _marked(model: AbstractTrainable, method: str, mark: Callable[[Any], bool]) -> Any:
+    """`model` with marks at the place that the method returns, and `False` elsewhere."""
     nothing = jtu.tree_map(lambda _: False, model)
+    marks = jtu.tree_map(mark, getattr(model, method)())
     if not jtu.tree_leaves(marks):
         return nothing
-    return eqx.tree_at(lambda m: getattr(m, where.__name__)(), nothing, marks)
+    return eqx.tree_at(lambda m: getattr(m, method)(), nothing, marks)
 
 
 def advance(
@@ -216,8 +214,7 @@ def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Flo
 
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     """One update, and the points for the next one."""
-    update = _by_least_squares if isinstance(objective.optimiser, SecondOrder) else _by_gradient
-    weights, optimiser_state, loss = update(objective, carry, epoch)
+    weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If the update is not finite, continue from the best model: skipping the update is not enough,
     # because the same points would give the same result in the next epoch.
@@ -240,24 +237,16 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     return carry._replace(points=points)
 
 
-def _by_gradient(
-    objective: Objective, carry: Carry, epoch: Array
-) -> tuple[Any, Any, Float[Array, ""]]:
-    loss, gradient = eqx.filter_value_and_grad(objective.loss)(
-        carry.weights, carry.points, objective.schedule(epoch)
-    )
-    assert not isinstance(objective.optimiser, SecondOrder)
-    updates, state = objective.optimiser.update(gradient, carry.optimiser_state, carry.weights)
-    return eqx.apply_updates(carry.weights, updates), state, loss
-
-
-def _by_least_squares(
-    objective: Objective, carry: Carry, epoch: Array
-) -> tuple[Any, Any, Float[Array, ""]]:
-    """The update by a second-order method, for which the weights are one vector."""
-    assert isinstance(objective.optimiser, SecondOrder)
-    vector, restore = ravel_pytree(carry.weights)
-    points, schedule = carry.points, objective.schedule(epoch)
+def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
+    """The next weights and state of the optimiser, and the loss."""
+    optimiser, schedule = objective.optimiser, objective.schedule(epoch)
+    weights, points, state = carry.weights, carry.points, carry.optimiser_state
+    if not isinstance(optimiser, SecondOrder):
+        loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
+        updates, state = optimiser.update(gradient, state, weights)
+        return eqx.apply_updates(weights, updates), state, loss
+    # For a second-order method the weights are one vector.
+    vector, restore = ravel_pytree(weights)
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
@@ -270,9 +259,7 @@ def _by_least_squares(
         typical=objective.typical,
     )
     fraction = epoch / objective.problem.recipe.epochs
-    vector, state, loss = objective.optimiser.update(
-        least_squares, vector, carry.optimiser_state, fraction, objective.linear
-    )
+    vector, state, loss = optimiser.update(least_squares, vector, state, fraction, objective.linear)
     return restore(vector), state, loss
 
 

@@ -1,5 +1,6 @@
 """Recipes: the options of a training, and the default one."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, final
 
@@ -131,7 +132,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     A `PINN` with up to 2,000 weights in each window is trained by
     [`diffrax_conserve.learned.LevenbergMarquardt`][] on a grid of 120 times, in 40 epochs for each
     window. A larger one, and every flow map, is trained by [`diffrax_conserve.learned.SPRING`][] on
-    250 fresh points in each of 2,000 epochs.
+    250 fresh points in each of 1,000 epochs.
 
     **Arguments:**
 
@@ -140,28 +141,13 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
         of the network.
     """
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
-        return Recipe(
-            epochs=40 if epochs is None else epochs,
-            points=120,
-            optimiser=LevenbergMarquardt(),
-            schedule=complete,
-            times=grid,
-            check_every=5,
-            retries=_HALVINGS,
-        )
-    return Recipe(
-        epochs=2000 if epochs is None else epochs,
-        points=250,
-        optimiser=SPRING(),
-        schedule=complete,
-        taylor=1,
-        refresh=1,
-        check_every=20,
-    )
+        found = Recipe(epochs or 40, 120, LevenbergMarquardt(), complete, times=grid)
+        # Up to 1,024 windows in the place of one.
+        return dataclasses.replace(found, check_every=5, retries=10)
+    found = Recipe(epochs or 1000, 250, SPRING(), complete, taylor=1)
+    return dataclasses.replace(found, check_every=20, refresh=1)
 
 
 # With this many columns its QR factorisation takes about as long as SPRING's Cholesky
 # factorisation.
 _LEVENBERG_MARQUARDT_MAX = 2000
-# Up to 1,024 windows in the place of one.
-_HALVINGS = 10

@@ -31,9 +31,9 @@ def reachable_states(
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
     In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
-    such states. Solutions rarely stay in the region from which initial states are drawn: between 73
-    % and 98 % of the trajectories leave the paper's boxes and annuli. Pass the result as `states`
-    to [`diffrax_conserve.DeepONet`][], and as `sample` to [`diffrax_conserve.fit`][].
+    such states. Between 73 % and 98 % of the trajectories leave the paper's boxes and annuli, from
+    which initial states are drawn. Pass the result as `states` to [`diffrax_conserve.DeepONet`][],
+    and as `sample` to [`diffrax_conserve.fit`][].
 
     **Arguments:**
 
@@ -67,12 +67,11 @@ def reachable_states(
         y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 200))
         key = jax.random.key(1)
         states = dfc.learned.reachable_states(system.vector_field, y0s, 5.0, key=key)
-        deeponet = dfc.DeepONet(states, 0.25, width=8, depth=1, key=jax.random.key(2))
         ```
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0)
+    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
     if keep is not None:
         good = good & eqx.filter_jit(jax.vmap(keep))(ys)
@@ -139,8 +138,8 @@ def _solutions(
     args: Args,
     solver: dfx.AbstractSolver | None,
     dt0: RealScalarLike | None,
-    rtol: float = 1e-6,
-    atol: float = 1e-6,
+    rtol: float,
+    atol: float,
 ) -> tuple[Any, Array]:
     """The states at `ts`, and which solves succeeded."""
     method = dfx.Dopri8() if solver is None else solver
