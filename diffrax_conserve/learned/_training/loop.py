@@ -79,7 +79,7 @@ class Loop:
     created: float = dataclasses.field(default_factory=time.perf_counter)
     begun: float | None = None  # the end of the compilation
     compiled: Any = None
-    pace: float = math.inf  # seconds for an epoch
+    pace: float = 0.0  # seconds for an epoch; 0 if that is not known
     first: int = 0  # the number of epochs before this call of `fit`
     saved: float = -math.inf  # time of the last save; `saving` is its duration
     saving: float = 0.0
@@ -149,10 +149,10 @@ class Loop:
         if math.isinf(self.seconds) or goal == 0:
             return goal
         left = self.seconds - self.elapsed
-        if left < self.pace / 2 or left <= 0:
+        if left <= self.pace / 2:
             return done
         # Half of the time, because the pace may change.
-        return min(goal, done + max(1, int(left / (2 * self.pace))))
+        return min(goal, done + max(1, int(left / (2 * self.pace)) if self.pace else 1))
 
     def _advanced(
         self, objective: Objective, state: FitState, stop: int, compare: bool
