@@ -277,9 +277,9 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
     [
         (dict(manifold=lambda t, y, args: y), TypeError, "FirstIntegral"),
         (dict(manifold=()), ValueError, "nothing to conserve"),
-        (dict(mean_steps=0.5), ValueError, "`mean_steps` must be at least 1, but is 0.5"),
+        (dict(mean_steps=0.5), ValueError, "`mean_steps` is 0.5, but it must be at least 1"),
         (dict(mean_steps=float("nan")), ValueError, "`mean_steps`"),
-        (dict(max_defect=0), ValueError, "`max_defect` must be positive, but is 0"),
+        (dict(max_defect=0), ValueError, "`max_defect` is 0, but it must be positive"),
     ],
 )
 def test_a_pool_that_cannot_be(options, error, match):

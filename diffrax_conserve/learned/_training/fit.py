@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import time
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -128,6 +129,7 @@ def fit(
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
+    created = time.perf_counter()
     check_limits(state, target, seconds, progress)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     loop = Loop(
@@ -138,6 +140,7 @@ def fit(
         progress,
         None if checkpoint is None else Path(checkpoint),
         fingerprint((model, key, args, vector_field), problem.recipe),
+        created,
     )
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)

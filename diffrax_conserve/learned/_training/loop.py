@@ -76,7 +76,7 @@ class Loop:
     progress: bool | Progress
     checkpoint: Path | None
     mark: str
-    created: float = dataclasses.field(default_factory=time.perf_counter)
+    created: float  # the beginning of `fit`
     begun: float | None = None  # the end of the compilation
     compiled: Any = None
     pace: float = 0.0  # seconds for an epoch; 0 if that is not known

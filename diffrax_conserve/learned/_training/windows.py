@@ -44,28 +44,35 @@ def train_windows(
     """Trains the windows one after the other, and estimates the error of the whole solution."""
     place = _projection(loop, pinn, manifold)
     state = loop.begin(tuple(map(pinn.window, range(pinn.windows))), given)
+    # Compiled here, so that it takes no time of the training.
+    _errors_along(loop, pinn, _halved(loop, pinn, state))
     shown, carry, ended = state, state.carry, "epochs"
 
     def own(window: Window) -> float:
         return _own_error(loop, pinn, window)
 
-    while not state.finished:
-        objective, state = loop.start(state)
-        limit = _limits(loop, pinn, state)[state.present]
-        state, carry, ended = loop.train(
-            objective,
-            state,
-            lambda carry, of=objective, limit=limit: own(of.best(carry)) <= limit,
-            own,
-        )
-        window = objective.best(carry)
-        shown = _judged(state, window, own(window), place)
-        if ended in ("seconds", "interrupt"):
-            # A continued training judges the window at its end.
-            break
-        state, ended = _next(loop, pinn, shown), "epochs"
-        shown = state
-        loop.save(state)
+    try:
+        while not state.finished:
+            objective, state = loop.start(state)
+            limit = _limits(loop, pinn, state)[state.present]
+            state, carry, ended = loop.train(
+                objective,
+                state,
+                lambda carry, of=objective, limit=limit: own(of.best(carry)) <= limit,
+                own,
+            )
+            window = objective.best(carry)
+            shown = _judged(state, window, own(window), place)
+            if ended in ("seconds", "interrupt"):
+                # A continued training judges the window at its end.
+                break
+            state, ended = _next(loop, pinn, shown), "epochs"
+            shown = state
+            loop.save(state)
+    except KeyboardInterrupt:
+        if not state.trained:
+            raise
+        ended = "interrupt"
     loop.save(state, always=True)
     along = _errors_along(loop, pinn, shown)
     if not max(along) <= _wrong(loop):
