@@ -180,7 +180,7 @@ def main(argv=None):
             if options.system and name not in options.system:
                 continue
             for before in (True, False):
-                if before and (options.after or options.smoke) or options.before and not before:
+                if (before and (options.after or options.smoke)) or (options.before and not before):
                     continue
                 for seed in range(options.seeds):
                     case = {"kind": kind, "system": name, "before": before, "seed": seed}
