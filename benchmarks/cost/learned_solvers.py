@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import jax.random as jr
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._training.defect import defects, squared_norms, trainable
+from diffrax_conserve.learned._training.objective import Problem, start
 from diffrax_conserve.reproduce._trained import KINDS, build, is_flow_map, is_learned
 
 OUT = Path(__file__).parent.parent / "results" / "learned_solvers.json"
@@ -50,20 +50,14 @@ def epoch(system, kind, points):
     if isinstance(network, dfc.PINN):
         network = network.window(0)
     sample = system.sample if is_flow_map(system) else None
-    batch = network.draw(dfc.learned.uniform_times, sample, points, jr.key(2))
-    steps = 0 if network.layer is None else network.layer.steps
+    recipe = dfc.learned.Recipe(epochs=1, points=points)
+    problem = Problem(system.vector_field, None, sample, None, recipe)
+    objective, carry = start(problem, network, jr.key(2))
 
-    def gradient(network, batch, p, s):
-        weights, static = eqx.partition(network, trainable(network))
+    def gradient(objective, carry, schedule):
+        return jax.value_and_grad(objective.loss)(carry.weights, carry.points, schedule)
 
-        def loss(weights):
-            model = eqx.combine(weights, static)
-            vectors = defects(model, system.vector_field, None, batch, (p, s))
-            return jnp.mean(squared_norms(vectors))
-
-        return jax.value_and_grad(loss)(weights)
-
-    arguments = (network, batch, jnp.asarray(steps), jnp.ones(()))
+    arguments = (objective, carry, objective.complete())
     call, seconds = compiled(gradient, *arguments)
     return lambda: call(*arguments), seconds
 

@@ -37,7 +37,7 @@ def train(system, spec, where, seed):
     states, sample = starts, system.sample
     if where == "reachable":
         states = zoo.reachable(system, spec, spec.pool, seed)
-        sample = dfc.learned.FromStates(states)
+        sample = states
     elif where == "pool":
         sample = dfc.learned.Pool(system.sample, manifold=system.manifold)
     network = dfc.DeepONet(

@@ -239,7 +239,7 @@ def train_flow_map(system, spec, seed, key):
         )
         return dfc.fit(
             network, system.vector_field,
-            key=key, sample=dfc.learned.FromStates(pool), recipe=recipe, progress=True,
+            key=key, sample=pool, recipe=recipe, progress=True,
         )  # fmt: skip
 
     network, log = fit(

@@ -1,5 +1,6 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
+from . import paper as paper
 from ._files.save import pretrained_path as pretrained_path
 from ._files.save import read_info as read_info
 from ._networks.cores import Concatenated as Concatenated
@@ -20,23 +21,11 @@ from ._solvers.policies import Refuse as Refuse
 from ._solvers.policies import Report as Report
 from ._solvers.policies import domain_statistics as domain_statistics
 from ._solvers.sweeps import NewtonSweep as NewtonSweep
-from ._training.loss import Bounded as Bounded
-from ._training.loss import mean_square as mean_square
+from ._training.loop import FitLog as FitLog
 from ._training.pool import Pool as Pool
-from ._training.reachable import FromStates as FromStates
-from ._training.reachable import reachable_states as reachable_states
-from ._training.reachable import trajectories as trajectories
 from ._training.recipe import Recipe as Recipe
-from ._training.recipe import paper as paper
 from ._training.recipe import second_order as second_order
-from ._training.schedule import constant_weight as constant_weight
-from ._training.schedule import every_iteration as every_iteration
-from ._training.schedule import linear_weight as linear_weight
-from ._training.schedule import ramped_weight as ramped_weight
-from ._training.schedule import staged_iterations as staged_iterations
 from ._training.second_order import SPRING as SPRING
 from ._training.second_order import LevenbergMarquardt as LevenbergMarquardt
-from ._training.state import FitLog as FitLog
-from ._training.state import FitState as FitState
-from ._training.times import grid_times as grid_times
-from ._training.times import uniform_times as uniform_times
+from ._training.states import reachable_states as reachable_states
+from ._training.states import trajectories as trajectories

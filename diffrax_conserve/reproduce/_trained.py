@@ -93,9 +93,9 @@ def build(
     if kind == "conservative":
         layer = ConservativeLayer(system.manifold, steps=_ITERATIONS[system.name])
     if not is_flow_map(system):
-        return PINN(system.y0, 0.0, system.t1, key=net_key, layer=layer)
+        return paper.pinn(system.y0, 0.0, system.t1, key=net_key, layer=layer)
     states = jax.vmap(system.sample)(jr.split(states_key, 1000))
-    return DeepONet(states, system.dt, key=net_key, layer=layer)
+    return paper.deeponet(states, system.dt, key=net_key, layer=layer)
 
 
 def train(
@@ -107,7 +107,7 @@ def train(
     points: int | None = None,
     progress: bool = False,
 ) -> tuple[Network, FitLog]:
-    """A network trained by the recipe `paper`; `kind` is one of `KINDS`."""
+    """A network trained by the recipe of the paper; `kind` is one of `KINDS`."""
     net_key, states_key, fit_key = jr.split(jr.key(seed), 3)
     network = build(system, kind, net_key, states_key)
     return fit(
@@ -116,7 +116,7 @@ def train(
         key=fit_key,
         sample=system.sample if is_flow_map(system) else None,
         args=system.args,
-        recipe=paper(network, epochs=epochs, points=points),
+        recipe=paper.recipe(network, epochs=epochs, points=points),
         progress=progress,
     )
 

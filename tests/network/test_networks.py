@@ -73,7 +73,7 @@ def test_the_ansatz_of_the_pinn():
 
 
 def test_the_ansatz_of_the_deeponet():
-    net, y0, h = flow_map(), LORENZ.y0, 0.2
+    net, y0, h = flow_map(core=dfc.learned.Product), LORENZ.y0, 0.2
     mean, deviation = jnp.mean(states(), axis=0), jnp.std(states(), axis=0)
     b = net.core.branch((y0 - mean) / deviation).reshape(3, 4)
     tau = net.core.trunk(jnp.array([2 * h / 0.25 - 1])).reshape(3, 4)
@@ -86,7 +86,7 @@ def test_without_normalisation_the_inputs_are_raw():
     np.testing.assert_allclose(
         pinn(3.0), LORENZ.y0 + 3 / 4 * pinn.window(0).net(jnp.array([3.0])), rtol=1e-15
     )
-    net, y0 = flow_map(normalise=False), LORENZ.y0
+    net, y0 = flow_map(core=dfc.learned.Product, normalise=False), LORENZ.y0
     b, tau = (x.reshape(3, 4) for x in (net.core.branch(y0), net.core.trunk(jnp.array([0.2]))))
     np.testing.assert_allclose(net(y0, 0.2), y0 + 0.8 * jnp.sum(b * tau, axis=1) / 2, rtol=1e-14)
 
@@ -95,7 +95,15 @@ def test_without_normalisation_the_inputs_are_raw():
     ("width", "depth", "latent"), [pytest.param(5, 1, 3, marks=pytest.mark.slow), (7, 4, 2)]
 )
 def test_sizes(width, depth, latent):
-    net = dfc.DeepONet(states(), 1.0, width=width, depth=depth, latent=latent, key=jr.key(0))
+    net = dfc.DeepONet(
+        states(),
+        1.0,
+        width=width,
+        depth=depth,
+        latent=latent,
+        core=dfc.learned.Product,
+        key=jr.key(0),
+    )
     assert [w.shape for w in net.core.branch.weights] == [
         (3, width),
         *[(width, width)] * (depth - 1),

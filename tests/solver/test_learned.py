@@ -315,7 +315,7 @@ def test_nothing_raises_in_a_batch(case, adaptive, errors_raise):
     for result in (one.result, jax.tree.map(lambda x: x[0], both.result)):
         assert result != dfx.RESULTS.successful
         # A controller rejects what is not finite, and tries smaller steps.
-        assert adaptive and text == "not finite" or text in dfx.RESULTS[result]
+        assert (adaptive and text == "not finite") or text in dfx.RESULTS[result]
 
 
 def test_roundoff_in_the_times_is_not_refused():

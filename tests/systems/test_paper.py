@@ -287,7 +287,12 @@ def test_networks_and_recipe_have_the_papers_numbers(name, kind):
         assert hidden(net) == [40] * 4
         assert net.activation is jnp.tanh
     assert (network.layer is not None) == (kind == "conservative")
-    recipe = dfc.learned.paper(network)
+
+
+@pytest.mark.parametrize("name", list(DEFAULTS))
+def test_the_recipe_has_the_papers_numbers(name):
+    network = build(systems.get(name), "standard", jr.key(0), jr.key(1))
+    recipe = dfc.learned.paper.recipe(network)
     assert recipe.epochs == 5000
     assert recipe.points == (2000 if name in HORIZONS else 5000)
     assert recipe.refresh is None  # the full batch
@@ -296,16 +301,14 @@ def test_networks_and_recipe_have_the_papers_numbers(name, kind):
     np.testing.assert_allclose(update, -1e-3, rtol=1e-6)
 
 
-def test_the_schedule_is_the_papers():
-    """p(e) = floor(e (P + 1) / E), which would be P + 1 at e = E, a step never made; s = e / E."""
+def test_the_iterations_are_the_papers():
+    """p(e) = floor(e (P + 1) / E), which would be P + 1 at e = E, a step never made."""
     epochs, most = 5000, 3
-    e = jnp.arange(epochs)
-    p = dfc.learned.staged_iterations(e, epochs, most)
+    network = build(systems.get("conservative-lorenz"), "conservative", jr.key(0), jr.key(1))
+    schedule = dfc.learned.paper.recipe(network).schedule
+    p, _ = jax.vmap(lambda e: schedule(e, epochs, most))(jnp.arange(epochs))
     np.testing.assert_array_equal(p, np.floor(np.arange(epochs) * (most + 1) / epochs))
     assert (p[0], p[-1]) == (0, most)
-    np.testing.assert_allclose(
-        dfc.learned.linear_weight(e, epochs, most), np.arange(epochs) / epochs
-    )
 
 
 def test_the_reproduction_has_all_five():

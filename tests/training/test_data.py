@@ -112,7 +112,7 @@ def test_data_that_make_no_sense(data, match):
 def test_what_goes_with_data_and_what_does_not():
     with pytest.raises(TypeError, match="needs a `vector_field`"):
         dfc.fit(network(), key=KEY)
-    with pytest.raises(TypeError, match="without `sample`"):
+    with pytest.raises(TypeError, match="`sample` is only used with"):
         dfc.fit(network(), data=(TS, EXACT), sample=lambda key: EAST, key=KEY)
     pinn = dfc.PINN(EAST, 0.0, 1.0, key=KEY)
     with pytest.raises(ValueError, match="and `data`"):

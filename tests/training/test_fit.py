@@ -13,8 +13,10 @@ import optax
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._training.recipe import complete, grid, mean, staged
+from diffrax_conserve.learned.paper import _bounded
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator
+from ..learned import EAST, LORENZ, RADIUS, SMALL, Within, flow_map, oscillator
 
 # Most of these trainings are too short, and say so.
 pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
@@ -30,7 +32,7 @@ def circle(layer=None, seed=0):
 def recipe(model, epochs=60, points=30, **options):
     parts = dict(check_every=20, optimiser=optax.adam(1e-2))
     return dataclasses.replace(
-        dfc.learned.paper(model, epochs=epochs, points=points), **(parts | options)
+        dfc.learned.paper.recipe(model, epochs=epochs, points=points), **(parts | options)
     )
 
 
@@ -115,7 +117,7 @@ def test_the_first_loss_is_that_of_the_formula():
 def test_the_best_model_is_returned_not_the_last():
     """A training that turns round and climbs."""
     optimiser = optax.sgd(lambda step: jnp.where(step < 60, 1e-2, -1e-2))
-    options = dict(epochs=120, points=40, optimiser=optimiser, times=dfc.learned.grid_times)
+    options = dict(epochs=120, points=40, optimiser=optimiser, times=grid)
     model, log = train(circle(), **options)
     assert log.best_epoch == 60
     assert log.best == min(log.criteria) < log.criteria[0]
@@ -185,15 +187,12 @@ def test_progress(capsys):
 def test_the_schedules():
     epochs, steps = 400, 3
     es = jnp.arange(epochs)
-    p = dfc.learned.staged_iterations(es, epochs, steps)
-    s = dfc.learned.ramped_weight(es, epochs, steps)
+    p, s = jax.vmap(lambda e: staged(e, epochs, steps))(es)
     np.testing.assert_array_equal(p, np.repeat([0, 1, 2, 3], 100))
     np.testing.assert_allclose(s, np.tile(np.arange(100) / 100, 4), atol=1e-12)
-    np.testing.assert_allclose(dfc.learned.linear_weight(es, epochs, steps), es / epochs)
-    np.testing.assert_array_equal(
-        dfc.learned.every_iteration(es, epochs, steps), np.full(epochs, 3)
-    )
-    np.testing.assert_array_equal(dfc.learned.constant_weight(es, epochs, steps), np.ones(epochs))
+    p, s = jax.vmap(lambda e: complete(e, epochs, steps))(es)
+    np.testing.assert_array_equal(p, np.full(epochs, 3))
+    np.testing.assert_array_equal(s, np.ones(epochs))
 
 
 # ---- The loss ----
@@ -201,8 +200,8 @@ def test_the_schedules():
 
 def test_the_losses():
     q = jnp.array([0.0, 1.0, 3.0, 1e12])
-    assert dfc.learned.mean_square(q[:3], jnp.array(9.0)) == 4 / 3
-    bounded = dfc.learned.Bounded(2.0)(q, jnp.array(1.5))
+    assert mean(q[:3], jnp.array(9.0)) == 4 / 3
+    bounded = _bounded(q, jnp.array(3.0))
     np.testing.assert_allclose(bounded, np.mean([0, 1 / (1 + 1 / 3), 3 / 2, 3.0]), rtol=1e-10)
 
 
@@ -212,14 +211,15 @@ def test_the_losses():
 def test_arguments_that_are_refused():
     with pytest.raises(ValueError, match="leave `sample` out"):
         dfc.fit(circle(), oscillator, key=KEY, sample=LORENZ.sample)
+    unbounded = Within(flow_map(), None)
     with pytest.raises(ValueError, match="pass `sample`"):
-        dfc.fit(flow_map(), LORENZ.vector_field, key=KEY)
+        dfc.fit(unbounded, LORENZ.vector_field, key=KEY)
     with pytest.raises(TypeError, match="max_step"):
         dfc.fit(LAYER, oscillator, key=KEY)
     without_weights = dfc.learned.FlowMap(lambda y0, h: y0, 1.0)
     with pytest.raises(ValueError, match="no weights of its own"):
         dfc.fit(without_weights, oscillator, key=KEY, sample=lambda key: EAST)
-    with pytest.raises(ValueError, match="`epochs` must be at least 1"):
+    with pytest.raises(ValueError, match="`epochs` is 0, but it must be at least 1"):
         dfc.learned.Recipe(epochs=0)
     with pytest.raises(ValueError, match="`refresh`"):
         dfc.learned.Recipe(refresh=0)
@@ -232,7 +232,6 @@ def test_arguments_that_are_refused():
         ("recipe", optax.adam(1e-3)),
         ("vector_field", 1.0),
         ("key", 0),
-        ("sample", np.zeros((5, 2))),
         ("progress", "yes"),
         ("seconds", "a"),
         ("target", [1e-3]),
@@ -259,11 +258,11 @@ def test_arguments_of_a_wrong_type_are_named(name, wrong):
 def test_the_papers_recipe_on_the_rigid_body():
     system = dfc.systems.get("rigid-body")
     layer = dfc.learned.ConservativeLayer(system.manifold, steps=5)
-    pinn = dfc.PINN(system.y0, 0.0, system.t1, key=jr.key(2), layer=layer)
+    pinn = dfc.learned.paper.pinn(system.y0, 0.0, system.t1, key=jr.key(2), layer=layer)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         pinn, log = dfc.fit(
-            pinn, system.vector_field, key=jr.key(3), recipe=dfc.learned.paper(pinn)
+            pinn, system.vector_field, key=jr.key(3), recipe=dfc.learned.paper.recipe(pinn)
         )
     warned = any("is not the solution" in str(x.message) for x in caught)
     ts = jnp.linspace(0, system.t1, 100)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._networks.flow_map import as_flow_map
-from diffrax_conserve.learned._training.objective import _anew, start
+from diffrax_conserve.learned._training.objective import Problem, fresh_points, start
 from diffrax_conserve.learned._training.pool import moved
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, oscillator
@@ -238,7 +238,8 @@ def test_it_learns_where_it_was_never_told_to_look(manifold, tmp_path):
     assert error_opposite(network) < 0.02
     assert log.skipped == 0
     dfc.save(tmp_path / "pool.network", network)
-    domain = dfc.load(tmp_path / "pool.network").domain
+    taylor = dfc.learned.Taylor(oscillator)
+    domain = dfc.load(tmp_path / "pool.network", taylor=taylor).domain
     assert float(jnp.mean(jax.vmap(domain.contains)(-Y0S))) > 0.9
 
 
@@ -259,8 +260,9 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
 
     @eqx.filter_jit
     def next_states(model):
-        problem, carry = start(model, lambda t, y, args: y**3, KEY, pool, None, recipe)
-        return carry.points.y0s, _anew(problem, carry, jnp.asarray(1)).y0s
+        problem = Problem(lambda t, y, args: y**3, None, pool, None, recipe)
+        objective, carry = start(problem, model, KEY)
+        return carry.points.y0s, fresh_points(objective, carry, jnp.asarray(1)).y0s
 
     before, after = next_states(wild)
     assert not np.any(np.asarray(before == after))
@@ -275,9 +277,9 @@ def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
     [
         (dict(manifold=lambda t, y, args: y), TypeError, "FirstIntegral"),
         (dict(manifold=()), ValueError, "nothing to conserve"),
-        (dict(mean_steps=0.5), ValueError, "`mean_steps` must be at least 1, but is 0.5"),
+        (dict(mean_steps=0.5), ValueError, "`mean_steps` is 0.5, but it must be at least 1"),
         (dict(mean_steps=float("nan")), ValueError, "`mean_steps`"),
-        (dict(max_defect=0), ValueError, "`max_defect` must be positive, but is 0"),
+        (dict(max_defect=0), ValueError, "`max_defect` is 0, but it must be positive"),
     ],
 )
 def test_a_pool_that_cannot_be(options, error, match):
@@ -293,9 +295,9 @@ def as_users_see_it():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def test_given_states_are_no_sampler(as_users_see_it):
-    with pytest.raises(TypeError, match=r"Pool\(FromStates\(states\)\)"):
-        dfc.learned.Pool(Y0S)  # pyright: ignore
+def test_a_pool_draws_from_given_states():
+    drawn = jax.vmap(dfc.learned.Pool(Y0S))(jr.split(KEY, 20))
+    assert bool(jnp.all(jnp.any(jnp.all(drawn[:, None] == Y0S, axis=2), axis=1)))
 
 
 @pytest.mark.parametrize("refresh", [None, 40, 100])

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import AbstractCore, Product, Sizes
+from .cores import AbstractCore, Concatenated, Sizes
 from .domain import Box, FramedBox
 from .flat import as_states, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, checked_args, checked_box
@@ -26,19 +26,19 @@ from .trainable import LayerSchedule
 class DeepONet(AbstractFlowMap):
     r"""A network for the flow map of an autonomous system, $(u_0, h) \mapsto u(h)$.
 
-    $$u(h) = u_0 + \frac{h}{\Delta} S G(u_0)(h), \qquad
-    G_j(u_0)(h) = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0) \, \tau_{jl}(h),$$
+    $$u(h) = u_0 + \frac{h}{\Delta} S N(u_0, h)$$
 
-    with a branch network $b$ and a trunk network $\tau$, both fully connected, and steps $h$ up to
-    $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. Longer times need several steps. With a
-    `layer`, the output is projected to the manifold of the conserved values at $u_0$.
+    with steps $h$ up to $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. Longer times need
+    several steps. With `taylor`, which [`diffrax_conserve.fit`][] adds by default, it is $u(h) =
+    T_q(u_0, h) + (h/\Delta)^{q+1} S N$: see [`diffrax_conserve.learned.Taylor`][]. With a `layer`,
+    the output is projected to the manifold of the conserved values at $u_0$. With a `frame` it
+    commutes with the symmetries of the equations: see [`diffrax_conserve.learned.Frame`][].
 
-    Two other cores take the state and the step together and are more accurate at the same size:
-    [`diffrax_conserve.learned.Concatenated`][] is a fully connected network,
-    [`diffrax_conserve.learned.Gated`][] feeds the input into each of its layers. With `taylor` the
-    network is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S G$: see
-    [`diffrax_conserve.learned.Taylor`][]. With a `frame` it commutes with the symmetries of the
-    equations: see [`diffrax_conserve.learned.Frame`][].
+    The `core` $N$ is one fully connected network of the state and the step,
+    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
+    feeds the input into each of its layers; or as in the literature, and less accurate at the same
+    size, [`diffrax_conserve.learned.Product`][], $N_j = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0)
+    \, \tau_{jl}(h)$ with a branch network $b$ and a trunk network $\tau$.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -77,10 +77,10 @@ class DeepONet(AbstractFlowMap):
         max_step: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        width: int = 40,
-        depth: int = 4,
+        width: int = 32,
+        depth: int = 2,
         latent: int = 20,
-        core: type[AbstractCore] = Product,
+        core: type[AbstractCore] = Concatenated,
         activation: str | Activation = "tanh",
         normalise: bool = True,
         taylor: Taylor | None = None,
@@ -227,16 +227,14 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
     and the box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
-- `width`, `depth`: the number of units in each hidden layer, and of hidden layers, in both
-    networks.
-- `latent`: the number $L$ of products in each component.
-- `core`: the architecture of the network: [`diffrax_conserve.learned.Product`][],
-    [`diffrax_conserve.learned.Concatenated`][] or [`diffrax_conserve.learned.Gated`][]; the last
-    two do not use `latent`.
+- `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
+- `latent`: the number $L$ of products in each component, for a `Product`.
+- `core`: the architecture of the network: [`diffrax_conserve.learned.Concatenated`][],
+    [`diffrax_conserve.learned.Gated`][] or [`diffrax_conserve.learned.Product`][].
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `normalise`: whether the branch gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
-    $S$ of `states`, and the trunk gets $h$ scaled to $[-1, 1]$. Otherwise both inputs are not
+- `normalise`: whether the network gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
+    $S$ of `states`, and $h$ scaled to $[-1, 1]$. Otherwise both inputs are not
     scaled, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then

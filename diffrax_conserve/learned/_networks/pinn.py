@@ -91,9 +91,9 @@ class PINN(eqx.Module):
     with a fully connected network $N$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
     output is projected to the manifold of the conserved values at $(t_0, u_0)$.
 
-    A long interval can be divided into `windows`, each with its own network that starts where the
-    last one ends: small networks on short intervals are far easier to train than a large one on a
-    long interval.
+    A long interval is divided into `windows`, each with its own network that starts where the last
+    one ends: small networks on short intervals are far easier to train than a large one on a long
+    interval. [`diffrax_conserve.fit`][] cuts windows that are too long.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.PINNSolver`][].
 
@@ -130,10 +130,10 @@ class PINN(eqx.Module):
         *,
         key: PRNGKeyArray,
         windows: int | Sequence[float] = 1,
-        width: int = 40,
-        depth: int = 4,
+        width: int = 30,
+        depth: int = 1,
         activation: str | Activation = "tanh",
-        slope: float | None = None,
+        slope: float | None = 2.0,
         normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):
@@ -218,9 +218,9 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `slope`: the standard deviation of the initial slopes of the first layer, whose units then have
-    centres spread over the interval. Default: Glorot initialisation, with which all units are
-    nearly linear in time, and so nearly the same. Levenberg-Marquardt needs about 2.
+- `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
+    spread over the interval. `None` for Glorot initialisation, with which all units are nearly
+    linear in time, and so nearly the same; Levenberg-Marquardt needs about 2.
 - `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
     leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._networks.flow_map import AbstractFlowMap
-from .._networks.trainable import LayerSchedule, Points, Sampler, Times
+from .._networks.trainable import LayerSchedule
 
 
 class Pairs(NamedTuple):
@@ -42,6 +42,13 @@ class Data(eqx.Module):
         )
         take = lambda k: jtu.tree_map(lambda y: y[i, k], self.ys)  # noqa: E731
         return Pairs(self.ts[i, end] - self.ts[i, j], take(j), take(end))
+
+    def mismatch(
+        self, model: AbstractFlowMap, pairs: Pairs, schedule: LayerSchedule | None
+    ) -> Float[Array, "points n"]:
+        """The differences from the later states of the pairs, relative to `deviation`."""
+        found = jax.vmap(lambda y0, h: model(y0, h, schedule=schedule))(pairs.y0s, pairs.hs)
+        return model.compared(found, pairs.y1s) / self.deviation
 
     def sample(self, key: PRNGKeyArray) -> Any:
         """One of the states."""
@@ -80,24 +87,3 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
 
 
 _MANY = 2000
-
-
-def draw_points(
-    model: Any, times: Times, sample: Sampler | None, data: Data | None, count: int, key: Any
-) -> Points:
-    """`count` collocation points, and as many pairs of the data."""
-    if data is None:
-        return model.draw(times, sample, count, key)
-    pairs = data.draw(count, jr.fold_in(key, 1))
-    if sample is None:
-        return Points(pairs.hs, pairs.y0s, pairs)
-    return model.draw(times, sample, count, key)._replace(pairs=pairs)
-
-
-def mismatch(
-    model: AbstractFlowMap, pairs: Pairs, deviation: Array, schedule: LayerSchedule | None
-) -> Float[Array, "points n"]:
-    """The difference of the flow map's states from the later states of the pairs, relative to
-    `deviation`."""
-    found = jax.vmap(lambda y0, h: model(y0, h, schedule=schedule))(pairs.y0s, pairs.hs)
-    return model.compared(found, pairs.y1s) / deviation

@@ -8,34 +8,19 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
-import jax.random as jr
-import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks.flow_map import args_domain_of, as_flow_map, restored
+from .._networks.flow_map import restored
 from .._networks.pinn import PINN
-from .._networks.trainable import Sampler
-from .._networks.wrappers import OfPairs, PairField, PairSampler
-from .arguments import (
-    check_arguments,
-    check_family,
-    check_field,
-    check_limits,
-    check_pool,
-    check_types,
-)
-from .data import as_data
-from .defect import VectorField
-from .objective import Objective
-from .path_error import data_error, step_error
-from .pool import Pool, with_domain
-from .recipe import Recipe, second_order
-from .state import FitLog, FitState, Past, continued, fingerprint, read_checkpoint
-from .trainer import Progress, Trainer
-from .windows import WindowEnds, solution_error, train_windows, windows_of
+from .._networks.wrappers import OfPairs
+from .checks import check_limits, checked
+from .errors import flow_map_error
+from .loop import FitLog, Loop, Progress
+from .objective import Carry, VectorField
+from .recipe import Recipe
+from .state import FitState, fingerprint
+from .windows import train_windows
 
 _Model = TypeVar("_Model", bound=eqx.Module)
 
@@ -45,7 +30,7 @@ def fit(
     vector_field: VectorField | None = None,
     *,
     key: PRNGKeyArray,
-    sample: Sampler | None = None,
+    sample: Any = None,
     data: tuple[Any, Any] | None = None,
     args: Args = None,
     recipe: Recipe | None = None,
@@ -63,20 +48,23 @@ def fit(
     For a network with a conservative layer, the recipe's schedule determines the number of
     iterations of the layer in $u$.
 
-    From `data` a flow map learns from pairs of states, one step of any length apart, which are
-    drawn along the trajectories. The loss is that of the differences, each component relative to
-    the root mean square change by a step. With a vector field the squared defect is added, relative
-    to the median of $|f|^2$.
+    From `data` a flow map learns pairs of states along the trajectories, one step of any length
+    apart. The loss is that of the differences, each component relative to the root mean square
+    change by a step. With a vector field the squared defect is added, relative to the median of
+    $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
     estimates the error of its solution.
 
-    A `PINN` of several windows is trained window by window; each starts at the end of the previous
-    one, projected to the manifold if one is given. Each is judged by its estimated error. A window
-    that failed is trained again from other weights, and then in halves, as often as the recipe's
-    `retries` allow. Errors add up along the solution and may grow: if it misses the `target`, the
-    windows are trained again, to smaller errors. If the solution is still wrong, a warning names
-    the window and the error.
+    By default a `DeepONet` gets the [`diffrax_conserve.learned.Taylor`][] polynomial of first order
+    of the vector field, unless it has one or the field changes too fast: see `taylor` of
+    [`diffrax_conserve.learned.Recipe`][].
+
+    A `PINN` is trained window by window; each starts at the end of the previous one, projected to
+    the manifold if one is given. Each is judged by its estimated error. A window that failed is cut
+    in halves, as often as the recipe's `retries` allow. Errors add up along the solution and may
+    grow: if it misses the `target`, the windows are trained again, to smaller errors. If the
+    solution is still wrong, a warning names the window and the error.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
     same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
@@ -91,23 +79,25 @@ def fit(
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time; with `data` it is
         optional.
     - `key`: a random key. The same key gives the same result.
-    - `sample`: for a flow map, a function from a random key to an initial state, or a
-        [`diffrax_conserve.learned.Pool`][], which follows the solutions from such states.
+    - `sample`: for a flow map, initial states, stacked along a leading axis, a function from a
+        random key to one of them, or a [`diffrax_conserve.learned.Pool`][], which follows the
+        solutions from such states. Default: the states of `data`, or else all of the `domain`, if
+        that is a [`diffrax_conserve.learned.Box`][].
     - `data`: for a flow map, trajectories `(ts, ys)`: times of shape `(n, k)`, increasing along
         each trajectory and not necessarily equidistant, and states with leading axes `(n, k)`.
-        [`diffrax_conserve.learned.trajectories`][] computes some. With a vector field and without
-        `sample`, the collocation points use these states too.
+        [`diffrax_conserve.learned.trajectories`][] computes some.
     - `args`: passed to `vector_field`. Omit them for a flow map that takes `args` itself: they are
         drawn from its `args_domain`, and the states of `data` are pairs `(y, args)`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
         [`diffrax_conserve.learned.second_order`][]`(model)`.
-    - `manifold`: for a `PINN` of several windows, the manifold to which the ends of the windows are
+    - `manifold`: for a `PINN`, the manifold to which the ends of the windows are
         projected, with the conserved values at the initial state. Default: that of its layer.
     - `state`: the `state` in the log of a training that is to be continued.
     - `target`: for a flow map, the loss at which the training ends. For a `PINN`, the accepted
-        estimated error of its solution, relative to its largest component. Default: all epochs are
-        run, and a solution with an error above 1e-4 counts as wrong.
-    - `seconds`: ends the training after this wall time.
+        estimated error of its solution, relative to its largest component. Default: a flow map is
+        trained for all epochs; windows are cut until the error is about 1e-7 (1e-4 in single
+        precision), and a solution with an error above 1e-4 counts as wrong.
+    - `seconds`: ends the training after this wall time, without the compilation.
     - `checkpoint`: a file for the state of the training, which is updated regularly; if it exists,
         the training continues from it.
     - `progress`: whether to print a line on standard error, or a function that is called regularly
@@ -130,127 +120,50 @@ def fit(
         import jax
 
         system = dfc.systems.get("harmonic-oscillator")
-        pinn = dfc.PINN(system.y0, 0.0, 1.0, width=10, depth=2, key=jax.random.key(0))
-        recipe = dfc.learned.paper(pinn, epochs=200, points=50)
-        pinn, log = dfc.fit(pinn, system.vector_field, key=jax.random.key(1), recipe=recipe)
-        print(f"loss {log.best:.0e} at epoch {log.best_epoch}")
-        ```
-
-        ```text
-        loss 5e-03 at epoch 200
+        pinn = dfc.PINN(system.y0, 0.0, 10.0, key=jax.random.key(0))
+        pinn, log = dfc.fit(pinn, system.vector_field, key=jax.random.key(1))
+        assert log.error < 1e-7
         ```
 
     ??? cite "Reference"
 
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
-    check_types(vector_field, key, sample, data, recipe, progress)
-    check_arguments(model, sample, data, manifold)
-    check_limits(state, target, seconds)
-    recipe = second_order(model) if recipe is None else recipe
-    given: Any = model
-    flow_map = None if isinstance(model, PINN) else as_flow_map(given)
-    if flow_map is not None and (domain := args_domain_of(flow_map)) is not None:
-        check_family(sample, args)
-        flow_map = OfPairs(flow_map)
-        vector_field = None if vector_field is None else PairField(vector_field)
-        sample = None if sample is None else PairSampler(sample, domain)
-    found = None if data is None or flow_map is None else as_data(data, flow_map)
-    if found is not None and vector_field is not None and sample is None:
-        sample = found.sample
-    trainer = Trainer(
-        vector_field,
-        sample,
-        found,
-        args,
-        recipe,
+    created = time.perf_counter()
+    check_limits(state, target, seconds, progress)
+    network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
+    loop = Loop(
+        problem,
         key,
         None if target is None else float(target),
         math.inf if seconds is None else seconds,
         progress,
         None if checkpoint is None else Path(checkpoint),
-        fingerprint((model, key, args, vector_field), recipe),
+        fingerprint((model, key, args, vector_field), problem.recipe),
+        created,
     )
     if isinstance(model, PINN):
-        return _fit_windows(trainer, model, manifold, state)
-    assert flow_map is not None
-    if isinstance(sample, Pool):
-        check_pool(sample, flow_map, args, recipe)
-    trained, log = _fit_flow_map(trainer, flow_map, state)
+        return train_windows(loop, model, manifold, state)
+    trained, log = _train_flow_map(loop, network, state)
     trained = trained.flow_map if isinstance(trained, OfPairs) else trained
     return restored(trained, model), log
 
 
-def _fit_windows(
-    trainer: Trainer, pinn: PINN, manifold: Manifold | None, given: FitState | None
-) -> tuple[Any, FitLog]:
-    ends = WindowEnds.of(pinn, manifold, trainer.args)
-    state = _first(trainer, pinn, given)
-    state, found, ended = train_windows(trainer, state, ends)
-    trainer.save(state, always=True)
-    trained = pinn.cut(found.edges.tolist(), found.nets, found.y0s)
-    error = solution_error(trainer, pinn, trained, found)
-    if ended == "epochs" and trainer.target is not None and error <= trainer.target:
-        ended = "target"
-    return trained, _log(trainer, state, ended, error, found.errors)
+def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
+    problem, state = loop.problem, loop.begin((flow_map,), given)
+    objective, state = loop.start(state)
 
+    def error(network: Any) -> float:
+        return flow_map_error(network, problem, loop.key)
 
-def _fit_flow_map(trainer: Trainer, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
-    state = _first(trainer, flow_map, given)
-    objective, _ = trainer.start(state.model, state)
+    def close(carry: Carry) -> bool:
+        return loop.target is not None and float(carry.best) <= loop.target
 
-    def close(objective: Objective, state: FitState) -> bool:
-        del objective
-        return trainer.target is not None and float(state.carry.best) <= trainer.target
-
-    def trained(objective: Objective, state: FitState) -> Any:
-        best = eqx.combine(state.carry.best_weights, objective.static)
-        return with_domain(best, state.carry.best_domain)
-
-    def error(objective: Objective, state: FitState) -> float:
-        network, field = trained(objective, state), trainer.vector_field
-        if field is None:
-            assert trainer.data is not None
-            return data_error(network, trainer.data, trainer.key)
-        assert trainer.sample is not None
-        return step_error(network, field, trainer.args, trainer.sample, trainer.key)
-
-    ended = "epochs"
+    carry, ended = state.carry, "epochs"
     if not state.finished:
-        state, ended = trainer.rounds(objective, state, close, error)
-        state = dataclasses.replace(state, finished=int(state.done >= trainer.recipe.epochs))
-    trainer.save(state, always=True)
-    return trained(objective, state), _log(trainer, state, ended, error(objective, state))
-
-
-def _first(trainer: Trainer, model: Any, given: FitState | None) -> FitState:
-    """The first state of the training: the given one, that of a checkpoint, or a new one."""
-    network = model.window(0) if isinstance(model, PINN) else model
-    recipe, (points_key, _) = trainer.recipe, jr.split(trainer.key)
-    if trainer.vector_field is not None:
-        points = network.draw(recipe.times, trainer.sample, recipe.points, points_key)
-        check_field(network, trainer.vector_field, trainer.args, points)
-    _, carry = trainer.start(network, None)
-    carry = jtu.tree_map(lambda x: jnp.astype(x, x.dtype), carry)
-    windows = windows_of(model) if isinstance(model, PINN) else None
-    nothing = np.zeros(0, int), np.zeros(0)
-    first = FitState(model, carry, *nothing, Past.empty(), windows=windows)
-    if given is not None:
-        return continued(given, trainer.recipe.epochs, first)
-    if trainer.checkpoint is not None and trainer.checkpoint.exists():
-        found = read_checkpoint(trainer.checkpoint, first, trainer.mark)
-        return found if found.finished else continued(found, trainer.recipe.epochs, first)
-    return first
-
-
-def _log(trainer: Trainer, state: FitState, ended: str, error: float, errors: Any = ()) -> FitLog:
-    past = state.past.and_then(state.carry, state.checked, state.criteria)
-    return FitLog(
-        **vars(past),
-        error=error,
-        errors=np.asarray(errors),
-        ended=ended,
-        seconds=time.perf_counter() - trainer.begun - trainer.compile_seconds,
-        compile_seconds=trainer.compile_seconds,
-        state=state,
-    )
+        state, carry, ended = loop.train(objective, state, close, error)
+        finished = int(state.done >= problem.recipe.epochs)
+        state = dataclasses.replace(state, finished=finished)
+    loop.save(state, always=True)
+    trained = objective.best(carry)
+    return trained, loop.log(state, carry, ended, error(trained))

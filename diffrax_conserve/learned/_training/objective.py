@@ -1,6 +1,10 @@
-"""The compiled part of a training: its constants, the values that change from epoch to epoch, and
-the epochs."""
+"""The compiled part of a training: the loss, and the epochs that minimise it.
 
+The defect `du/dt - f(t, u)` is computed at a batch of collocation points by one forward-mode pass.
+A `vmap` of forward passes takes twice as long, and reverse mode six times as long.
+"""
+
+from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
@@ -13,24 +17,62 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..._custom_types import Args
-from ..._tree import tree_all_finite
+from ..._custom_types import Args, RealScalarLike
+from ..._tree import tree_all_finite, tree_sub
 from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
-from .data import Data, draw_points, mismatch
-from .defect import (
-    VectorField,
-    defects,
-    linear_weights,
-    squared_norms,
-    trainable,
-    typical_square,
-)
+from .data import Data
 from .pool import Pool, domain_of, moved
 from .recipe import Recipe
-from .second_order import LeastSquares, SecondOrder
+from .second_order import LeastSquares, SecondOrder, squared_norms
+
+VectorField = Callable[[RealScalarLike, Any, Args], Any]
+
+
+@final
+class Problem(eqx.Module):
+    """What is learned, and how. It does not change during a call of `fit`."""
+
+    vector_field: VectorField | None
+    args: Args
+    sample: Sampler | None
+    data: Data | None
+    recipe: Recipe
+
+    def field(self, t: Any, y: Any) -> Any:
+        """The vector field with its `args`."""
+        assert self.vector_field is not None
+        return self.vector_field(t, y, self.args)
+
+    def draw(self, model: AbstractTrainable, key: PRNGKeyArray) -> Points:
+        """New collocation points, and as many pairs of the data."""
+        count, times = self.recipe.points, self.recipe.times
+        if self.data is None:
+            return model.draw(times, self.sample, count, key)
+        pairs = self.data.draw(count, jr.fold_in(key, 1))
+        if self.sample is None:
+            return Points(pairs.hs, pairs.y0s, pairs)
+        return model.draw(times, self.sample, count, key)._replace(pairs=pairs)
+
+    def defects(
+        self, model: AbstractTrainable, points: Points, schedule: LayerSchedule
+    ) -> Float[Array, "points n"]:
+        """`du/dt - f(t, u)` at every point, as vectors in the units of the model."""
+        ts, ones = points.ts, jnp.ones_like(points.ts)
+        y, rates = jax.jvp(lambda ts: model.states(points, ts, schedule), (ts,), (ones,))
+        return model.measured(points, tree_sub(rates, jax.vmap(self.field)(ts, y)))
+
+    def typical(self, model: AbstractTrainable, points: Points) -> Float[Array, ""]:
+        """The median of `|f|²` over the initial states."""
+        if self.vector_field is None:
+            return jnp.ones(())
+        starts = model.starts(points)
+        rates = jax.vmap(self.field)(starts.ts, starts.y0s)
+        return jnp.median(squared_norms(model.measured(starts, rates)))
 
 
 class Carry(NamedTuple):
+    """What changes from epoch to epoch."""
+
     weights: Any
     optimiser_state: Any
     points: Points
@@ -45,14 +87,10 @@ class Carry(NamedTuple):
 
 @final
 class Objective(eqx.Module):
-    """The constants of a training: the loss as a function of the weights, and its minimisation."""
+    """The constants in the training of one network: the loss as a function of its weights."""
 
+    problem: Problem
     static: Any  # the model without its weights
-    vector_field: VectorField | None
-    args: Args
-    sample: Sampler | None
-    data: Data | None
-    recipe: Recipe
     optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
     typical: Float[Array, ""]
@@ -62,19 +100,18 @@ class Objective(eqx.Module):
     def defects(
         self, weights: Any, points: Points, schedule: LayerSchedule
     ) -> Float[Array, "points n"]:
-        model = eqx.combine(weights, self.static)
-        rows = []
-        if self.vector_field is not None:
-            rows.append(defects(model, self.vector_field, self.args, points, schedule))
-        if self.data is not None:
+        model, problem, rows = eqx.combine(weights, self.static), self.problem, []
+        if problem.vector_field is not None:
+            rows.append(problem.defects(model, points, schedule))
+        if problem.data is not None:
             # Both are relative, so that neither dominates because of its units.
             rows = [row / jnp.sqrt(self.typical) for row in rows]
-            rows.append(mismatch(model, points.pairs, self.data.deviation, schedule))
+            rows.append(problem.data.mismatch(model, points.pairs, schedule))
         return rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=1)
 
     def loss(self, weights: Any, points: Points, schedule: LayerSchedule) -> Float[Array, ""]:
-        vectors = self.defects(weights, points, schedule)
-        return self.recipe.loss(squared_norms(vectors), self.typical)
+        squares = squared_norms(self.defects(weights, points, schedule))
+        return self.problem.recipe.loss(squares, self.typical)
 
     def criterion(self, weights: Any, points: Points) -> Float[Array, ""]:
         """The loss with all iterations of the layer, as the trained model is used."""
@@ -83,49 +120,37 @@ class Objective(eqx.Module):
 
     def complete(self) -> LayerSchedule:
         """The schedule with all iterations of the conservative layer."""
-        return jnp.asarray(self.steps()), jnp.ones(())
-
-    def steps(self) -> int:
         layer = self.static.layer
-        return 0 if layer is None else layer.steps
+        return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
-        steps, epochs = self.steps(), self.recipe.epochs
-        if steps == 0:
+        layer, recipe = self.static.layer, self.problem.recipe
+        if layer is None or layer.steps == 0:
             return jnp.zeros_like(epoch), jnp.ones(())
-        return (
-            self.recipe.iterations(epoch, epochs, steps),
-            jnp.asarray(self.recipe.weight(epoch, epochs, steps), float),
-        )
+        p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
+        return p, jnp.asarray(s, float)
+
+    def best(self, carry: Carry) -> Any:
+        """The best model so far."""
+        model = eqx.combine(carry.best_weights, self.static)
+        if carry.best_domain is None:
+            return model
+        return eqx.tree_at(lambda m: m.domain, model, carry.best_domain)
 
 
-def start(
-    model: AbstractTrainable,
-    vector_field: VectorField | None,
-    key: PRNGKeyArray,
-    sample: Sampler | None,
-    args: Args,
-    recipe: Recipe,
-    data: Data | None = None,
-) -> tuple[Objective, Carry]:
-    points_key, key = jr.split(key)
-    trained = trainable(model)
+@eqx.filter_jit
+def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tuple[Objective, Carry]:
+    recipe, (points_key, key) = problem.recipe, jr.split(key)
+    trained = _marked(model, "weights", eqx.is_inexact_array)
     weights, static = eqx.partition(model, trained)
-    points = draw_points(model, recipe.times, sample, data, recipe.points, points_key)
+    points = problem.draw(model, points_key)
     optimiser = recipe.optimiser
     if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
-        clip = optax.clip_by_global_norm(recipe.max_gradient_norm)
-        optimiser = optax.chain(clip, optimiser)
-    typical = jnp.ones(())
-    if vector_field is not None:
-        typical = typical_square(model, vector_field, args, points)
-    last = eqx.filter(linear_weights(model), trained)
+        optimiser = optax.chain(optax.clip_by_global_norm(recipe.max_gradient_norm), optimiser)
+    last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
-    objective = Objective(
-        static, vector_field, args, sample, data, recipe, optimiser, points, typical, linear, key
-    )
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
-    domain = domain_of(model) if isinstance(sample, Pool) else None
+    domain = domain_of(model) if isinstance(problem.sample, Pool) else None
     carry = Carry(
         weights=weights,
         optimiser_state=optimiser.init(weights),
@@ -138,23 +163,39 @@ def start(
         best_domain=domain,
         losses=jnp.full(recipe.epochs, jnp.nan, dtype),
     )
-    return objective, carry
+    # No array is weakly typed, because the compiled epochs return none that is.
+    carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
+    typical = problem.typical(model, points)
+    return Objective(problem, static, optimiser, points, typical, linear, key), carry
+
+
+def _marked(model: AbstractTrainable, method: str, mark: Callable[[Any], bool]) -> Any:
+    """`model` with marks at the place that the method returns, and `False` elsewhere."""
+    nothing = jtu.tree_map(lambda _: False, model)
+    marks = jtu.tree_map(mark, getattr(model, method)())
+    if not jtu.tree_leaves(marks):
+        return nothing
+    return eqx.tree_at(lambda m: getattr(m, method)(), nothing, marks)
 
 
 def advance(
-    objective: Objective, carry: Carry, start: Int[Array, ""], stop: Int[Array, ""]
+    objective: Objective,
+    carry: Carry,
+    start: Int[Array, ""],
+    stop: Int[Array, ""],
+    compare: Bool[Array, ""],
 ) -> tuple[Carry, Float[Array, ""]]:
-    """Runs the epochs from `start` up to `stop`, and compares the model with the best one so far.
+    """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far.
 
-    `start` and `stop` may be traced, so that all rounds share one compilation.
+    The last three may be traced, so that all calls share one compilation.
     """
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
     criterion, best = _compared(objective, carry)
-    better = criterion < best
+    better = compare & (criterion < best)
     carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
         best_domain=_where(better, carry.domain, carry.best_domain),
-        best=jnp.where(better, criterion, best),
+        best=jnp.where(better, criterion, jnp.where(compare, best, carry.best)),
         best_epoch=jnp.where(better, stop, carry.best_epoch),
     )
     return carry, criterion
@@ -162,7 +203,7 @@ def advance(
 
 def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The criterion of the model, and that of the best one so far."""
-    if not isinstance(objective.sample, Pool):
+    if not isinstance(objective.problem.sample, Pool):
         return objective.criterion(carry.weights, objective.first_points), carry.best
     # The states of a pool move, so both models are compared on the points of the next epoch, on
     # which with `refresh=1` neither has been trained.
@@ -173,9 +214,7 @@ def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Flo
 
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     """One update, and the points for the next one."""
-    schedule = objective.schedule(epoch)
-    update = _by_least_squares if isinstance(objective.optimiser, SecondOrder) else _by_gradient
-    weights, optimiser_state, loss = update(objective, carry, schedule, epoch)
+    weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If the update is not finite, continue from the best model: skipping the update is not enough,
     # because the same points would give the same result in the next epoch.
@@ -187,28 +226,27 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
-    return carry._replace(points=_refreshed(objective, carry, epoch + 1))
-
-
-def _by_gradient(
-    objective: Objective, carry: Carry, schedule: LayerSchedule, epoch: Array
-) -> tuple[Any, Any, Float[Array, ""]]:
-    del epoch
-    loss, gradient = eqx.filter_value_and_grad(objective.loss)(
-        carry.weights, carry.points, schedule
+    refresh, following = objective.problem.recipe.refresh, epoch + 1
+    if refresh is None:
+        return carry
+    points = lax.cond(
+        following % refresh == 0,
+        lambda: fresh_points(objective, carry, following),
+        lambda: carry.points,
     )
-    assert not isinstance(objective.optimiser, SecondOrder)
-    updates, state = objective.optimiser.update(gradient, carry.optimiser_state, carry.weights)
-    return eqx.apply_updates(carry.weights, updates), state, loss
+    return carry._replace(points=points)
 
 
-def _by_least_squares(
-    objective: Objective, carry: Carry, schedule: LayerSchedule, epoch: Array
-) -> tuple[Any, Any, Float[Array, ""]]:
-    """The update by a second-order method, for which the weights are one vector."""
-    assert isinstance(objective.optimiser, SecondOrder)
-    vector, restore = ravel_pytree(carry.weights)
-    points = carry.points
+def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
+    """The next weights and state of the optimiser, and the loss."""
+    optimiser, schedule = objective.optimiser, objective.schedule(epoch)
+    weights, points, state = carry.weights, carry.points, carry.optimiser_state
+    if not isinstance(optimiser, SecondOrder):
+        loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
+        updates, state = optimiser.update(gradient, state, weights)
+        return eqx.apply_updates(weights, updates), state, loss
+    # For a second-order method the weights are one vector.
+    vector, restore = ravel_pytree(weights)
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
@@ -217,31 +255,19 @@ def _by_least_squares(
     least_squares = LeastSquares(
         defects=lambda v: objective.defects(restore(v), points, schedule),
         jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
-        loss=objective.recipe.loss,
+        loss=objective.problem.recipe.loss,
         typical=objective.typical,
     )
-    fraction = epoch / objective.recipe.epochs
-    vector, state, loss = objective.optimiser.update(
-        least_squares, vector, carry.optimiser_state, fraction, objective.linear
-    )
+    fraction = epoch / objective.problem.recipe.epochs
+    vector, state, loss = optimiser.update(least_squares, vector, state, fraction, objective.linear)
     return restore(vector), state, loss
 
 
-def _refreshed(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    """The points for `epoch`."""
-    if objective.recipe.refresh is None:
-        return carry.points
-    due = epoch % objective.recipe.refresh == 0
-    return lax.cond(due, lambda: _anew(objective, carry, epoch), lambda: carry.points)
-
-
-def _anew(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    """New points; the states of a pool are moved by the network."""
-    recipe, sample = objective.recipe, objective.sample
-    key = jr.fold_in(objective.key, epoch)
-    static, data = objective.static, objective.data
-    points = draw_points(static, recipe.times, sample, data, recipe.points, key)
-    if not isinstance(sample, Pool):
+def fresh_points(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
+    """The points for `epoch`. The states of a pool are moved by the network."""
+    problem, key = objective.problem, jr.fold_in(objective.key, epoch)
+    points = problem.draw(objective.static, key)
+    if not isinstance(problem.sample, Pool):
         return points
 
     def squares(steps: Points) -> Float[Array, " points"]:
@@ -249,7 +275,7 @@ def _anew(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
 
     model = eqx.combine(carry.weights, objective.static)
     old, new, key = carry.points.y0s, points.y0s, jr.fold_in(key, 0)
-    y0s = moved(sample, model, objective.args, squares, objective.typical, old, new, key)
+    y0s = moved(problem.sample, model, problem.args, squares, objective.typical, old, new, key)
     return points._replace(y0s=y0s)
 
 
@@ -258,7 +284,7 @@ def _seen(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Any:
     if carry.domain is None:
         return None
     # Earlier, the network may have moved states where no solution goes.
-    late = 2 * epoch >= objective.recipe.epochs
+    late = 2 * epoch >= objective.problem.recipe.epochs
     return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
 
 

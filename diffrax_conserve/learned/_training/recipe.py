@@ -1,22 +1,51 @@
-"""Recipes: the options of a training, the default one and that of the paper."""
+"""Recipes: the options of a training, and the default one."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
 import optax
-from jaxtyping import Array
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._options import check_number
 from ..._tree import tree_size
 from .._networks.pinn import PINN
-from .._networks.trainable import Times
-from .loss import Bounded, Loss, mean_square
-from .schedule import every_iteration, ramped_weight, staged_iterations
-from .second_order import SPRING, LevenbergMarquardt, SecondOrder
-from .times import grid_times, uniform_times
+from .._networks.trainable import LayerSchedule, Times
+from .second_order import SPRING, LevenbergMarquardt, Loss, SecondOrder
 
-Schedule = Callable[[Array, int, int], Array]
+
+def staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
+    """No iteration of the layer at first and one more in each stage, with a weight that rises from
+    0 to 1, so that the trained function is continuous."""
+    position = epoch * (steps + 1) / epochs
+    p = jnp.minimum(steps, epoch * (steps + 1) // epochs)
+    return p, position - jnp.minimum(jnp.floor(position), steps)
+
+
+def complete(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
+    """All iterations of the layer from the first epoch on."""
+    del epochs
+    return jnp.full_like(epoch, steps), jnp.ones_like(epoch, float)
+
+
+def mean(squares: Array, typical: Array) -> Float[Array, ""]:
+    """The mean of the squared norms of the defects."""
+    del typical
+    return jnp.mean(squares)
+
+
+def uniform(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
+    """Independent times."""
+    return jr.uniform(key, (count,), minval=first, maxval=last)
+
+
+def grid(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
+    """Equally spaced times."""
+    del key
+    return jnp.linspace(first, last, count)
 
 
 @final
@@ -38,19 +67,25 @@ class Recipe(eqx.Module):
     optimiser: optax.GradientTransformation | SecondOrder = eqx.field(
         default_factory=lambda: optax.adam(1e-3)
     )
-    iterations: Schedule = staged_iterations
-    weight: Schedule = ramped_weight
-    loss: Loss = mean_square
-    times: Times = uniform_times
+    schedule: Callable[[Array, int, int], LayerSchedule] = staged
+    loss: Loss = mean
+    times: Times = uniform
+    taylor: int = 0
     refresh: int | None = None
     max_gradient_norm: float | None = 1.0
     check_every: int = 50
     retries: int = 0
 
     def __check_init__(self):
-        for name in ("epochs", "points", "check_every"):
-            if not getattr(self, name) >= 1:
-                raise ValueError(f"`{name}` must be at least 1, but is {getattr(self, name)}.")
+        for name, least in (
+            ("epochs", 1.0),
+            ("points", 1.0),
+            ("check_every", 1.0),
+            ("retries", 0.0),
+        ):
+            check_number(name, getattr(self, name), least=least, optional=False)
+        check_number("taylor", self.taylor, least=0.0, optional=False)
+        check_number("refresh", self.refresh, least=1.0)
         check_number("max_gradient_norm", self.max_gradient_norm, above=0.0)
         if not isinstance(self.optimiser, optax.GradientTransformation | SecondOrder):
             raise TypeError(
@@ -58,13 +93,9 @@ class Recipe(eqx.Module):
                 "`optax.adam(1e-3)`, or `diffrax_conserve.learned.SPRING()` or "
                 "`LevenbergMarquardt()`."
             )
-        for name in ("iterations", "weight", "loss", "times"):
+        for name in ("schedule", "loss", "times"):
             if not callable(getattr(self, name)):
                 raise TypeError(f"`{name}` is {getattr(self, name)!r}, not a function.")
-        if self.retries < 0:
-            raise ValueError(f"`retries` must not be negative, but is {self.retries}.")
-        if self.refresh is not None and self.refresh < 1:
-            raise ValueError(f"`refresh` must be at least 1, or `None`, but is {self.refresh}.")
 
 
 Recipe.__init__.__doc__ = r"""**Arguments:**
@@ -73,19 +104,25 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
     [`diffrax_conserve.learned.LevenbergMarquardt`][].
-- `iterations`, `weight`: the projection schedule, for a network with a conservative layer:
-    functions of the epoch (traced), the number of epochs and the number of iterations in the layer,
-    which return $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where
-    $P_k u$ is its output after $k$ iterations. Defaults: `staged_iterations` and `ramped_weight`.
+- `schedule`: for a network with a conservative layer, a function of the epoch (traced), the number
+    of epochs and the number of iterations in the layer, which returns $p$ and $s$. The network is
+    trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations.
+    Default: one more iteration in each of $P + 1$ stages, in each of which $s$ rises from 0 to 1.
 - `loss`: a function from the squared norm of the defect at each point, and the median of $|f|^2$
-    over the initial states, to the loss: `mean_square`, `Bounded()`, or your own.
-- `times`: the distribution of times: `uniform_times`, `grid_times`, or your own function.
+    over the initial states, to the loss. Default: the mean of the squared norms. With `lambda q,
+    typical: jnp.mean(q / (1 + q / typical))` a few states that change too fast for the network do
+    not dominate.
+- `times`: a function from a key, a number of points, the first and the last time to the times of
+    the points. Default: independent and uniform.
+- `taylor`: the order of the Taylor polynomial that `fit` gives to a
+    [`diffrax_conserve.DeepONet`][] without one, if it is trained with a vector field that changes
+    slowly enough in the longest step. Default: 0, none.
 - `refresh`: the number of epochs after which new points are drawn. Default: never.
 - `max_gradient_norm`: longer gradients are scaled to this norm; `None` for no limit. Not used by
     second-order methods, which have a damping instead.
 - `check_every`: the number of epochs after which the model is compared with the best one so far.
-- `retries`: how often a failed window of a `PINN` is cut in halves. Before each cut it is trained
-    again from other weights. With 0 windows are judged but not retrained.
+- `retries`: how often a window of a `PINN` that failed is cut in halves. With 0 windows are judged
+    but not trained again.
 """
 
 
@@ -95,7 +132,7 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     A `PINN` with up to 2,000 weights in each window is trained by
     [`diffrax_conserve.learned.LevenbergMarquardt`][] on a grid of 120 times, in 40 epochs for each
     window. A larger one, and every flow map, is trained by [`diffrax_conserve.learned.SPRING`][] on
-    250 fresh points in each of 2,000 epochs.
+    250 fresh points in each of 1,000 epochs.
 
     **Arguments:**
 
@@ -104,50 +141,13 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
         of the network.
     """
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
-        return Recipe(
-            epochs=40 if epochs is None else epochs,
-            points=120,
-            optimiser=LevenbergMarquardt(),
-            iterations=every_iteration,
-            times=grid_times,
-            check_every=5,
-            retries=4,
-        )
-    return Recipe(
-        epochs=2000 if epochs is None else epochs,
-        points=250,
-        optimiser=SPRING(),
-        iterations=every_iteration,
-        refresh=1,
-        check_every=20,
-    )
+        found = Recipe(epochs or 40, 120, LevenbergMarquardt(), complete, times=grid)
+        # Up to 1,024 windows in the place of one.
+        return dataclasses.replace(found, check_every=5, retries=10)
+    found = Recipe(epochs or 1000, 250, SPRING(), complete, taylor=1)
+    return dataclasses.replace(found, check_every=20, refresh=1)
 
 
 # With this many columns its QR factorisation takes about as long as SPRING's Cholesky
 # factorisation.
 _LEVENBERG_MARQUARDT_MAX = 2000
-
-
-def paper(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -> Recipe:
-    """The recipe of the paper, with changes where it fails as published.
-
-    From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
-    map 5,000 pairs of an initial state and a time and the projection schedule.
-
-    Changed: a PINN is projected from the first epoch on; the weight of the last iteration rises
-    within each stage; the loss of a flow map is bounded at each point; gradients are clipped. "The
-    paper, reproduced" gives the reason and the effect of each.
-
-    **Arguments:**
-
-    - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
-    - `epochs`, `points`: as for [`diffrax_conserve.learned.Recipe`][].
-
-    ??? cite "Reference"
-
-        E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
-    """
-    if isinstance(model, PINN):
-        points = 2000 if points is None else points
-        return Recipe(epochs=epochs, points=points, iterations=every_iteration)
-    return Recipe(epochs=epochs, points=5000 if points is None else points, loss=Bounded())

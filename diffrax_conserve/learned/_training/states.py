@@ -13,6 +13,8 @@ from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_all_finite
+from .._networks.flat import as_states
+from .._networks.trainable import Sampler
 
 
 def reachable_states(
@@ -29,10 +31,9 @@ def reachable_states(
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
     In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
-    such states. Solutions rarely stay in the region from which initial states are drawn: between 73
-    % and 98 % of the trajectories leave the paper's boxes and annuli. Pass the result as `states`
-    to [`diffrax_conserve.DeepONet`][], and through [`diffrax_conserve.learned.FromStates`][] as
-    `sample` to [`diffrax_conserve.fit`][].
+    such states. Between 73 % and 98 % of the trajectories leave the paper's boxes and annuli, from
+    which initial states are drawn. Pass the result as `states` to [`diffrax_conserve.DeepONet`][],
+    and as `sample` to [`diffrax_conserve.fit`][].
 
     **Arguments:**
 
@@ -66,12 +67,11 @@ def reachable_states(
         y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 200))
         key = jax.random.key(1)
         states = dfc.learned.reachable_states(system.vector_field, y0s, 5.0, key=key)
-        deeponet = dfc.DeepONet(states, 0.25, width=8, depth=1, key=jax.random.key(2))
         ```
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0)
+    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
     if keep is not None:
         good = good & eqx.filter_jit(jax.vmap(keep))(ys)
@@ -138,8 +138,8 @@ def _solutions(
     args: Args,
     solver: dfx.AbstractSolver | None,
     dt0: RealScalarLike | None,
-    rtol: float = 1e-6,
-    atol: float = 1e-6,
+    rtol: float,
+    atol: float,
 ) -> tuple[Any, Array]:
     """The states at `ts`, and which solves succeeded."""
     method = dfx.Dopri8() if solver is None else solver
@@ -180,7 +180,7 @@ _MAX_STEPS = 10_000
 
 @final
 class FromStates(eqx.Module):
-    """A sampler for [`diffrax_conserve.fit`][] that draws from given states, with replacement."""
+    """Draws from given states, with replacement."""
 
     states: Y
 
@@ -190,7 +190,6 @@ class FromStates(eqx.Module):
         return jtu.tree_map(lambda x: x[index], self.states)
 
 
-FromStates.__init__.__doc__ = """**Arguments:**
-
-- `states`: the states, stacked along a leading axis.
-"""
+def as_sampler(sample: Any) -> Sampler | None:
+    """A function as it is; for stacked states one that draws from them."""
+    return sample if sample is None or callable(sample) else FromStates(as_states(sample))

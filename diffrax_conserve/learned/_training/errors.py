@@ -20,15 +20,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..._custom_types import Args, Y
+from ..._custom_types import Y
 from ..._tree import unflatten
 from .._networks.flat import flatten, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import Window
-from .._networks.trainable import AbstractTrainable, Points, Sampler
+from .._networks.trainable import AbstractTrainable, Points
 from .._solvers.sweeps import rk4_errors
-from .data import Data
-from .defect import VectorField
+from .objective import Problem
 
 
 class PathErrors(NamedTuple):
@@ -43,8 +42,7 @@ class PathErrors(NamedTuple):
 @eqx.filter_jit
 def path_errors(
     model: AbstractTrainable,
-    vector_field: VectorField,
-    args: Args,
+    problem: Problem,
     paths: Points,
     lengths: Float[Array, " paths"],
     initial: Float[Array, "paths n"],
@@ -71,7 +69,7 @@ def path_errors(
 
     def slope(i: Array, e: Array) -> Array:
         def one(t: Array, y: Array) -> Array:
-            return flatten(vector_field(t, unflatten(y, example), args)).astype(e.dtype)
+            return flatten(problem.field(t, unflatten(y, example))).astype(e.dtype)
 
         return jax.vmap(one)(ts[i], us[i] + e) - rates[i]
 
@@ -80,52 +78,33 @@ def path_errors(
     return PathErrors(largest, end, jnp.max(jnp.abs(us), axis=0))
 
 
-def window_errors(
-    window: Window,
-    vector_field: VectorField,
-    args: Args,
-    initial: Float[Array, " n"],
-    substeps: int,
-) -> PathErrors:
+def window_errors(window: Window, problem: Problem, initial: Float[Array, " n"]) -> PathErrors:
     """The errors of a window, as a single path, that starts with the error `initial`."""
     paths, lengths = Points(window.start[None], None), window.length[None]
-    return path_errors(window, vector_field, args, paths, lengths, initial[None], substeps)
+    return path_errors(window, problem, paths, lengths, initial[None], 2 * problem.recipe.points)
 
 
-def step_error(
-    flow_map: AbstractFlowMap,
-    vector_field: VectorField,
-    args: Args,
-    sample: Sampler,
-    key: PRNGKeyArray,
-) -> float:
-    """The root mean square of the error of the longest step, relative as in `relative`."""
-    y0s = jax.vmap(sample)(jr.split(key, _STATES))
-    start = stacked_vectors(y0s)
-    dtype = jnp.result_type(start, np.float16)
-    lengths = jnp.full(_STATES, flow_map.max_step, dtype)
-    found = path_errors(
-        flow_map,
-        vector_field,
-        args,
-        Points(jnp.zeros(_STATES, dtype), y0s),
-        lengths,
-        jnp.zeros_like(start),
-        _SUBSTEPS,
-    )
+def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArray) -> float:
+    """The root mean square of the error of the longest step, or without a vector field at pairs of
+    the data, relative as in `relative`."""
+    if problem.vector_field is None:
+        assert problem.data is not None
+        pairs = problem.data.draw(16 * _STATES, key)
+        ends = eqx.filter_jit(jax.vmap(flow_map))(pairs.y0s, pairs.hs)
+        y0s, sizes = pairs.y0s, jnp.abs(stacked_vectors(pairs.y1s))
+        errors = stacked_vectors(ends) - stacked_vectors(pairs.y1s)
+    else:
+        assert problem.sample is not None
+        y0s = jax.vmap(problem.sample)(jr.split(key, _STATES))
+        start = stacked_vectors(y0s)
+        dtype = jnp.result_type(start, np.float16)
+        lengths = jnp.full(_STATES, flow_map.max_step, dtype)
+        paths = Points(jnp.zeros(_STATES, dtype), y0s)
+        found = path_errors(flow_map, problem, paths, lengths, jnp.zeros_like(start), _SUBSTEPS)
+        errors, sizes = found.end, found.size
     example = jtu.tree_map(lambda x: x[0], y0s)
-    squares = jnp.mean(jnp.square(found.end), axis=0)
-    return relative(np.sqrt(squares), np.max(np.asarray(found.size), axis=0), example)
-
-
-def data_error(flow_map: AbstractFlowMap, data: Data, key: PRNGKeyArray) -> float:
-    """The root mean square of the error at pairs of the data, relative as in `relative`."""
-    pairs = data.draw(16 * _STATES, key)
-    found = eqx.filter_jit(jax.vmap(flow_map))(pairs.y0s, pairs.hs)
-    difference = stacked_vectors(found) - stacked_vectors(pairs.y1s)
-    example = jtu.tree_map(lambda x: x[0], pairs.y0s)
-    squares = jnp.mean(jnp.square(difference), axis=0)
-    return relative(np.sqrt(squares), np.max(np.abs(stacked_vectors(pairs.y1s)), axis=0), example)
+    squares = jnp.mean(jnp.square(errors), axis=0)
+    return relative(jnp.sqrt(squares), jnp.max(sizes, axis=0), example)
 
 
 # For a flow map: the number of initial states, and of RK4 steps for the error of each.

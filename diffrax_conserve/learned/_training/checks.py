@@ -1,0 +1,247 @@
+"""The checks of the arguments of `fit`, made before compilation."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from ..._balance import refuse_rates
+from ..._custom_types import Args, Manifold, Y
+from ..._manifold import check_manifold, check_outputs
+from ..._options import check_number
+from ..._projection.project import check_state
+from ..._tree import ravel
+from .._networks.deeponet import DeepONet
+from .._networks.domain import Box
+from .._networks.flat import stacked_vectors
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, has_arrays
+from .._networks.pinn import PINN
+from .._networks.taylor import Taylor
+from .._networks.wrappers import OfPairs, PairField, PairSampler
+from .._solvers.checks import check_output
+from .data import as_data
+from .objective import Problem, VectorField
+from .pool import Pool
+from .recipe import Recipe, second_order
+from .state import FitState
+from .states import as_sampler
+
+
+def checked(
+    model: Any,
+    vector_field: VectorField | None,
+    key: PRNGKeyArray,
+    sample: Any,
+    data: Any,
+    args: Args,
+    recipe: Recipe | None,
+    manifold: Manifold | None,
+) -> tuple[Any, Problem]:
+    """The flow map, or the first window of a PINN, and the problem; raises unless the arguments
+    fit."""
+    _check_types(vector_field, key, data, recipe)
+    _check_manifold(model, manifold)
+    recipe = second_order(model) if recipe is None else recipe
+    if isinstance(model, PINN):
+        if sample is not None or data is not None:
+            raise ValueError(
+                "A `PINN` has one initial state, its own: leave `sample` out, and `data`, from "
+                "which only a flow map is trained."
+            )
+        network, problem = model.window(0), Problem(vector_field, args, None, None, recipe)
+    else:
+        network, problem = _of_flow_map(model, vector_field, sample, data, args, recipe)
+    if vector_field is None:
+        return network, problem
+    _check_field(network, problem, jr.split(key)[0])
+    return _with_taylor(network, problem), problem
+
+
+def _of_flow_map(
+    model: Any, field: Any, sample: Any, data: Any, args: Args, recipe: Recipe
+) -> tuple[AbstractFlowMap, Problem]:
+    if not (callable(model) and hasattr(model, "max_step")):
+        raise TypeError(
+            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
+            "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
+        )
+    if sample is not None and field is None:
+        raise TypeError("`sample` is only used with a `vector_field`: leave it out.")
+    sample = as_sampler(sample)
+    flow_map, domain = as_flow_map(model), args_domain_of(model)
+    if not has_arrays(flow_map.weights()):
+        raise ValueError(
+            f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
+            "Train its inner `flow_map` if it has one, and repeat that."
+        )
+    _check_precision(model)
+    if sample is None and data is None:
+        if not isinstance(flow_map.domain, Box):
+            raise ValueError(
+                "A flow map is trained on many initial states, and this one has no `domain` to "
+                "draw them from: pass `sample`, states or a function from a random key to one of "
+                "them, for example `sample=system.sample`."
+            )
+        sample = flow_map.domain.sample
+    if domain is not None:
+        _check_family(sample, args)
+        flow_map = OfPairs(flow_map)
+        field = field if field is None else PairField(field)
+        sample = None if sample is None else PairSampler(sample, domain)
+    found = None if data is None else as_data(data, flow_map)
+    if found is not None and field is not None and sample is None:
+        sample = found.sample
+    if isinstance(sample, Pool):
+        _check_pool(sample, flow_map, args, recipe)
+    return flow_map, Problem(field, args, sample, found, recipe)
+
+
+def _with_taylor(network: Any, problem: Problem) -> Any:
+    """The network, if it is a DeepONet with the Taylor polynomial of the recipe."""
+    family, field = isinstance(network, OfPairs), problem.vector_field
+    inner: Any = network.flow_map if family else network
+    order = problem.recipe.taylor
+    if not (order and isinstance(inner, DeepONet) and inner.taylor is None):
+        return network
+    # The polynomial helps only if the field changes by little in a step, at most of the states.
+    if not inner.max_step * _rate_of_change(problem) <= _SLOW:
+        return network
+    own: Any = field.vector_field if isinstance(field, PairField) else field
+    taylor = Taylor(own, order, args=None if family else problem.args)
+    where = (lambda m: m.flow_map.taylor) if family else (lambda m: m.taylor)
+    return eqx.tree_at(where, network, taylor, is_leaf=lambda x: x is None)
+
+
+# In units of the field itself.
+_SLOW = 3.0
+
+
+@eqx.filter_jit
+def _rate_of_change(problem: Problem) -> Array:
+    """The median of `|f' f| / |f|`."""
+    sample = problem.sample
+    assert sample is not None
+
+    def at(key: PRNGKeyArray) -> Array:
+        y, rate = sample(key), lambda y: problem.field(0.0, y)
+        first, second = jax.jvp(rate, (y,), (rate(y),))
+        before, after = (jnp.linalg.norm(ravel(x)) for x in (first, second))
+        return after / jnp.maximum(before, 1e-30)
+
+    return jnp.median(jax.vmap(at)(jr.split(jr.key(0), 64)))
+
+
+def _check_types(vector_field: Any, key: Any, data: Any, recipe: Any) -> None:
+    if vector_field is None and data is None:
+        raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
+    if vector_field is not None and not callable(vector_field):
+        raise TypeError(f"`vector_field` is {vector_field!r}, not a function `(t, y, args)`.")
+    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
+        raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
+    if recipe is not None and not isinstance(recipe, Recipe):
+        raise TypeError(
+            f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`, such as "
+            "`diffrax_conserve.learned.Recipe(optimiser=optax.adam(1e-3))` or "
+            "`diffrax_conserve.learned.second_order(model)`."
+        )
+
+
+def check_limits(state: Any, target: Any, seconds: Any, progress: Any) -> None:
+    """Raises unless the initial state, the limits and the progress of a training are valid."""
+    if state is not None and not isinstance(state, FitState):
+        raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
+    for name, value in (("target", target), ("seconds", seconds)):
+        check_number(name, value, above=0.0)
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise TypeError(
+            f"`progress` is {progress!r}, but it must be `True`, `False`, or a function."
+        )
+
+
+def _check_manifold(model: Any, manifold: Manifold | None) -> None:
+    if manifold is None:
+        return
+    check_manifold(manifold)
+    refuse_rates(manifold, "a training")
+    if not isinstance(model, PINN):
+        raise ValueError(
+            "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "
+            "network has no windows. To conserve its integrals give the network a `layer`, or "
+            "wrap its solver in `ManifoldProjection`."
+        )
+
+
+def _check_precision(model: Any) -> None:
+    """Raises for a network that is evaluated in a lower precision than its states have."""
+    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
+    networks = filter(is_network, jtu.tree_leaves(model, is_leaf=is_network))
+    if any(network.precision != network.scale.dtype for network in networks):
+        raise TypeError(
+            "The weights of the model are float32, but its states are float64. Train it in double "
+            "precision, and pass the result to `diffrax_conserve.learned.single_precision`."
+        )
+
+
+def _check_family(sample: Any, args: Args) -> None:
+    """Raises unless states and `args` can be drawn for a flow map that takes `args`."""
+    if args is not None:
+        raise ValueError(
+            "`args` were given, but this flow map takes them as inputs: a training draws them "
+            "from its `args_domain`. Leave `args` out."
+        )
+    if isinstance(sample, Pool):
+        raise ValueError(
+            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Draw "
+            "states along solutions by `diffrax_conserve.learned.reachable_states`, and pass them "
+            "as `sample`."
+        )
+
+
+def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
+    """Raises unless the vector field fits the states, is finite, and for a flow map is
+    autonomous."""
+    starts = network.starts(problem.draw(network, key))
+    y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
+    check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
+    now = np.asarray(_rates(problem, starts.ts, starts.y0s))
+    wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
+    if wrong.size:
+        y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
+        raise ValueError(
+            f"`vector_field` is not finite at {wrong.size} of {len(now)} initial states, for "
+            f"example at {y0}. Draw states at which it is."
+        )
+    if isinstance(network, AbstractFlowMap):
+        later = _rates(problem, starts.ts + 0.618 * network.max_step, starts.y0s)
+        change, size = np.max(np.abs(np.asarray(later) - now)), np.max(np.abs(now))
+        if not change <= 1e-3 * size:
+            raise ValueError(
+                f"`vector_field` depends on time: from t = 0 to {0.618 * network.max_step:.3g} it "
+                f"changes by {change:.3g}, where its largest component is {size:.3g}. A flow map "
+                "is for autonomous equations. Make time a component of the state, of rate one."
+            )
+
+
+@eqx.filter_jit
+def _rates(problem: Problem, ts: Array, y0s: Y) -> Array:
+    return stacked_vectors(jax.vmap(problem.field)(ts, y0s))
+
+
+def _check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:
+    """Raises unless a pool can grow and its states fit the model and the manifold."""
+    if recipe.refresh is None or recipe.refresh >= recipe.epochs:
+        raise ValueError(
+            "A `Pool` grows when new points are drawn, but with "
+            f"`refresh={recipe.refresh}` in a recipe of {recipe.epochs} epochs that is never. "
+            "Write for example `recipe=dataclasses.replace(recipe, refresh=1)`."
+        )
+    y0 = jtu.tree_map(jnp.asarray, pool.sample(jr.key(0)))
+    check_state(y0, "a `Pool`")
+    check_output(flow_map, (y0, float(flow_map.max_step)), y0, "model")
+    if pool.manifold is not None:
+        check_outputs(pool.manifold, 0.0, y0, args)

@@ -1,0 +1,262 @@
+"""The loop of a training: its epochs, its clock, what it shows, and its log."""
+
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from .objective import Carry, Objective, Problem, advance, start
+from .state import FitState, read_checkpoint, write_checkpoint
+
+# Called with the number of epochs done, the total number, the last loss and the best criterion.
+Progress = Callable[[int, int, float, float], None]
+
+
+@final
+class FitLog(eqx.Module):
+    """The record of a training.
+
+    **Attributes:**
+
+    - `error`: the estimated error of the solution, for each leaf of the state relative to its
+        largest component. For a `PINN` it is the largest error in the whole interval; for a flow
+        map the root mean square error of its longest step, over states from `sample`. The estimate
+        solves the differential equation of the error, driven by the defect. Infinity if no estimate
+        is possible or a window was not trained.
+    - `errors`: for each window of a `PINN`, the error that this window alone causes.
+    - `losses`: the training loss at each epoch, before its update.
+    - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
+        the compared values: the loss on the first collocation points with all iterations of the
+        conservative layer, so that epochs with different numbers of iterations are comparable. With
+        a [`diffrax_conserve.learned.Pool`][] it is the loss on its states for the next epoch, the
+        same states for both models.
+    - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
+        those of the worst.
+    - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
+        best model so far, with a new state of the optimiser.
+    - `ended`: the reason why the training ended: `"epochs"`, `"target"`, `"seconds"` or
+        `"interrupt"`.
+    - `seconds`, `compile_seconds`: the wall times of the training, and of all that comes before its
+        first epoch, which is mostly compilation.
+    - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
+    """
+
+    error: float
+    errors: np.ndarray
+    losses: np.ndarray
+    checked: np.ndarray
+    criteria: np.ndarray
+    best_epoch: int
+    best: float
+    skipped: int
+    ended: str
+    seconds: float
+    compile_seconds: float
+    state: Any
+
+
+@final
+@dataclasses.dataclass
+class Loop:
+    """Trains several networks of the same shape in turn, with one compilation."""
+
+    problem: Problem
+    key: PRNGKeyArray
+    target: float | None
+    seconds: float
+    progress: bool | Progress
+    checkpoint: Path | None
+    mark: str
+    created: float  # the beginning of `fit`
+    begun: float | None = None  # the end of the compilation
+    compiled: Any = None
+    pace: float = 0.0  # seconds for an epoch; 0 if that is not known
+    first: int = 0  # the number of epochs before this call of `fit`
+    saved: float = -math.inf  # time of the last save; `saving` is its duration
+    saving: float = 0.0
+
+    def begin(self, networks: tuple[Any, ...], given: FitState | None) -> FitState:
+        """The first state of the training: the given one, that of a checkpoint, or a new one."""
+        _, carry = start(self.problem, networks[0], self.key)
+        first = FitState(networks, (math.inf,) * len(networks), carry)
+        if given is None and self.checkpoint is not None and self.checkpoint.exists():
+            given = read_checkpoint(self.checkpoint, first, self.mark)
+            if given.finished:
+                return given
+        return first if given is None else given.continued(self.problem.recipe.epochs, first)
+
+    def start(self, state: FitState) -> tuple[Objective, FitState]:
+        """The constants of the training of the present network, and its first state."""
+        model, key = state.networks[state.present], self.network_key(state)
+        objective, carry = start(self.problem, model, key)
+        return objective, dataclasses.replace(state, carry=carry) if state.done < 0 else state
+
+    def network_key(self, state: FitState) -> PRNGKeyArray:
+        return self.key if state.trained == 0 else jr.fold_in(self.key, state.trained)
+
+    def train(
+        self,
+        objective: Objective,
+        state: FitState,
+        close_enough: Callable[[Carry], bool],
+        estimate: Callable[[Any], float],
+    ) -> tuple[FitState, Carry, str]:
+        """Trains one network to its last epoch, or until the training ends earlier.
+
+        Returns the state to go on from, and the carry with the best model. They differ if the time
+        is over between two comparisons: a training that goes on must not make one more.
+        """
+        recipe, ended = self.problem.recipe, ""
+        self._compile(objective, state, estimate)
+        try:
+            while not ended:
+                # At first the model is only evaluated.
+                following = (state.done // recipe.check_every + 1) * recipe.check_every
+                goal = min(following, recipe.epochs) if state.done >= 0 else 0
+                stop = self._affordable(max(state.done, 0), goal)
+                if stop < goal and stop == state.done:
+                    ended = "seconds"
+                    break
+                state = self._advanced(objective, state, stop, stop == goal)
+                if stop < goal:
+                    continue
+                self._report(state, lambda s=state: estimate(objective.best(s.carry)))
+                if close_enough(state.carry):
+                    ended = "target"
+                elif state.done >= recipe.epochs:
+                    ended = "epochs"
+                else:
+                    self.save(state)
+        except KeyboardInterrupt:
+            if not state.checked.size:
+                raise
+            ended = "interrupt"
+        _refuse_nothing(state)
+        shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
+        return state, shown.carry, ended
+
+    def _affordable(self, done: int, goal: int) -> int:
+        """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
+        if math.isinf(self.seconds) or goal == 0:
+            return goal
+        left = self.seconds - self.elapsed
+        if left <= self.pace / 2:
+            return done
+        # Half of the time, because the pace may change.
+        return min(goal, done + max(1, int(left / (2 * self.pace)) if self.pace else 1))
+
+    def _advanced(
+        self, objective: Objective, state: FitState, stop: int, compare: bool
+    ) -> FitState:
+        begun, done = time.perf_counter(), max(state.done, 0)
+        numbers = jnp.asarray(done), jnp.asarray(stop), jnp.asarray(compare)
+        carry, criterion = self.compiled(objective, state.carry, *numbers)
+        criterion = float(criterion)  # waits for it
+        if stop > done:
+            self.pace = (time.perf_counter() - begun) / (stop - done)
+        state = dataclasses.replace(state, carry=carry, done=stop)
+        return state.compared(criterion) if compare else state
+
+    @property
+    def elapsed(self) -> float:
+        """The time since the end of the compilation."""
+        return 0.0 if self.begun is None else time.perf_counter() - self.begun
+
+    @property
+    def compile_seconds(self) -> float:
+        return (time.perf_counter() if self.begun is None else self.begun) - self.created
+
+    def save(self, state: FitState, always: bool = False) -> None:
+        """Writes a checkpoint, unless the time since the last one is short compared with its
+        duration."""
+        begun = time.perf_counter()
+        if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
+            return
+        write_checkpoint(self.checkpoint, state, self.mark)
+        self.saved = time.perf_counter()
+        self.saving = self.saved - begun
+
+    def log(
+        self,
+        state: FitState,
+        carry: Carry,
+        ended: str,
+        error: float,
+        errors: tuple[float, ...] = (),
+    ) -> FitLog:
+        """The log of a training that ends with `state` and `carry`."""
+        found = dataclasses.replace(state, carry=carry).closed()
+        return FitLog(
+            error=error,
+            errors=np.asarray(errors),
+            losses=found.losses,
+            checked=found.checked,
+            criteria=found.criteria,
+            best_epoch=found.worst_epoch,
+            best=found.worst,
+            skipped=found.skipped,
+            ended=ended,
+            seconds=self.elapsed,
+            compile_seconds=self.compile_seconds,
+            state=state,
+        )
+
+    def _compile(
+        self, objective: Objective, state: FitState, estimate: Callable[[Any], float]
+    ) -> None:
+        if self.begun is not None:
+            return
+        numbers = jnp.asarray(0), jnp.asarray(0), jnp.asarray(False)
+        compilable = eqx.filter_jit(advance)
+        lowered = compilable.lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
+        self.compiled = lowered.compile()
+        estimate(objective.best(state.carry))
+        self.first = state.losses.size + max(state.done, 0)
+        self.begun = time.perf_counter()
+
+    def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
+        """Calls the function `progress`, or prints a line."""
+        if self.progress is False:
+            return
+        rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
+        done, total = state.losses.size + state.done, state.losses.size + rest
+        # Before the first epoch there is no loss yet.
+        loss = float(state.carry.losses[state.done - 1]) if state.done else state.criteria[-1]
+        best = float(state.carry.best)
+        if self.progress is not True:
+            self.progress(done, total, float(loss), best)
+            return
+        # On a terminal one line is overwritten; in a file there is one line for each tenth of the
+        # epochs.
+        terminal = sys.stderr.isatty()
+        if not (terminal or done == total or done % max(total // 10, 1) == 0):
+            return
+        parts = [f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"]
+        if done and (error := estimate()):
+            parts.append(f"estimated error {error:.1e}")
+        parts.append(f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile")
+        if done > self.first:
+            left = self.elapsed / (done - self.first) * (total - done)
+            parts.append(f"{min(left, self.seconds - self.elapsed):.0f} s left")
+        ending = "\r" if terminal and done < total else "\n"
+        print(", ".join(parts), end=ending, file=sys.stderr, flush=True)
+
+
+def _refuse_nothing(state: FitState) -> None:
+    """Raises if every update was skipped."""
+    skipped = int(state.carry.skipped)
+    if skipped and skipped == state.done:
+        raise FloatingPointError(
+            f"None of the {skipped} updates was finite, so nothing was learned, although the "
+            "vector field is finite at the initial states. It may not be finite where the network "
+            "leads, or the updates are too long: lower the learning rate."
+        )

@@ -1,0 +1,96 @@
+"""Without options `fit` does what the guide advises."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..learned import EAST, LORENZ, flow_map, oscillator, states
+
+KEY = jr.key(5)
+
+
+def stiff(t, y, args):
+    return -1e4 * y
+
+
+def recipe(network, **options):
+    found = dfc.learned.second_order(network, epochs=8)
+    return dataclasses.replace(found, **(dict(points=10, check_every=4) | options))
+
+
+def trained(field=LORENZ.vector_field, **options):
+    network = flow_map()
+    return dfc.fit(network, field, key=KEY, recipe=recipe(network, **options))[0]
+
+
+def test_a_flow_map_gets_the_slope_of_the_field():
+    network = trained()
+    assert isinstance(network.core, dfc.learned.Concatenated)
+    y = states(1)[0]
+    slope = LORENZ.vector_field(0.0, y, None)
+    np.testing.assert_allclose(network.slope(y), slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("field", "options"), [(stiff, dict()), (LORENZ.vector_field, dict(taylor=0))]
+)
+def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
+    assert trained(field, **options).taylor is None
+
+
+def test_the_paper_is_one_name():
+    paper = dfc.learned.paper
+    network = paper.deeponet(states(), 0.25, key=KEY)
+    assert isinstance(network.core, dfc.learned.Product)
+    assert {net.weights[0].shape[-1] for net in (network.core.branch, network.core.trunk)} == {40}
+    assert paper.recipe(network).taylor == 0
+    pinn = paper.pinn(EAST, 0.0, 1.0, key=KEY)
+    assert (pinn.net.weights[0].shape[-1], len(pinn.net.weights), pinn.windows) == (40, 5, 1)
+
+
+@pytest.mark.slow
+def test_a_pinn_of_several_turns_needs_no_options():
+    pinn, log = dfc.fit(dfc.PINN(EAST, 0.0, 12.0, key=KEY), oscillator, key=jr.key(6))
+    ts = jnp.linspace(0, 12, 300)
+    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
+    error = float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
+    assert error < 1e-7
+    np.testing.assert_allclose(log.error, error, rtol=0.1)
+    assert pinn.windows > 1
+
+
+def test_a_limited_time_is_kept():
+    """Though a comparison is due only every 1,000 epochs."""
+    network = flow_map()
+    chosen = recipe(network, epochs=3000, check_every=1000)
+    options = dict(key=KEY, sample=LORENZ.sample, recipe=chosen)
+    _, log = dfc.fit(network, LORENZ.vector_field, **options, seconds=0.2)
+    assert log.ended == "seconds"
+    assert log.seconds < 2  # generous, because tests share their processor
+    assert np.any(np.isfinite(log.losses))
+    assert log.best < log.criteria[0]
+
+
+def test_it_goes_on_bit_for_bit_from_between_two_comparisons():
+    network = flow_map()
+    chosen = recipe(network, epochs=400, check_every=100)
+    options = dict(key=KEY, sample=LORENZ.sample, recipe=chosen)
+    whole, log = dfc.fit(network, LORENZ.vector_field, **options)
+    state, seconds = None, 0.02
+    for _ in range(100):
+        model, stopped = dfc.fit(
+            network, LORENZ.vector_field, **options, state=state, seconds=seconds
+        )
+        if stopped.ended != "seconds":
+            break
+        state, seconds = stopped.state, 2 * seconds
+    assert eqx.tree_equal(model, whole)
+    np.testing.assert_array_equal(stopped.losses, log.losses)
+    np.testing.assert_array_equal(stopped.criteria, log.criteria)
