@@ -5,33 +5,37 @@ import numpy as np
 GAP = 11.0  # points between two names, at least
 
 
-def label(ax, room=0.0):
+def label(ax, places=None):
     """Writes the name of each curve at its last point, in its colour, names apart from each other.
 
-    `room` is what a name may take beside the curves, as a fraction of the axis.
+    `places` has names that stand elsewhere: the index of their point, and "left" or "right" of it.
     """
+    places = places or {}
     lines = [line for line in ax.lines if not line.get_label().startswith("_")]
-    if room:
-        left, right = ax.transAxes.transform([(0, 0), (1 + room, 0)])[:, 0]
-        start, end = ax.transData.inverted().transform([(left, 0), (right, 0)])[:, 0]
-        ax.set_xlim(start, end)
-    ends = [_last(ax, line) for line in lines]
-    heights = _apart([end[1] for end in ends], GAP * ax.figure.dpi / 72)
-    for line, (x, y), height in zip(lines, ends, heights, strict=True):
+    given = [places.get(line.get_label(), (-1, "right")) for line in lines]
+    points = [_point(ax, line, index) for line, (index, _) in zip(lines, given, strict=True)]
+    heights = [point[1] for point in points]
+    for side in ("left", "right"):
+        here = [i for i, (_, beside) in enumerate(given) if beside == side]
+        moved = _apart([heights[i] for i in here], GAP * ax.figure.dpi / 72)
+        for i, height in zip(here, moved, strict=True):
+            heights[i] = height
+    for line, (x, y), height, (_, side) in zip(lines, points, heights, given, strict=True):
         ax.annotate(
             line.get_label(),
             ax.transData.inverted().transform((x, y)),
-            xytext=(5, (height - y) * 72 / ax.figure.dpi),
+            xytext=(5 if side == "right" else -5, (height - y) * 72 / ax.figure.dpi),
             textcoords="offset points",
+            ha="left" if side == "right" else "right",
             va="center",
             color=line.get_color(),
             annotation_clip=False,
         )
 
 
-def _last(ax, line):
+def _point(ax, line, index):
     points = ax.transData.transform(np.stack(line.get_data(), axis=1).astype(float))
-    return points[np.all(np.isfinite(points), axis=1)][-1]
+    return points[np.all(np.isfinite(points), axis=1)][index]
 
 
 def _apart(heights, gap):

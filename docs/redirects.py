@@ -52,9 +52,9 @@ def on_post_build(config):
         path, _, anchor = new.partition("#")
         target, here = site / path / "index.html", site / old / "index.html"
         if not target.exists() or here.exists():
-            raise PluginError(f"docs/redirects.py: {old} -> {new}: no such page, or it still exists")
+            raise PluginError(f"{__file__}: {old} -> {new}: no such page, or the old one exists")
         if anchor and f'id="{anchor}"' not in target.read_text(encoding="utf-8"):
-            raise PluginError(f"docs/redirects.py: {new}: the page has no such heading")
+            raise PluginError(f"{__file__}: {new}: the page has no such heading")
         here.parent.mkdir(parents=True, exist_ok=True)
         up = "../" * (old.count("/") + 1)
         here.write_text(PAGE.format(address=f"{up}{new}"), encoding="utf-8")

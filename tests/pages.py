@@ -3,8 +3,8 @@
 The ```` ```python ```` blocks of one page, or of one docstring, run in order in one namespace, in a
 new folder and in the state of a new interpreter: float32 unless the page enables float64. What a
 block prints is shown in a ```` ```text ```` block right below it, and the figures that it saves are
-in `docs/images/pages`. A block in a comment `<!-- check ... -->` runs too, and is not shown: asserts,
-and the code of figures.
+in `docs/images/pages`. A block in a comment `<!-- check ... -->` runs too, and is not shown:
+asserts, and the code of figures.
 
 `python -m tests.pages FILE ...` runs the pages named and writes both anew.
 """
@@ -28,11 +28,7 @@ PACKAGE = ROOT / "diffrax_conserve"
 # `docs/appendix` is not on the site, and has no code.
 PAGES = [
     ROOT / "README.md",
-    *(
-        file
-        for file in sorted((ROOT / "docs").rglob("*.md"))
-        if file.parent.name != "appendix"
-    ),
+    *(file for file in sorted((ROOT / "docs").rglob("*.md")) if file.parent.name != "appendix"),
 ]
 CHECK = re.compile(r"^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)
 FIGURES = ROOT / "docs" / "images" / "pages"

@@ -13,6 +13,7 @@ HEAD = (
     "<!doctype html><meta name=viewport content='width=device-width'><style>body{margin:0}</style>"
 )
 FINE = f"{HEAD}<p>text</p><pre style='overflow-x: auto'>{'wide ' * 400}</pre>"
+CODE = f"{HEAD}<pre><code style='display: block; overflow: auto'>{'wide ' * 400}</code></pre>"
 
 
 def errors(found):
@@ -23,6 +24,8 @@ def errors(found):
 def test_what_is_wrong_with_a_page_is_found(tmp_path):
     (tmp_path / "fine.html").write_text(FINE)
     (tmp_path / "wide.html").write_text(f"{HEAD}<div style='width: 800px'>wide</div>")
+    (tmp_path / "code.html").write_text(CODE)
+    (tmp_path / "old.html").write_text('<meta http-equiv="refresh"><img src="nowhere.png">')
     (tmp_path / "picture.html").write_text(f"{HEAD}<img src='nowhere.png'>")
     dark = "matchMedia('(prefers-color-scheme: dark)').matches"
     (tmp_path / "script.html").write_text(f"{HEAD}<script>if ({dark}) throw Error('no')</script>")
@@ -30,7 +33,9 @@ def test_what_is_wrong_with_a_page_is_found(tmp_path):
     assert not [line for line in found if line.startswith("fine")]
     assert "wide.html at 390 pixels: 800 pixels wide (dark)" in found
     assert "wide.html at 390 pixels: 800 pixels wide (light)" in found
-    assert not [line for line in found if "1280" in line]
+    assert not [line for line in found if "1280" in line and not line.startswith("code")]
+    assert "code.html at 1280 pixels: cut off: wide" in " ".join(found)
+    assert not [line for line in found if line.startswith("old")]
     assert "picture.html: no picture nowhere.png (light)" in found
     thrown = errors(found)
     for _ in range(3):  # Chromium may end before it has written its log
