@@ -76,6 +76,19 @@ def test_tables_fit_on_a_screen(file):
     assert [head for head in heads if head.count("|") - 1 > 7] == []
 
 
+def test_what_only_runs_is_not_on_the_site():
+    strip = runpy.run_path(str(ROOT / "docs" / "hooks.py"))["on_page_markdown"]
+    text = "before\n\n<!-- check\n```python\nassert x\n```\n-->\n\nafter\n"
+    assert [block.code for block in blocks(text, 1, "python")] == ["assert x\n"]
+    assert strip(text) == "before\n\nafter\n"
+
+
+def test_names_in_a_figure_are_apart():
+    apart = runpy.run_path(str(ROOT / "docs" / "drawing.py"))["_apart"]
+    moved = apart([3.0, 50.0, 1.0, 2.0], 10.0)
+    assert list(moved) == [12.0, 50.0, -8.0, 2.0]
+
+
 def test_figures_are_shown():
     """Every figure in `docs/images` is on a page, and every page shows figures that there are."""
     files = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
