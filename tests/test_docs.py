@@ -76,6 +76,31 @@ def test_tables_fit_on_a_screen(file):
     assert [head for head in heads if head.count("|") - 1 > 7] == []
 
 
+def names(code, context):
+    return {
+        node.id
+        for block in code
+        for node in ast.walk(ast.parse(block.code))
+        if isinstance(node, ast.Name) and isinstance(node.ctx, context)
+    }
+
+
+@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(ROOT).as_posix())
+def test_what_is_shown_needs_nothing_that_is_not(file):
+    all_blocks = blocks(file.read_text(encoding="utf-8"), 1, "python")
+    visible = blocks(shown(file), 1, "python")
+    codes = {block.code for block in visible}
+    hidden = [block for block in all_blocks if block.code not in codes]
+    only_there = names(hidden, ast.Store) - names(visible, ast.Store)
+    defined = {
+        node.name
+        for block in hidden
+        for node in ast.walk(ast.parse(block.code))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    }
+    assert not (only_there | defined) & names(visible, ast.Load)
+
+
 def test_what_only_runs_is_not_on_the_site():
     strip = runpy.run_path(str(ROOT / "docs" / "hooks.py"))["on_page_markdown"]
     text = "before\n\n<!-- check\n```python\nassert x\n```\n-->\n\nafter\n"
