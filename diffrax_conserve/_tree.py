@@ -44,51 +44,9 @@ def tree_sub(a: Y, b: Y) -> Y:
     return jtu.tree_map(lambda x, y: x - y, a, b)
 
 
-def tree_cancel(a: Y, b: Y) -> Y:
-    """`a - b`, with differences of at most two units of roundoff of `a` set to zero.
-
-    An iteration then reaches a component whose true value is zero exactly; otherwise its roundoff
-    would never be small relative to the component itself.
-    """
-
-    def subtract(x: Array, y: Array) -> Array:
-        rest = x - y
-        roundoff = 2 * float(jnp.finfo(x.dtype).eps) * jnp.abs(x)
-        return jnp.where(jnp.abs(rest) <= roundoff, jnp.zeros_like(rest), rest)
-
-    return jtu.tree_map(subtract, a, b)
-
-
 def tree_scale(factor: RealScalarLike, a: Y) -> Y:
     """`factor * a`, in the dtypes of `a`."""
     return jtu.tree_map(lambda x: jnp.asarray(factor, x.dtype) * x, a)
-
-
-def tree_mul(a: Y, b: Y) -> Y:
-    """The elementwise product, in the dtypes of `a`."""
-    return jtu.tree_map(lambda x, y: x * y.astype(x.dtype), a, b)
-
-
-def tree_dot(a: Y, b: Y, dtype: jnp.dtype) -> Real[Array, ""]:
-    """The Euclidean inner product `Σ a b` as a scalar of `dtype`.
-
-    Written as an elementwise product and a sum, not as `jnp.vdot`: XLA fuses it into the
-    surrounding code, and an accelerator never computes it in reduced precision.
-    """
-    products = jtu.tree_map(lambda x, y: jnp.sum(x * y).astype(dtype), a, b)
-    return ft.reduce(jnp.add, jtu.tree_leaves(products))
-
-
-def tree_norm(a: Y) -> Real[Array, ""]:
-    """The Euclidean norm. Below float64 the squares can overflow, so they are scaled."""
-    a = real_view(a)
-    dtype = working_dtype(a)
-    if dtype == jnp.float64:
-        return jnp.sqrt(tree_dot(a, a, dtype))
-    largest = tree_max(a)
-    scale = jnp.where(largest > 0, largest, 1)
-    unit = jtu.tree_map(lambda x: x / scale.astype(x.dtype), a)
-    return scale * jnp.sqrt(tree_dot(unit, unit, dtype))
 
 
 def tree_max(a: Y) -> Real[Array, ""]:
@@ -98,13 +56,6 @@ def tree_max(a: Y) -> Real[Array, ""]:
         jnp.maximum,
         [jnp.max(jnp.abs(x), initial=0).astype(dtype) for x in jtu.tree_leaves(a)],
     )
-
-
-def tree_uniform(y: Y) -> Y:
-    """`y` with every component as large as the largest, which gives a term a size where a component
-    is zero."""
-    largest = tree_max(y)
-    return jtu.tree_map(lambda x: jnp.full_like(x, largest.astype(x.dtype)), y)
 
 
 def tree_all_finite(a: PyTree[Array]) -> Array:

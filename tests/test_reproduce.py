@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.__main__ import main
 from diffrax_conserve._replace_file import replace_file
-from diffrax_conserve.reproduce import _compare, _job
+from diffrax_conserve.reproduce import _compare, _job, main
 
 FIGURES = ("trajectory", "drift", "state_error")
 PAPER = dfc.systems.names()[:5]
@@ -335,7 +334,7 @@ def test_an_interpreter_without_matplotlib(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
 
     code = (
-        "from diffrax_conserve.__main__ import main\n"
+        "from diffrax_conserve.reproduce import main\n"
         "assert main(['list']) == 0\n"
         "raise SystemExit(main(['reproduce', 'kepler', '--t1', '1']))"
     )

@@ -83,8 +83,7 @@ def test_the_manifolds_of_the_catalogue_and_their_gradients(name):
     system = dfc.systems.get(name)
     y0 = ravel(system.y0)
     values = ravel(conserved_values(system.manifold, 0.0, system.y0, None))
-    zero = jnp.zeros_like(values)
-    equations = equations_of(system.manifold, values, zero, 0.0, system.y0, None)
+    equations = equations_of(system.manifold, values, 0.0, system.y0, None)
     converted = in_scalars(equations.linearise, y0)
     if y0.size > _scalars.MAX_SCALARS or name in TOO_LARGE:
         assert converted is None

@@ -240,7 +240,7 @@ def _relative_sizes(
     numbers = ravel(values).astype(vector.dtype)
 
     def equations(t: Array) -> Equations:
-        return equations_of(entry, numbers, jnp.zeros_like(numbers), t, y, args)
+        return equations_of(entry, numbers, t, y, args)
 
     t = jnp.asarray(t, vector.dtype)
     now, in_time = jax.jvp(lambda t: equations(t).residual(vector), (t,), (jnp.ones_like(t),))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
-from .implicit import project_along
+from .loop import project_along
 
 
 @final

@@ -82,14 +82,10 @@ class Equations(eqx.Module):
         limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        small = (jnp.abs(g) <= 0.25 * limit) | self.is_noise(g)
+        small = (jnp.abs(g) <= 0.25 * limit) | (jnp.abs(g) <= self._relative(self.sampled))
         reached = jnp.where(small, 2, 1)
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
-
-    def is_noise(self, g: Float[Array, " m"]) -> Bool[Array, " m"]:
-        """Which residuals are within measured roundoff."""
-        return jnp.abs(g) <= self._relative(self.sampled)
 
     def _relative(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -117,7 +113,7 @@ def measure(
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
     vector = ravel(y)
     numbers = ravel(values).astype(vector.dtype)
-    equations = equations_of(manifold, numbers, jnp.zeros_like(numbers), t, y, args)
+    equations = equations_of(manifold, numbers, t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
@@ -126,13 +122,14 @@ def measure(
 def equations_of(
     manifold: Manifold,
     values: Float[Array, " m"],
-    sampled: Float[Array, " m"],
     t: RealScalarLike,
     like: Any,
     args: Args,
+    sampled: Float[Array, " m"] | None = None,
 ) -> Equations:
     """The equations of a manifold with the conserved `values`, for states like `like`; `sampled` is
     the measured part of the scales."""
+    sampled = jnp.zeros_like(values) if sampled is None else sampled
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):

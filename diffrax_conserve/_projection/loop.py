@@ -1,4 +1,5 @@
-"""The one loop of the projections: Newton's method for the multipliers.
+"""The one loop of the projections, Newton's method for the multipliers, and its derivative by the
+implicit function theorem, which is exact for the returned state.
 
 A single trajectory is fastest in arrays. In a batch of small systems the same iteration is written
 out in scalars; in every batch, lanes iterate together until none goes on.
@@ -29,6 +30,10 @@ from .gram import (
 )
 from .scalars import components, in_scalars, joined
 
+# Gradients count as nearly parallel if the sine of their angle is below the cube root of roundoff,
+# or if it is below `_SMALL_ANGLE` and the correction, relative to the state and divided by the
+# sine, is above `_SHORT_CORRECTION`. Whether they are so everywhere is tested at this distance.
+_SMALL_ANGLE, _SHORT_CORRECTION, _OFFSET = 1e-2, 1e-5, 1e-3
 # The largest state of which a batch is written out in scalars.
 _UNKNOWNS_MAX = 8
 # The bisections of a step where it must be shortened.
@@ -102,34 +107,25 @@ def _solve(
         like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate)
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
-    def first(y: Array) -> tuple[Array, _Kept]:
-        g, jacobian = equations.linearise(y)
-        kept = keep(y, g, jacobian)
-        g = jnp.where(equations.is_noise(g), 0, g)
-        return _corrected(equations, kept, y, g, jacobian), kept
+    def start(y: Array) -> _Kept:
+        return keep(y, *equations.linearise(y))
 
-    def further(kept: _Kept, y: Array) -> Array:
-        g, jacobian = equations.linearise(y)
-        g = jnp.where(equations.is_noise(g), 0, g)
-        return _corrected(equations, kept, y, g, jacobian)
-
-    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array]:
+    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
         return _tested(equations, kept, y, left, *equations.linearise(y))
 
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
     count = jnp.asarray(0)
-    if small and own and max_steps > 1:
-        fns: tuple[Any, ...] = tuple(
-            in_scalars(fn, *given)
-            for fn, *given in ((first, y), (further, kept, y), (test, kept, y, left))
-        )
-        if None not in fns:
+    if small and own:
+        written = in_scalars(start, y), in_scalars(test, kept, y, left)
+        if written[0] is not None and written[1] is not None:
             # From here on arrays are tuples of scalars. Most steps of an integrator need two
-            # iterations, so these are not preceded by a test.
-            first, further, test = fns
-            y, kept = first(components(y))
-            y, own = further(kept, y), False
-            left, count = left - 2, count + 2
+            # iterations, which need no loop.
+            start, test = written
+            y, own = components(y), False
+            kept = start(y)
+            for _ in range(2):
+                y, left, more = test(kept, y, left)
+                count = count + more
 
     def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
         y, left, index, count, kept = carry
@@ -137,10 +133,10 @@ def _solve(
             g, jacobian = equations.linearise(y)
             is_first = index == 0 if kept.factors is not None else left > max_steps
             kept = _if_first(is_first, lambda: keep(y, g, jacobian), kept)
-            y, left = _tested(equations, kept, y, left, g, jacobian)
+            y, left, more = _tested(equations, kept, y, left, g, jacobian)
         else:
-            y, left = test(kept, y, left)
-        return y, left, index + 1, count + (left > 0).astype(int), kept
+            y, left, more = test(kept, y, left)
+        return y, left, index + 1, count + more, kept
 
     def unfinished(carry: tuple[Any, Array, Array, Array, Any]) -> Array:
         return any_lane(carry[1] > 0)
@@ -171,16 +167,17 @@ def _if_first(first: Bool[Array, ""], new: Callable[[], _Kept], kept: _Kept) -> 
 
 def _tested(
     equations: Equations, kept: _Kept, y: Array, left: Array, g: Array, jacobian: Array
-) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """The verdict at the state itself, and the next state. `left` counts the iterations that are
-    left; 0 is success, -1 failure."""
+) -> tuple[Float[Array, " n"], Int[Array, ""], Int[Array, ""]]:
+    """The verdict at the state itself, the next state, and whether that is another one. `left`
+    counts the iterations that are left; 0 is success, -1 failure."""
     level = equations.verdict(g, jacobian, y)
     # Within the tolerance at most two more.
     less = jnp.where(level > 0, jnp.minimum(left - 1, 2), left - 1)
     last = jnp.where(level > 0, 0, -1)
     now = jnp.where(level == 2, 0, jnp.where(left == 1, last, less))
     left = jnp.where(left > 0, now, left).astype(left.dtype)
-    return jnp.where(left > 0, _corrected(equations, kept, y, g, jacobian), y), left
+    more = left > 0
+    return jnp.where(more, _corrected(equations, kept, y, g, jacobian), y), left, more.astype(int)
 
 
 def _corrected(
@@ -232,3 +229,97 @@ def _length(
     last = jnp.sum(multiplier * equations.residual(y - change))
     first = jnp.sum(multiplier * equations.residual(y))
     return jnp.where(within_bounds | (last >= -1e-3 * first), one, end)
+
+
+@eqx.filter_custom_jvp
+def project_along(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None,
+    *,
+    max_steps: int,
+) -> Solved:
+    """`loop.solve` with the directions frozen, and its derivative."""
+    return solve(equations, candidate, directions=directions, max_steps=max_steps)
+
+
+@project_along.def_jvp
+def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
+    """Let `ẏ` and `ġ` be the tangents of `y = ŷ + Dᵀ λ` and of its residual at constant `λ`. Then
+    `λ̇ = -(G(y) Dᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + Dᵀ λ̇`."""
+    equations, candidate, directions = primals
+    y, ok, count = project_along(*primals, max_steps=max_steps)
+
+    if directions is None:
+        _, dual = equations.linearise(candidate)
+        rows = equations.weighted(dual)
+    else:
+        dual = rows = directions
+    sizes = row_sizes(dual)
+    dual, rows = dual / sizes[:, None], rows / sizes[:, None]
+    along = dual @ (y - candidate)
+    multiplier = gram_solve(gram_matrix(dual, rows), along) / sizes
+
+    def displaced(equations: Equations, candidate: Array, directions: Array | None) -> Any:
+        if directions is not None:
+            moved = combined(multiplier, directions)
+        else:  # by one reverse pass, not row by row
+            _, vjp = jax.vjp(equations.residual, candidate)
+            moved = equations.weighted(vjp(multiplier)[0][None])[0]
+        return candidate + moved, equations.residual(candidate + moved)
+
+    t_y, t_g = (
+        jnp.zeros_like(x) if t is None else t
+        for x, t in zip(
+            (y, multiplier), eqx.filter_jvp(displaced, primals, tangents)[1], strict=True
+        )
+    )
+    _, jacobian = equations.linearise(y)
+    heights = row_sizes(jacobian)
+    gram = gram_matrix(jacobian / heights[:, None], rows)
+    t_y = t_y - combined(gram_solve(gram, t_g / heights), rows)
+    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
+    factor = jnp.where(ok, certain(equations, candidate, y, jacobian, directions), 1)
+    return (y, ok, count), (lax.stop_gradient(factor) * t_y, None, None)
+
+
+def certain(
+    equations: Equations,
+    candidate: Array,
+    y: Array,
+    jacobian: Array,
+    directions: Array | None = None,
+) -> Float[Array, ""]:
+    """One if the derivative of the projected state `y` is well determined, otherwise NaN.
+
+    Where gradients are nearly parallel, multipliers are large and cancel, so that roundoff
+    dominates their derivatives. Gradients that are parallel everywhere do no harm: such a
+    constraint is redundant.
+    """
+    one, eps = jnp.ones((), y.dtype), float(jnp.finfo(y.dtype).eps)
+    if len(jacobian) == 1:
+        if directions is None:
+            return one
+        lengths = jnp.linalg.norm(jacobian) * jnp.linalg.norm(directions)
+        crosses = jnp.abs(jnp.sum(jacobian * directions)) > eps ** (1 / 3) * lengths
+        return jnp.where(crosses | (lengths == 0), one, jnp.nan)
+    sines = _sines(equations, jacobian)
+    size = jnp.max(jnp.abs(y), initial=0)
+    phases = jnp.sin(jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2)
+    beside = y + _OFFSET * (jnp.abs(y) + 0.1 * size) * phases
+    dependent = _sines(equations, equations.linearise(beside)[1]) <= 64 * eps
+    amplified = jnp.linalg.norm(y - candidate) > _SHORT_CORRECTION * sines * jnp.linalg.norm(y)
+    doubtful = (sines <= eps ** (1 / 3)) | ((sines <= _SMALL_ANGLE) & amplified)
+    return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, one)
+
+
+def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """The sine of the angle between each gradient and the span of those before it, in the norm of
+    the metric."""
+    unit = jacobian / row_sizes(jacobian)[:, None]
+    if equations.weights is not None:
+        unit = unit * jnp.sqrt(equations.weights)[None]
+    columns = unit.astype(jnp.float32 if jnp.finfo(unit.dtype).bits < 32 else unit.dtype).T
+    norms = jnp.linalg.norm(columns, axis=0)
+    lengths = jnp.abs(jnp.diagonal(jnp.linalg.qr(columns, mode="r")))
+    return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(unit.dtype)

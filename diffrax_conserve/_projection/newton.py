@@ -20,8 +20,7 @@ from .base import (
 from .bounded import Box, box_of, check_bounds
 from .equations import Equations
 from .gram import gram_matrix, gram_solve
-from .implicit import certain
-from .loop import solve
+from .loop import certain, solve
 
 # The largest number of unknowns and constraints for which the nearest point is sought.
 _NEAREST_MAX = 512

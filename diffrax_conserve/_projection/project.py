@@ -1,13 +1,11 @@
-"""`project`, and the problem that the solver and the interpolation pose too."""
+"""`project`, and the checks of what is projected."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
@@ -17,16 +15,15 @@ from .._manifold import (
     check_outputs,
     check_values,
     conserved_values,
-    evaluate,
     is_entry,
     named_entries,
 )
 from .._options import dtype_of
-from .._tree import ravel, real_view, unflatten, unravel
-from .base import AbstractProjection, Problem, ProjectionInfo, check_like, check_projection
+from .._tree import ravel
+from .base import AbstractProjection, ProjectionInfo, check_like, check_projection
 from .equations import equations_of, hidden_scale
 from .newton import Newton
-from .step import Step
+from .target import Target
 
 
 def project(
@@ -81,14 +78,8 @@ def project(
     check_metric(projection.metric, y)
     check_outputs(manifold, t, y, args)
     values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
-    problem = problem_of(projection, manifold, values, jnp.zeros_like(values), t, y, args)
-    equations = problem.equations
-    sampled = hidden_scale(equations, vector)
-    equations = dataclasses.replace(
-        equations, magnitude=equations.magnitude + sampled, sampled=sampled
-    )
-    projected, info = projection.solve(dataclasses.replace(problem, equations=equations), vector)
-    return unravel(projected, problem.like), info
+    sampled = hidden_scale(equations_of(manifold, values, t, y, args), vector)
+    return Target(projection, manifold, values, sampled, args, jnp.asarray(1)).project(t, y)
 
 
 def given_values(
@@ -112,31 +103,6 @@ def given_values(
         values = jtu.tree_map(choose, manifold, value, values, is_leaf=is_entry)
     check_values(manifold, values, t, y, args)
     return values
-
-
-def problem_of(
-    projection: AbstractProjection,
-    manifold: Manifold,
-    values: Float[Array, " m"],
-    sampled: Float[Array, " m"],
-    t: RealScalarLike,
-    like: Any,
-    args: Args,
-    step: Step | None = None,
-) -> Problem:
-    """The problem of a projection at a time, for states like `like`."""
-    like = jax.eval_shape(lambda: like)
-    equations = equations_of(manifold, values, sampled, t, like, args)
-    weights = inverse_metric(projection.metric, like)
-    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    keys = tuple(_key(path[0]) if path else None for path, _ in flat)
-    shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
-    equations = dataclasses.replace(equations, weights=weights)
-    return Problem(equations, t, args, shaped, like, keys, step)
-
-
-def _key(entry: Any) -> Any:
-    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
@@ -167,17 +133,3 @@ def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
         return
     remedy = "Give one weight (or an array of weights) for each leaf of the state."
     check_like("metric", metric, y, remedy)
-
-
-def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
-    """`M⁻¹` as a vector; an infinite weight freezes its component."""
-    if metric is None:
-        return None
-    view = jax.eval_shape(real_view, like)
-    return ravel(
-        jtu.tree_map(
-            lambda weight, x: jnp.broadcast_to(1 / jnp.asarray(weight, x.dtype), x.shape),
-            metric,
-            view,
-        )
-    )

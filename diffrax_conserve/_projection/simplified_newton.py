@@ -15,7 +15,7 @@ from .base import (
     positive_weights,
 )
 from .bounded import box_of, check_bounds
-from .implicit import project_along
+from .loop import project_along
 
 
 @final

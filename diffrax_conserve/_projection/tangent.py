@@ -28,8 +28,9 @@ from .._tree import ravel, tree_add, unflatten, unravel
 from .base import positive_weights
 from .equations import equations_of
 from .gram import combined, gram_matrix, gram_solve
-from .project import check_metric, check_state, inverse_metric
+from .project import check_metric, check_state
 from .scalars import written_out
+from .target import inverse_metric
 
 
 def tangent(
@@ -164,7 +165,7 @@ class TangentField(eqx.Module):
         wrong = self._wrong_rates(t, y, args, slope, values)
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
-        equations = equations_of(self.manifold, numbers, jnp.zeros_like(numbers), t, y, args)
+        equations = equations_of(self.manifold, numbers, t, y, args)
         weights = inverse_metric(self.metric, y)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:

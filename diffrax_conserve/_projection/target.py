@@ -2,19 +2,22 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree, Real
 
 from .._balance import integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Y
-from .._tree import ravel, tree_all_finite, unravel
-from .base import AbstractProjection, ProjectionInfo
-from .project import problem_of
+from .._manifold import evaluate, is_entry
+from .._tree import ravel, real_view, tree_all_finite, unflatten, unravel
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .equations import equations_of
 from .step import Step
 
 
@@ -91,3 +94,42 @@ def _project(
     )
     y, info = target.projection.solve(problem, ravel(candidate))
     return unravel(y, problem.like), info
+
+
+def problem_of(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Float[Array, " m"],
+    sampled: Float[Array, " m"],
+    t: RealScalarLike,
+    like: Any,
+    args: Args,
+    step: Step | None = None,
+) -> Problem:
+    """The problem of a projection at a time, for states like `like`."""
+    like = jax.eval_shape(lambda: like)
+    equations = equations_of(manifold, values, t, like, args, sampled)
+    weights = inverse_metric(projection.metric, like)
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+    keys = tuple(_key(path[0]) if path else None for path, _ in flat)
+    shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
+    equations = dataclasses.replace(equations, weights=weights)
+    return Problem(equations, t, args, shaped, like, keys, step)
+
+
+def _key(entry: Any) -> Any:
+    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
+
+
+def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
+    """`M⁻¹` as a vector; an infinite weight freezes its component."""
+    if metric is None:
+        return None
+    view = jax.eval_shape(real_view, like)
+    return ravel(
+        jtu.tree_map(
+            lambda weight, x: jnp.broadcast_to(1 / jnp.asarray(weight, x.dtype), x.shape),
+            metric,
+            view,
+        )
+    )

@@ -34,10 +34,9 @@ from .._projection.project import check_metric, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
 from .checks import check_direction, check_nested, innermost
-from .state import State, started
+from .state import State, member, started, verdict
 from .statistics import ProjectionStatistics
 from .terms import is_backsolve, is_ode, time_direction
-from .verdict import member, verdict
 
 
 @final
@@ -280,10 +279,10 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), all as
     sums of absolute components. Corrections are of the size of the local error of the wrapped
     solver: one as long as half a step tells that the quantity is not conserved, or that the state
-    jumped to another part of the manifold. With `every`, the limit is multiplied by it. It does not apply
-    where the manifold has a `Constraint`, whose correction may do all the work of a step, to
-    stochastic equations, to learned solvers, and to the first projection to a given `value`.
-    `None` is no limit.
+    jumped to another part of the manifold. With `every`, the limit is multiplied by it. It does not
+    apply where the manifold has a `Constraint`, whose correction may do all the work of a step, to
+    stochastic equations, to learned solvers, and to the first projection to a given `value`. `None`
+    is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 **Raises:**

@@ -1,6 +1,5 @@
 """Properties of a solve that its terms, given to a solver's `init` and `step`, reveal."""
 
-import functools as ft
 from typing import Any
 
 import diffrax as dfx
@@ -8,9 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
-from .._along import slope_like
-from .._custom_types import Args, RealScalarLike, Y
-from .._tree import tree_add
+from .._custom_types import RealScalarLike
 from .diffrax_private import AdjointTerm, WrapTerm
 
 
@@ -42,21 +39,6 @@ def check_ode(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
 def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
     """Whether every term is a `diffrax.ODETerm`."""
     return all(isinstance(term, dfx.ODETerm) for term in _innermost(terms))
-
-
-def slope_of(
-    solver: dfx.AbstractSolver,
-    terms: PyTree[dfx.AbstractTerm],
-    args: Args,
-    direction: RealScalarLike,
-    t: RealScalarLike,
-    y: Y,
-) -> Y:
-    """The vector field of ordinary differential equations, at a time of the user."""
-    # The direction of a solve is in the controls of its terms.
-    slope = solver.func(terms, t * direction, y, args)
-    slope = ft.reduce(tree_add, slope) if isinstance(terms, dfx.MultiTerm) else slope
-    return slope_like(y, slope)
 
 
 def _innermost(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:

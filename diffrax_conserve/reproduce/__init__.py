@@ -1,3 +1,5 @@
+from ._command import main as main
+from ._command import run as run
 from ._job import reproduce as reproduce
 from ._setup import SetupError as SetupError
 from ._trained import history as history

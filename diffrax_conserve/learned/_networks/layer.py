@@ -90,9 +90,7 @@ class ConservativeLayer(eqx.Module):
         start = ravel(candidate)
         dtype = start.dtype
         numbers = ravel(values).astype(dtype)
-        equations = equations_of(
-            self.manifold, numbers, jnp.zeros_like(numbers), t, candidate, self.args
-        )
+        equations = equations_of(self.manifold, numbers, t, candidate, self.args)
         if schedule is None:
             schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
         p, s = schedule
