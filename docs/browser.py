@@ -2,8 +2,8 @@
 
     python docs/browser.py site
 
-Says which pages overflow the screen, lack a picture or write errors to the console, and exits with
-status 1 if any does. Without Chromium it says so, and looks at nothing.
+Says which pages overflow the screen, cut off a line of code, lack a picture or write errors to the
+console, and exits with status 1 if any does. Without Chromium it says so, and looks at nothing.
 """
 
 import functools
@@ -18,7 +18,9 @@ import tempfile
 import threading
 from pathlib import Path
 
-WIDTHS = (1280, 390)
+WIDTHS = (1920, 1280, 390)
+# From here on a line of code must not be cut off; on a telephone it scrolls.
+WHOLE = 1280
 # Blink's numbers.
 SCHEMES = {"dark": 0, "light": 1}
 HARNESS = "seen-in-a-browser.html"
@@ -37,6 +39,11 @@ function look(page, width) {
       const page_ = frame.contentDocument, root = page_.documentElement;
       for (const image of page_.images) image.loading = "eager";
       setTimeout(() => {
+        for (const code of page_.querySelectorAll("pre > code")) {
+          const [line] = code.innerText.trim().split("\\n");
+          if (width >= WHOLE && code.scrollWidth > code.clientWidth)
+            found.push(`${page} at ${width} pixels: cut off: ${line}`);
+        }
         if (root.scrollWidth > root.clientWidth)
           found.push(`${page} at ${width} pixels: ${root.scrollWidth} pixels wide`);
         for (const image of page_.images)
@@ -74,9 +81,14 @@ def chromium() -> str | None:
 def problems(site: Path, browser: str) -> list[str]:
     """What is wrong with the site in this folder, one line each."""
     pages = sorted(
-        file.relative_to(site).as_posix() for file in site.rglob("*.html") if file.name != HARNESS
+        file.relative_to(site).as_posix()
+        for file in site.rglob("*.html")
+        if file.name != HARNESS and 'http-equiv="refresh"' not in file.read_text(encoding="utf-8")
     )
-    text = SCRIPT.replace("PAGES", json.dumps(pages)).replace("WIDTHS", json.dumps(WIDTHS))
+    values = {"PAGES": pages, "WIDTHS": WIDTHS, "WHOLE": WHOLE}
+    text = SCRIPT
+    for name, value in values.items():
+        text = text.replace(name, json.dumps(value))
     (site / HARNESS).write_text(text, encoding="utf-8")
     handler = functools.partial(Quiet, directory=str(site))
     found = []

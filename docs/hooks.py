@@ -1,9 +1,11 @@
-"""Three things that the pages cannot do themselves.
+"""What the pages cannot do themselves.
 
-The table of solvers in `solvers.md` is the one that the tests run.
+The table of solvers in `api/solvers.md` is the one that the tests run.
 
 The link to the repository, at the foot of the pages, is the `place` of `pyproject.toml`, if there
 is one.
+
+A code block in a comment `<!-- check ... -->` runs with the page, and is not shown.
 
 Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
 
@@ -11,6 +13,7 @@ The usual way is an inventory downloaded at each build. Ours is a table, so that
 network; a name that is not in it fails the strict build, as a misspelt name of our own does.
 """
 
+import re
 import runpy
 import tomllib
 from pathlib import Path
@@ -74,6 +77,7 @@ def on_config(config):
         config.extra["social"] = [{"icon": "fontawesome/brands/git-alt", "link": place}]
 
 
+CHECK = re.compile(r"\n*^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)
 CONFORMANCE = ROOT / "tests" / "solver" / "conformance_table.py"
 
 
@@ -82,4 +86,5 @@ def on_page_markdown(markdown, **kwargs):
     rows = runpy.run_path(str(CONFORMANCE))["TABLE"].items()
     table = ["| solver | tested as | inside `ManifoldProjection` |", "|---|---|---|"]
     table += [f"| `{solver}` | {kind} | supported |" for solver, kind in rows]
+    markdown = CHECK.sub("", markdown)
     return markdown.replace("<!-- conformance table -->", "\n".join(table))

@@ -3,7 +3,8 @@
 The ```` ```python ```` blocks of one page, or of one docstring, run in order in one namespace, in a
 new folder and in the state of a new interpreter: float32 unless the page enables float64. What a
 block prints is shown in a ```` ```text ```` block right below it, and the figures that it saves are
-in `docs/images/pages`.
+in `docs/images/pages`. A block in a comment `<!-- check ... -->` runs too, and is not shown:
+asserts, and the code of figures.
 
 `python -m tests.pages FILE ...` runs the pages named and writes both anew.
 """
@@ -24,7 +25,12 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "diffrax_conserve"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+# `docs/appendix` is not on the site, and has no code.
+PAGES = [
+    ROOT / "README.md",
+    *(file for file in sorted((ROOT / "docs").rglob("*.md")) if file.parent.name != "appendix"),
+]
+CHECK = re.compile(r"^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)
 FIGURES = ROOT / "docs" / "images" / "pages"
 FENCE = re.compile(
     r"^(?P<indent>[ ]*)```[ ]*(?P<language>\w+)[^\n]*\n(?P<code>.*?)^(?P=indent)```[ ]*$"

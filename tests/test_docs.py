@@ -1,6 +1,8 @@
 """Executes the code of the README, docs and docstrings; checks that the reference is complete."""
 
 import ast
+import importlib
+import operator
 import re
 import runpy
 import shlex
@@ -11,7 +13,7 @@ import types
 import jax
 import pytest
 
-from .pages import FIGURES, PAGES, ROOT, agree, blocks, example_pages, roundoff, run
+from .pages import CHECK, FIGURES, PAGES, ROOT, agree, blocks, example_pages, roundoff, run
 
 EXAMPLES = [page for page in example_pages() if page.blocks]
 
@@ -41,13 +43,32 @@ def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
         assert f"images/pages/{figure.name})" in text, f"{figure.name} is not on the page"
 
 
-GUIDES = sorted((ROOT / "docs").glob("*.md"))
-SHOWN_EXAMPLES = [page for page in EXAMPLES if page.file.parent.name == "examples"]
+SITE = [page for page in PAGES if page.name != "README.md"]
+GUIDES = [page for page in SITE if page.parent.name != "api"]
+
+
+def shown(file):
+    """The text of a page as a reader gets it, without the blocks that only run."""
+    return CHECK.sub("", file.read_text(encoding="utf-8"))
+
+
+def test_there_are_few_pages():
+    assert len(SITE) <= 26
 
 
 @pytest.mark.parametrize("file", GUIDES, ids=lambda file: file.stem)
 def test_guides_are_short(file):
-    assert len(file.read_text(encoding="utf-8").split()) <= 1500
+    assert len(shown(file).split()) <= 900
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 90
+
+
+@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
+def test_what_only_runs_prints_nothing(page):
+    text = page.file.read_text(encoding="utf-8")
+    assert not [found for found in CHECK.findall(text) if "```text" in found]
 
 
 @pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(ROOT).as_posix())
@@ -56,17 +77,54 @@ def test_tables_fit_on_a_screen(file):
     assert [head for head in heads if head.count("|") - 1 > 7] == []
 
 
-def test_there_are_ten_examples():
-    assert len(SHOWN_EXAMPLES) >= 10
+def names(code, context):
+    return {
+        node.id
+        for block in code
+        for node in ast.walk(ast.parse(block.code))
+        if isinstance(node, ast.Name) and isinstance(node.ctx, context)
+    }
 
 
-@pytest.mark.parametrize("page", SHOWN_EXAMPLES, ids=lambda page: page.file.stem)
-def test_an_example_is_short_and_has_a_figure_and_output(page):
-    lines = [line for block in page.blocks for line in block.code.splitlines() if line.strip()]
-    assert len(lines) <= 60
-    assert any(block.shown for block in page.blocks)
-    assert (FIGURES / f"{page.file.stem}.svg").exists()
-    assert f"images/pages/{page.file.stem}.svg)" in page.file.read_text(encoding="utf-8")
+@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(ROOT).as_posix())
+def test_what_is_shown_needs_nothing_that_is_not(file):
+    all_blocks = blocks(file.read_text(encoding="utf-8"), 1, "python")
+    visible = blocks(shown(file), 1, "python")
+    codes = {block.code for block in visible}
+    hidden = [block for block in all_blocks if block.code not in codes]
+    only_there = names(hidden, ast.Store) - names(visible, ast.Store)
+    defined = {
+        node.name
+        for block in hidden
+        for node in ast.walk(ast.parse(block.code))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    }
+    assert not (only_there | defined) & names(visible, ast.Load)
+
+
+def test_what_only_runs_is_not_on_the_site():
+    strip = runpy.run_path(str(ROOT / "docs" / "hooks.py"))["on_page_markdown"]
+    text = "before\n\n<!-- check\n```python\nassert x\n```\n-->\n\nafter\n"
+    assert [block.code for block in blocks(text, 1, "python")] == ["assert x\n"]
+    assert strip(text) == "before\n\nafter\n"
+
+
+def test_names_in_a_figure_are_apart():
+    apart = runpy.run_path(str(ROOT / "docs" / "drawing.py"))["_apart"]
+    moved = apart([3.0, 50.0, 1.0, 2.0], 10.0)
+    assert list(moved) == [12.0, 50.0, -8.0, 2.0]
+
+
+def test_figures_are_shown():
+    """Every figure in `docs/images` is on a page, and every page shows figures that there are."""
+    files = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    used = {name for name in re.findall(r"images/((?:pages/)?[\w-]+\.(?:svg|png))", text)}
+    folder = ROOT / "docs" / "images"
+    kept = {file.relative_to(folder).as_posix() for file in folder.rglob("*.*")}
+    assert used <= kept
+    # The benchmarks write both kinds.
+    assert {name for name in kept - used if name.removesuffix(".png") + ".svg" not in used} == set()
 
 
 def commands() -> list[str]:
@@ -90,7 +148,12 @@ def test_shell_examples_run(command, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def exported(module: str) -> list[str]:
+MODULES = ["diffrax_conserve"] + [
+    f"diffrax_conserve.{name}" for name in ("learned", "systems", "testing")
+]
+
+
+def exported(module):
     """The public names that the `__init__.py` of `module` imports, without its subpackages."""
     tree = ast.parse((ROOT / module.replace(".", "/") / "__init__.py").read_text(encoding="utf-8"))
     names = [
@@ -102,18 +165,41 @@ def exported(module: str) -> list[str]:
     return [f"{module}.{name}" for name in names if not name.startswith("_")]
 
 
-def modules_with_reference() -> list[str]:
-    modules = ["diffrax_conserve", "diffrax_conserve.systems", "diffrax_conserve.testing"]
-    return [m for m in modules if (ROOT / m.replace(".", "/") / "__init__.py").exists()]
+def found(path):
+    """What is called `path` here, or `None`."""
+    module = max((m for m in MODULES if path.startswith(f"{m}.")), key=len)
+    try:
+        return operator.attrgetter(path.removeprefix(f"{module}."))(importlib.import_module(module))
+    except AttributeError:
+        return None
 
 
-@pytest.mark.parametrize("module", modules_with_reference())
-def test_every_public_name_is_in_the_api_reference(module):
+def documented():
     pages = "\n".join(f.read_text(encoding="utf-8") for f in (ROOT / "docs" / "api").glob("*.md"))
-    documented = re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE)
-    missing = set(exported(module)) - set(documented)
+    return re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_public_name_is_in_the_api_reference(module):
+    there = [found(path) for path in documented()]
+    missing = [name for name in exported(module) if not any(found(name) is x for x in there)]
     assert not missing, f"add `::: NAME` to a page in docs/api for {sorted(missing)}"
-    assert len(documented) == len(set(documented)), "a name is documented twice"
+
+
+def test_the_reference_has_only_public_names_and_each_once():
+    paths = documented()
+    private = sorted(path for path in paths if found(path) is None)
+    assert not private, f"these are not public: remove their `:::` lines, {private}"
+    things = [id(found(path)) for path in paths]
+    assert len(things) == len(set(things)), "something is documented twice"
+
+
+def test_old_addresses_lead_to_pages():
+    moved = runpy.run_path(str(ROOT / "docs" / "redirects.py"))["MOVED"]
+    addresses = {page.relative_to(ROOT / "docs").with_suffix("").as_posix() for page in SITE}
+    assert not addresses & moved.keys()
+    assert {new.partition("/")[0] for new in moved.values()} <= {a.split("/")[0] for a in addresses}
+    assert {re.sub("/(#.*)?$", "", new).removesuffix("/") for new in moved.values()} <= addresses
 
 
 def test_links_and_figures_of_the_package_follow_from_its_place(monkeypatch):

@@ -5,18 +5,14 @@
 2. A pendulum with weak friction to t = 1,000, and one with stronger friction that is driven: errors
    of state and energy, steps and CPU seconds at tolerance 1e-6.
 
-Writes `results/balance.json` and the figure of the page on balance laws.
+Writes `results/balance.json`.
 """
 
 import diffrax as dfx
 import equinox as eqx
-import figures
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import measuring
-import numpy as np
-from matplotlib.figure import Figure
 
 import diffrax_conserve as dfc
 
@@ -147,10 +143,10 @@ def pendulums(smoke):
         clocks = timed(solvers, args, times)
         for key, row in rows.items():
             row["seconds"] = clocks[key].seconds
-            numbers = {k: f"{v:.3g}" for k, v in row.items() if k != "curve"}
+            numbers = {k: f"{v:.3g}" for k, v in row.items()}
             print(f"{name}, {' '.join(key)}: {numbers}", flush=True)
         found[name] = {" ".join(key): row for key, row in rows.items()}
-    return times, found
+    return found
 
 
 def timed(solvers, args, times):
@@ -164,7 +160,7 @@ def timed(solvers, args, times):
 
 
 def judged(solver, args, times, exact):
-    """The largest errors of state and energy, the steps, and the error of the energy in time."""
+    """The largest errors of state and energy, and the steps."""
     solution = solve(solver, args, times, 1e-6, dfx.SaveAt(ts=times))
     state = jnp.maximum(*jax.tree.map(lambda a, b: jnp.abs(a - b), solution.ys, exact))
     energies = jnp.abs(energy(times, solution.ys, args) - energy(times, exact, args))
@@ -172,31 +168,7 @@ def judged(solver, args, times, exact):
         steps=int(solution.stats["num_steps"]),
         state=float(jnp.max(state)),
         energy=float(jnp.max(energies)),
-        curve=np.asarray(energies),
     )
-
-
-# ---- The figure ----
-
-
-def figure(times, cases):
-    """The error of the energy against time: what is kept, and what is not."""
-    colours = {"Bosh3": figures.GREEN, "Tsit5": figures.RED, "Dopri8": figures.BLUE}
-    with mpl.rc_context(figures.LOOK):
-        drawn = Figure(figsize=(8.4, 3.4), layout="constrained")
-        axes = drawn.subplots(1, 2, sharey=True)
-        for ax, (title, rows) in zip(axes, cases.items(), strict=True):
-            for name, row in rows.items():
-                solver, kind = name.split()
-                # The largest so far, since an error passes through zero.
-                largest = np.maximum.accumulate(row["curve"])
-                line = "-" if kind == "kept" else "--"
-                label = f"{solver}, {'balance kept' if kind == 'kept' else 'plain'}"
-                ax.plot(times[1:], largest[1:], line, color=colours[solver], label=label)
-            ax.set(title=title, xlabel="t", yscale="log", ylim=(1e-12, None))
-        axes[0].set_ylabel("largest error of the energy so far")
-        drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper")
-    return drawn
 
 
 def main(argv=None):
@@ -204,14 +176,7 @@ def main(argv=None):
     about = measuring.machine()
     measuring.print_machine(about)
     rows = entropy(options.smoke)
-    times, cases = pendulums(options.smoke)
-    drawn = figure(times, cases)
-    if not options.smoke:
-        figures.save(drawn, measuring.HERE.parent.parent / "docs" / "images" / "balance-laws.png")
-    cases = {
-        name: {key: {k: v for k, v in row.items() if k != "curve"} for key, row in rows.items()}
-        for name, rows in cases.items()
-    }
+    cases = pendulums(options.smoke)
     measuring.write(options, about, entropy=rows, pendulum=cases)
     return dict(entropy=rows, pendulum=cases)
 

@@ -1,5 +1,5 @@
-"""From the results of `make bench`: what was reached, the tables of the README and the
-documentation, and the figures of the page on performance.
+"""From the results of `make bench`: what was reached, the tables of the documentation,
+and the figures of the page on performance.
 
 Prints the table of what was meant to be reached; `--write` puts every table between its two markers
 and redraws the figures. A test holds the tables of the pages to the results.
@@ -16,17 +16,20 @@ import measuring
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [
-    ROOT / "README.md",
-    DOCS / "performance.md",
-    DOCS / "appendix" / "performance.md",
-    measuring.RESULTS.parent / "README.md",
-]
+PAGES = [DOCS / "performance.md", measuring.RESULTS.parent / "README.md"]
 UNROLLED = ", unrolled"
 NAMES = ("overhead", "gradients", "work_precision", "scaling")
 
 # One trajectory without the option of XLA that the documentation recommends.
 DEFAULT_FLAGS = "overhead-default-flags"
+
+# Of each system: what is kept, the integrals, and the numbers in its state.
+SIZES = {
+    "rigid-body": ("rigid body", 2, 3),
+    "three-vortices": ("three vortices", 4, 6),
+    "ten-vortices": ("ten vortices", 4, 20),
+    "outer-solar-system": ("outer solar system", 10, 36),
+}
 
 Results = dict[str, dict[str, Any]]
 
@@ -217,6 +220,26 @@ def overhead_table(results: Results, name: str = "overhead") -> list[str]:
     return lines
 
 
+def integrals_table(results: Results) -> list[str]:
+    """Projected over plain, by the number of integrals: the times of a step, alone and in a batch,
+    and the time of compilation, alone."""
+    tables = results["overhead"]["tables"]
+    found = {(t["system"], t["method"], t["batch"]): t["ratios"] for t in tables}
+    heads = ("integrals", "numbers in the state", "system", "method")
+    heads = (*heads, "alone", "batch of 1,000", "compilation")
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for system, (name, integrals, numbers) in SIZES.items():
+        for method in ("RK4", "Tsit5 adaptive"):
+            one, many = (found.get((system, method, batch), {}) for batch in (1, 1_000))
+            if one or many:
+                times = [x.get("projected / plain") for x in (one, many)]
+                times.append(one.get("compilation, projected / plain"))
+                cells = ["" if x is None else f"{x:.1f}" for x in times]
+                head = [str(integrals), str(numbers), name, method]
+                lines.append(f"| {' | '.join([*head, *cells])} |")
+    return lines
+
+
 def times_table(results: Results, part: str) -> list[str]:
     found = results["work_precision"]["parts"][part]
     lines = [
@@ -246,6 +269,7 @@ def tables(results: Results) -> dict[str, list[str]]:
     """By the name in the markers of the pages."""
     return {
         "goals": goal_table(results),
+        "by integrals": integrals_table(results),
         "overhead": overhead_table(results),
         "default flags": overhead_table(results, DEFAULT_FLAGS),
         "rigid body": times_table(results, "rigid-body"),

@@ -52,7 +52,7 @@ def test_the_paper_is_one_name():
     assert {net.weights[0].shape[-1] for net in (network.core.branch, network.core.trunk)} == {40}
     assert paper.recipe(network).taylor == 0
     pinn = paper.pinn(EAST, 0.0, 1.0, key=KEY)
-    assert (pinn.net.weights[0].shape[-1], len(pinn.net.weights), pinn.windows) == (40, 5, 1)
+    assert (pinn.nets.weights[0].shape[-1], len(pinn.nets.weights), pinn.windows) == (40, 5, 1)
 
 
 @pytest.mark.slow
