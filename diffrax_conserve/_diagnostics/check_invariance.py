@@ -256,7 +256,8 @@ def _relative_sizes(
     f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), vector_field(t, y, args), y)
     terms = jnp.sum(jnp.abs(jacobian * ravel(f)), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
     # Forces may cancel inside the field.
-    terms = jnp.maximum(terms, hidden_terms(along, vector))
+    hidden = hidden_terms(along, vector)
+    terms = jnp.where(hidden > 4 * terms, hidden, terms)
     change = along(vector) + in_time - rate
     defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may

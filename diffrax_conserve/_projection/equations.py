@@ -70,14 +70,14 @@ class Equations(eqx.Module):
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> Int[Array, ""]:
         """0 if `y` is off the manifold; 1 if it is on it; 2 if, besides, no iteration could reduce
-        a residual but by chance, because all are within a quarter of the tolerance. A residual
+        a residual but by chance, because all are within an eighth of the tolerance. A residual
         within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         limit = self._relative(scale)
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        reached = jnp.where(jnp.abs(g) <= 0.25 * limit, 2, 1)
+        reached = jnp.where(jnp.abs(g) <= 0.125 * limit, 2, 1)
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
 

@@ -111,9 +111,9 @@ def _solve(
         return keep(y, *equations.linearise(y))
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
-        return _tested(equations, kept, y, left, *equations.linearise(y))
+        return _tested(equations, max_steps, kept, y, left, *equations.linearise(y))
 
-    y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 127 else jnp.int32)
+    y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
     count = jnp.asarray(0)
     if small and own:
         written: tuple[Any, ...] = in_scalars(start, y), in_scalars(test, kept, y, left)
@@ -131,9 +131,9 @@ def _solve(
         y, left, index, count, kept = carry
         if own:
             g, jacobian = equations.linearise(y)
-            is_first = index == 0 if kept.factors is not None else left > max_steps
+            is_first = index == 0 if kept.factors is not None else left == max_steps + 1
             kept = _if_first(is_first, lambda: keep(y, g, jacobian), kept)
-            y, left, more = _tested(equations, kept, y, left, g, jacobian)
+            y, left, more = _tested(equations, max_steps, kept, y, left, g, jacobian)
         else:
             y, left, more = test(kept, y, left)
         return y, left, index + 1, count + more, kept
@@ -143,7 +143,8 @@ def _solve(
 
     carry = y, left, jnp.asarray(0), count, kept
     y, left, _, count, _ = lax.while_loop(unfinished, body, carry)
-    return joined(candidate, y), left == 0, count
+    y = jnp.where(left == -2, candidate, joined(candidate, y))
+    return y, (left == 0) | (left == -2), count
 
 
 def _keep(
@@ -166,15 +167,26 @@ def _if_first(first: Bool[Array, ""], new: Callable[[], _Kept], kept: _Kept) -> 
 
 
 def _tested(
-    equations: Equations, kept: _Kept, y: Array, left: Array, g: Array, jacobian: Array
+    equations: Equations,
+    max_steps: int,
+    kept: _Kept,
+    y: Array,
+    left: Array,
+    g: Array,
+    jacobian: Array,
 ) -> tuple[Float[Array, " n"], Int[Array, ""], Int[Array, ""]]:
     """The verdict at the state itself, the next state, and whether that is another one. `left`
-    counts the iterations that are left; 0 is success, -1 failure."""
+    counts the iterations that are left: at first `max_steps + 1`; `max_steps + 2` if the candidate
+    is on the manifold and is corrected once, which may fail. It ends as 0, success; -1, failure;
+    or -2 if the candidate is the result."""
     level = equations.verdict(g, jacobian, y)
+    on = level > 0
     # Within the tolerance at most two more.
-    less = jnp.where(level > 0, jnp.minimum(left - 1, 2), left - 1)
-    last = jnp.where(level > 0, 0, -1)
-    now = jnp.where(level == 2, 0, jnp.where(left == 1, last, less))
+    less = jnp.where(on, jnp.minimum(left - 1, 2), left - 1)
+    now = jnp.where(left == 1, jnp.where(on, 0, -1), less)
+    now = jnp.where((left == max_steps + 1) & on, max_steps + 2, now)
+    now = jnp.where(left == max_steps + 2, jnp.where(on, 0, -2), now)
+    now = jnp.where(level == 2, 0, now)
     left = jnp.where(left > 0, now, left).astype(left.dtype)
     more = left > 0
     return jnp.where(more, _corrected(equations, kept, y, g, jacobian), y), left, more.astype(int)

@@ -44,7 +44,7 @@ def hidden_terms(
 
             def changed(x: Any) -> Array:
                 moves, axes = next(given)
-                share = 0.5 * ft.reduce(jnp.multiply.outer, axes).reshape(np.shape(x))
+                share = 0.5 * ft.reduce(_outer, axes).reshape(np.shape(x))
                 share = jnp.where(moves, share, 0).astype(jnp.finfo(jnp.result_type(x)).dtype)
                 return _changed(x, share, size)
 
@@ -63,6 +63,10 @@ def _weights(seed: int, shape: tuple[int, ...], dtype: Any) -> list[Array]:
     rng = np.random.default_rng(seed)
     sizes = [(_SAMPLES, n) for n in shape or (1,)]
     return [jnp.asarray(rng.choice([-1, 1], x) * rng.uniform(0.5, 1.5, x), dtype) for x in sizes]
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[..., None] * b.reshape(*[1] * a.ndim, -1)
 
 
 @jax.custom_jvp

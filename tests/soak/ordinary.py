@@ -2,7 +2,9 @@
 where a damped Gauss-Newton iteration in long double succeeds is counted: a false failure.
 
 The candidate is 1e-12 to 1e-2 of its size away from a state of the manifold. To the families of the
-other attacks come networks, and functions with constants that their gradients do not show.
+other attacks come networks, and functions with constants that their gradients do not show. A lane
+counts if one Newton step halves the residual at least, so that the functions are nearly linear at
+this distance, and if the squares of their gradients are in the range of the dtype.
 """
 
 import functools
@@ -89,15 +91,24 @@ def compiled(name: str, mode: str) -> Any:
 
 
 def reachable(family: Family, y: np.ndarray, a: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Which lanes a damped Gauss-Newton iteration brings to the manifold, in long double."""
+    """Which lanes a damped Gauss-Newton iteration brings to the manifold, in long double, of those
+    that count."""
+    # Below float64 the package scales the gradients.
+    largest = np.finfo(y.dtype).max ** (0.5 if y.dtype == np.float64 else 1.0)
     y, a, value = long(y), long(a), long(value)
-    m = len(value)
+    m, counts, before = len(value), np.ones(y.shape[1], bool), np.inf
     reached = np.zeros(y.shape[1], bool)
     with np.errstate(all="ignore"):
-        for _ in range(_STEPS):
+        for step in range(_STEPS):
             g = values(family.fn, y, a) - value
             size = scales(family.fn, y, a, value)
-            reached |= (np.abs(g) <= 1e-17 * size).all(axis=0)
+            off = (np.abs(g) / size).max(axis=0)
+            reached |= off <= 1e-17
+            if step == 0:
+                counts &= (size < 1e-3 * largest).all(axis=0)
+            if step == 1:
+                counts &= reached | (off <= 0.5 * before)
+            before = off
             rows = (
                 np.stack([_derivative(family, y, a, k) for k in range(len(y))], axis=1)
                 / size[:, None]
@@ -108,7 +119,7 @@ def reachable(family: Family, y: np.ndarray, a: np.ndarray, value: np.ndarray) -
             for i in range(m):
                 gram[i, i] = gram[i, i] * (1 + damping) + np.longdouble("1e-4000")
             y = y - np.einsum("ikl,il->kl", rows, _solved(gram, g))
-    return reached & np.isfinite(y).all(axis=0)
+    return counts & reached & np.isfinite(y).all(axis=0)
 
 
 def _derivative(family: Family, y: np.ndarray, a: np.ndarray, k: int) -> np.ndarray:

@@ -89,20 +89,6 @@ def test_a_state_that_is_not_finite_is_called_that(errors_raise):
         )
 
 
-def test_an_inaccurate_function_is_kept_as_well_as_it_can_be():
-    """The roundoff of the function is measured at the start."""
-
-    def noisy(t, y, args):
-        return jnp.sum(y**2) + jax.lax.stop_gradient(1e-12 * jnp.sin(1e15 * y[0]))
-
-    saveat = dfx.SaveAt(steps=True, solver_state=True)
-    sol = run(dfc.FirstIntegral(noisy), y0=jnp.array([1.0, 0.5]), saveat=saveat, max_steps=32)
-    assert sol.result == dfx.RESULTS.successful
-    assert dfc.statistics(sol).roundoff > 0.5
-    squares = np.sum(np.asarray(sol.ys)[:10] ** 2, axis=1)
-    assert np.max(np.abs(squares - 1.25)) < 1e-10
-
-
 def test_the_list_of_messages_is_the_same_whatever_was_solved():
     run(OUT_OF_REACH, throw=False)
     assert fresh.interpreter()["messages"] == len(dfx.RESULTS._index_to_message)

@@ -72,7 +72,7 @@ def test_events(solver):
     def crossing(t, y, args, **kwargs):
         return y[k] - level
 
-    event = dfx.Event(crossing, optx.Newton(1e-10, 1e-10))
+    event = dfx.Event(crossing, optx.Bisection(1e-10, 1e-10))
     sol = solve(solver, path(solver, 0.5), t0=0.5, event=event)
     assert sol.result == dfx.RESULTS.event_occurred
     assert 0.5 < float(sol.ts[-1]) < 0.75
