@@ -176,5 +176,6 @@ def write(file: Path) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("MPLBACKEND", "Agg")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see `tests/conftest.py`
     for name in sys.argv[1:]:
         write(Path(name).resolve())

@@ -133,10 +133,13 @@ def test_the_figures_show_every_curve(tmp_path):
         f"{name}.{suffix}" for name in ("work-precision", "scaling") for suffix in ("png", "svg")
     }
     figure = report.figures.work_precision(results["work_precision"])
-    legend = figure.axes[-1].get_legend()
-    parts = results["work_precision"]["parts"]
-    names = {name for part in parts.values() for name in part.get("curves", ())}
-    assert {text.get_text() for text in legend.get_texts()} == names
+    (ax,) = figure.axes
+    shown = set(report.figures.SHOWN)
+    assert len(shown) <= 6
+    assert shown <= set(results["work_precision"]["parts"]["kepler"]["curves"])
+    curves = {line.get_label() for line in ax.get_lines() if not line.get_label().startswith("_")}
+    assert curves == shown
+    assert {text.get_text() for text in ax.texts} == shown
 
 
 def test_the_drift_is_flat():

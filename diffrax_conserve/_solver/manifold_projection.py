@@ -58,6 +58,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     its first step, so that lanes would depend on each other, as they do with implicit methods:
     these keep the stage.
 
+    Success means that each residual is within 16 units of roundoff of $|I_0| + \sum_k |y_k
+    \partial_k I|$ and the terms that cancel inside `fn`, such as the 1 of `1 - cos(q)`, unless the
+    projection has other tolerances.
+
     A solve fails at its first step if the initial state violates a `Constraint` by more than the
     square root of roundoff, relative to the size of its terms (find a consistent state by
     [`diffrax_conserve.project`][]), or if a function is not finite there.

@@ -117,12 +117,12 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```text
         projections of the accepted steps
           num_projections  18
-          num_iterations   3
+          num_iterations   1
           max_iterations   1
-          residual_before  9.1e-07
-          residual_after   4.8e-07
-          correction       1.4e-06
-          roundoff         0.0e+00
+          residual_before  5.7e-07
+          residual_after   4.2e-07
+          correction       1.6e-06
+          roundoff         4.7e-01
         ```
     """
     check_solution(sol, "statistics")

@@ -119,6 +119,7 @@ def fit(
         import diffrax_conserve as dfc
         import jax
 
+        jax.config.update("jax_enable_x64", True)
         system = dfc.systems.get("harmonic-oscillator")
         pinn = dfc.PINN(system.y0, 0.0, 10.0, key=jax.random.key(0))
         pinn, log = dfc.fit(pinn, system.vector_field, key=jax.random.key(1))
