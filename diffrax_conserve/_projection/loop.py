@@ -104,7 +104,7 @@ def _solve(
         kept = _Kept(directions / row_sizes(directions)[:, None])
     if own:
         zero = jnp.zeros_like(equations.magnitude)
-        like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate)
+        like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate[None])
         kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
     def start(y: Array) -> _Kept:
