@@ -117,11 +117,11 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```text
         projections of the accepted steps
           num_projections  18
-          num_iterations   1
+          num_iterations   3
           max_iterations   1
-          residual_before  5.7e-07
-          residual_after   4.2e-07
-          correction       1.6e-06
+          residual_before  3.6e-07
+          residual_after   1.5e-07
+          correction       1.0e-06
           roundoff         4.7e-01
         ```
     """
