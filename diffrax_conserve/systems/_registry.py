@@ -40,6 +40,7 @@ _SYSTEMS: dict[str, type[AbstractSystem]] = {
 # Explicit methods cannot solve these.
 _STIFF: dict[str, type[AbstractSystem]] = {system.name: system for system in (Robertson, Pollu)}
 _ALL = _SYSTEMS | _STIFF
+CLASSES = tuple(_ALL.values())
 
 
 def names(*, stiff: bool = False) -> tuple[str, ...]:

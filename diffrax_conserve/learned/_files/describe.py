@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ... import systems
 from ..._manifold import Constraint, FirstIntegral
 from ...systems import AbstractSystem
+from ...systems._registry import CLASSES
 from .._networks.cores import Concatenated, Gated, Product
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box, FramedBox
@@ -30,8 +30,7 @@ from .._networks.wrappers import BoxCox, Repeated, Transformed
 
 _NETWORKS = (PINN, DeepONet, Repeated, Transformed, BoxCox, Product, Concatenated, Gated, MLP)
 _PARTS = (Box, FramedBox, ConservativeLayer, Taylor, FirstIntegral, Constraint)
-_SYSTEMS = [type(systems.get(n)) for stiff in (False, True) for n in systems.names(stiff=stiff)]
-_CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (*_NETWORKS, *_PARTS, *_SYSTEMS)}
+_CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (*_NETWORKS, *_PARTS, *CLASSES)}
 _DTYPES = ("float64", "float32", "float16", "bfloat16", "int64", "int32", "bool")
 # No network needs more. They limit what a small file can make this package allocate.
 _ARRAYS_MAX, _INTEGER_MAX = 1000, 100_000
@@ -93,7 +92,7 @@ def _fields(kind: Any) -> list[str]:
 
 def _method(system: Any, name: str) -> Any:
     """The public method called `name` of a system of the catalogue, or `None`."""
-    known = type(system) in _SYSTEMS and not name.startswith("_")
+    known = type(system) in CLASSES and not name.startswith("_")
     return getattr(system, name) if known and callable(getattr(type(system), name, 0)) else None
 
 
