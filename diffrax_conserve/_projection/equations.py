@@ -74,17 +74,13 @@ class Equations(eqx.Module):
         within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
-        limit = self._relative(scale)
+        rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
+        limit = jnp.asarray(rtol, scale.dtype) * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         reached = jnp.where(jnp.abs(g) <= 0.125 * limit, 2, 1)
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
-
-    def _relative(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
-        eps = float(jnp.finfo(scale.dtype).eps)
-        rtol = ROUNDOFF_MULTIPLE * eps if self.rtol is None else self.rtol
-        return jnp.asarray(rtol, scale.dtype) * scale
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
