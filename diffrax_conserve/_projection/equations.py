@@ -59,7 +59,10 @@ class Equations(eqx.Module):
         for part in self.parts:
             value, vjp = jax.vjp(part, y)
             values.append(value)
-            rows.append(jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))[0])
+            if value.size == 1:
+                rows.append(vjp(jnp.ones_like(value))[0][None])
+            else:
+                rows.append(jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
 
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -78,9 +81,9 @@ class Equations(eqx.Module):
         limit = jnp.asarray(rtol, scale.dtype) * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        reached = jnp.where(jnp.abs(g) <= 0.125 * limit, 2, 1)
+        reached = jnp.where(jnp.abs(g) <= 0.125 * limit, jnp.int8(2), jnp.int8(1))
         # Not by a maximum of residuals, which can lose NaN on a CPU.
-        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, 0))
+        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, jnp.int8(0)))
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""

@@ -98,58 +98,48 @@ def _solve(
     damped: bool,
     small: bool,
 ) -> Solved:
-    keep = ft.partial(_keep, equations, fresh, damped)
-    kept, own = _Kept(), directions is None and not (fresh and not damped)
-    if directions is not None:
-        kept = _Kept(directions / row_sizes(directions)[:, None])
-    if own:
-        zero = jnp.zeros_like(equations.magnitude)
-        like = eqx.filter_eval_shape(keep, candidate, zero, zero[:, None] * candidate[None])
-        kept = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-
     def start(y: Array) -> _Kept:
-        return keep(y, *equations.linearise(y))
+        if directions is not None:
+            return _Kept(directions / row_sizes(directions)[:, None])
+        return _keep(equations, fresh, damped, y) if damped or not fresh else _Kept()
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
-        return _tested(equations, max_steps, kept, y, left, *equations.linearise(y))
+        return _tested(equations, max_steps, kept, y, left)
 
     y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
     count = jnp.asarray(0)
-    if small and own:
-        written: tuple[Any, ...] = in_scalars(start, y), in_scalars(test, kept, y, left)
-        if None not in written:
-            # From here on arrays are tuples of scalars. Most steps of an integrator need two
-            # iterations, which need no loop.
-            start, test = written
-            y, own = components(y), False
-            kept = start(y)
-            for _ in range(2):
-                y, left, more = test(kept, y, left)
-                count = count + more
-
-    def body(carry: tuple[Any, Array, Array, Array, Any]) -> tuple[Any, Array, Array, Array, Any]:
-        y, left, index, count, kept = carry
-        if own:
-            g, jacobian = equations.linearise(y)
-            is_first = index == 0 if kept.factors is not None else left == max_steps + 1
-            kept = _if_first(is_first, lambda: keep(y, g, jacobian), kept)
-            y, left, more = _tested(equations, max_steps, kept, y, left, g, jacobian)
-        else:
+    written: tuple[Any, ...] = (None,)
+    if small:
+        like = jax.eval_shape(start, y)
+        written = in_scalars(start, y), in_scalars(test, like, y, left)
+    if None not in written:
+        # From here on arrays are tuples of scalars.
+        start, test = written
+        y = components(y)
+    else:
+        y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
+    kept = start(y)
+    if None not in written:
+        # Most steps of an integrator need two iterations, which need no loop.
+        for _ in range(2):
             y, left, more = test(kept, y, left)
-        return y, left, index + 1, count + more, kept
+            count = count + more
 
-    def unfinished(carry: tuple[Any, Array, Array, Array, Any]) -> Array:
+    def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+        y, left, count = carry
+        y, left, more = test(kept, y, left)
+        return y, left, count + more
+
+    def unfinished(carry: tuple[Any, Array, Array]) -> Array:
         return any_lane(carry[1] > 0)
 
-    carry = y, left, jnp.asarray(0), count, kept
-    y, left, _, count, _ = lax.while_loop(unfinished, body, carry)
-    y = jnp.where(left == -2, candidate, joined(candidate, y))
-    return y, (left == 0) | (left == -2), count
+    y, left, count = lax.while_loop(unfinished, body, (y, left, count))
+    return jnp.where(left == -2, candidate, joined(candidate, y)), left != -1, count
 
 
-def _keep(
-    equations: Equations, fresh: bool, damped: bool, y: Array, g: Array, jacobian: Array
-) -> _Kept:
+def _keep(equations: Equations, fresh: bool, damped: bool, y: Array) -> _Kept:
+    del damped
+    _, jacobian = equations.linearise(y)
     if fresh:
         return _Kept(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
     sizes = row_sizes(jacobian)
@@ -159,35 +149,20 @@ def _keep(
     return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
 
-def _if_first(first: Bool[Array, ""], new: Callable[[], _Kept], kept: _Kept) -> _Kept:
-    """`new()` in the first iteration. What takes a factorisation is worth a branch."""
-    if kept.factors is not None:
-        return lax.cond(first, new, lambda: kept)
-    return jtu.tree_map(lambda a, b: jnp.where(first, a, b), new(), kept)
-
-
 def _tested(
-    equations: Equations,
-    max_steps: int,
-    kept: _Kept,
-    y: Array,
-    left: Array,
-    g: Array,
-    jacobian: Array,
+    equations: Equations, max_steps: int, kept: _Kept, y: Array, left: Array
 ) -> tuple[Float[Array, " n"], Int[Array, ""], Int[Array, ""]]:
     """The verdict at the state itself, the next state, and whether that is another one. `left`
-    counts the iterations that are left: at first `max_steps + 1`; `max_steps + 2` if the candidate
-    is on the manifold and is corrected once, which may fail. It ends as 0, success; -1, failure;
-    or -2 if the candidate is the result."""
+    counts the iterations that are left, at first `max_steps + 1`; it ends as 0, success, or -1. A
+    candidate on the manifold is corrected once, with a count of `max_steps + 2`; if that moves it
+    off the manifold, the candidate is the result, which -2 tells."""
+    g, jacobian = equations.linearise(y)
     level = equations.verdict(g, jacobian, y)
-    on = level > 0
+    on, first, second = level > 0, left == max_steps + 1, left == max_steps + 2
     # Within the tolerance at most two more.
-    less = jnp.where(on, jnp.minimum(left - 1, 2), left - 1)
-    now = jnp.where(left == 1, jnp.where(on, 0, -1), less)
-    now = jnp.where((left == max_steps + 1) & on, max_steps + 2, now)
-    now = jnp.where(left == max_steps + 2, jnp.where(on, 0, -2), now)
-    now = jnp.where(level == 2, 0, now)
-    left = jnp.where(left > 0, now, left).astype(left.dtype)
+    now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
+    now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
+    left = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
     more = left > 0
     return jnp.where(more, _corrected(equations, kept, y, g, jacobian), y), left, more.astype(int)
 

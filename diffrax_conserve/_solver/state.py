@@ -121,17 +121,15 @@ def verdict(
     because the candidate is already very close to the last state, the step is a roundoff of time,
     or the solve cannot start. `states` are the last state, the candidate and the result."""
     last, candidate, result = (ravel(y) for y in states)
-    eps = float(jnp.finfo(candidate.dtype).eps)
-    # In one kernel; NaN can get lost in a maximum on a CPU.
-    parts = jnp.stack([candidate - last, candidate, result - candidate])
-    parts = jnp.where(jnp.isnan(parts), jnp.inf, jnp.abs(parts))
-    moved, size, correction = jnp.max(parts, axis=1, initial=0)
-    cause = jnp.where(ok, 0, jnp.where(jnp.isfinite(correction), _NOT_REACHED, _NOT_FINITE))
+    info = jnp.finfo(candidate.dtype)
+    moved, size, correction = (jnp.abs(x) for x in (candidate - last, candidate, result - candidate))
+    # One sum, hence one kernel. A correction within the second term is allowed in any step.
+    share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype) * every
+    share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
+    excess = jnp.sum(correction - share * moved - 8 * float(info.eps) ** 0.5 * size)
+    cause = jnp.where(ok, 0, jnp.where(jnp.isfinite(excess), _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
-        # A correction this small is allowed however short the step.
-        share = jnp.asarray(max_correction, size.dtype) * every
-        share = jnp.minimum(share, float(jnp.finfo(size.dtype).max))  # infinity times zero is NaN
-        too_far = ok & ~(correction <= share * moved + 8 * eps**0.5 * size)
+        too_far = ok & ~(excess <= 0)
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
         cause = jnp.where(too_far, _TOO_FAR, cause)
     lost = jnp.any(jnp.isnan(state.values))
@@ -139,5 +137,5 @@ def verdict(
         cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    near = (moved <= max(5e-4, 16 * eps) * size) & (moved < jnp.inf)
+    near = jnp.sum(moved - max(5e-4, 16 * float(info.eps)) * size) <= 0
     return cause, near | instant | lost
