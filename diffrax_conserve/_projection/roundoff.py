@@ -18,13 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 # What other operations contain is taken as one function.
-_COUNTED = frozenset(
-    """
-    add add_any sub reduce_sum dot_general cumsum conv_general_dilated
-    acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 lgamma log log1p
-    logistic pow sin sinh tan tanh
-    """.split()
-)
+_NAMES = """
+add add_any sub reduce_sum dot_general cumsum conv_general_dilated
+acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 lgamma log log1p
+logistic pow sin sinh tan tanh
+"""
+_COUNTED = frozenset(_NAMES.split())
 
 
 def hidden_terms(
@@ -32,17 +31,20 @@ def hidden_terms(
 ) -> Float[Array, " m"]:
     """The roundoff of `fn(y)` in units of roundoff."""
     evaluated = ft.partial(_evaluated, jax.make_jaxpr(fn)(y))
-    operands: list[Array] = []
-    like = jax.eval_shape(lambda y: evaluated([y], lambda x: operands.append(x) or x)[0], y)
+    like: list[Array] = []
+    jax.eval_shape(lambda y: evaluated([y], lambda x: like.append(x) or x), y)
 
-    def perturbed(shares: list[Array]) -> Array:
-        given = iter(shares)
-        return evaluated([y], lambda x: x * (1 + next(given)))[0]
+    def shifted(shifts: list[Array]) -> tuple[Array, list[Array]]:
+        given, operands = iter(shifts), []
+        out = evaluated([y], lambda x: operands.append(x) or x + next(given))[0]
+        return out, operands
 
-    _, vjp = jax.vjp(perturbed, [jnp.zeros(x.shape, x.dtype) for x in operands])
-    (terms,) = jax.vmap(vjp)(jnp.eye(like.size, dtype=like.dtype))
-    terms = [jnp.abs(x).reshape(like.size, -1).astype(like.dtype) for x in terms]
-    sizes = jnp.nan_to_num(jnp.concatenate(terms, axis=1))
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
+    value, vjp, operands = jax.vjp(shifted, zeros, has_aux=True)
+    (adjoints,) = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
+    pairs = zip(adjoints, operands, strict=True)
+    terms = [jnp.abs(adjoint * x).reshape(value.size, -1) for adjoint, x in pairs]
+    sizes = jnp.nan_to_num(jnp.concatenate(terms, axis=1)).astype(value.dtype)
     # Squares of small energies underflow in float32.
     largest = jnp.max(sizes, axis=1, keepdims=True)
     unit = sizes / jnp.where(largest > 0, largest, 1)

@@ -280,15 +280,16 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
     `Directional`, a `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
-    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), all in the
-    largest component. Corrections are of the size of the local error of the wrapped
-    solver: one as long as half a step tells that the quantity is not conserved, or that the state
+    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), each the
+    sum over the components. Corrections are of the size of the local error of the wrapped solver:
+    one as long as half a step tells that the quantity is not conserved, or that the state
     jumped to another part of the manifold. With `every`, the limit is multiplied by it. It does not
     apply where the manifold has a `Constraint`, whose correction may do all the work of a step, to
     stochastic equations, to learned solvers, and to the first projection to a given `value`. `None`
     is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
+
 **Raises:**
 
 `TypeError` or `ValueError`, before compilation, if an argument is invalid, if the manifold is empty

@@ -122,7 +122,8 @@ def verdict(
     or the solve cannot start. `states` are the last state, the candidate and the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
-    moved, size, correction = (jnp.abs(x) for x in (candidate - last, candidate, result - candidate))
+    moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
+    size = jnp.abs(candidate)
     # One sum, hence one kernel. A correction within the second term is allowed in any step.
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype) * every
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
