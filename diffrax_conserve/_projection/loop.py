@@ -101,7 +101,16 @@ def _solve(
     def start(y: Array) -> _Kept:
         if directions is not None:
             return _Kept(directions / row_sizes(directions)[:, None])
-        return _keep(equations, fresh, damped, y) if damped or not fresh else _Kept()
+        if fresh and not damped:
+            return _Kept()
+        _, jacobian = equations.linearise(y)
+        if fresh:
+            return _Kept(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
+        sizes = row_sizes(jacobian)
+        unit = jacobian / sizes[:, None]
+        rows = equations.weighted(unit)
+        many = len(rows) > WRITTEN_OUT_MAX
+        return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
     def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
         return _tested(equations, max_steps, kept, y, left)
@@ -135,18 +144,6 @@ def _solve(
 
     y, left, count = lax.while_loop(unfinished, body, (y, left, count))
     return jnp.where(left == -2, candidate, joined(candidate, y)), left != -1, count
-
-
-def _keep(equations: Equations, fresh: bool, damped: bool, y: Array) -> _Kept:
-    del damped
-    _, jacobian = equations.linearise(y)
-    if fresh:
-        return _Kept(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
-    sizes = row_sizes(jacobian)
-    unit = jacobian / sizes[:, None]
-    rows = equations.weighted(unit)
-    many = len(rows) > WRITTEN_OUT_MAX
-    return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
 
 def _tested(

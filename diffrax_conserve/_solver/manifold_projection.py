@@ -34,8 +34,7 @@ from .._projection.project import check_metric, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.target import Target
 from .checks import check_direction, check_nested, innermost
-from .state import State, member, started, verdict
-from .statistics import ProjectionStatistics
+from .state import ProjectionStatistics, State, member, started, verdict
 from .terms import is_backsolve, is_ode, time_direction
 
 

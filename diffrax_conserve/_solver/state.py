@@ -1,7 +1,8 @@
 """The solver state of a `ManifoldProjection`, how it starts, and the verdict on a step: whether its
 projection failed, why, and whether it can be saved."""
 
-from typing import Any
+import dataclasses
+from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry
+from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
 from .._projection.equations import equations_of
 from .._projection.roundoff import hidden_terms
 from .._tree import ravel, tree_stop_gradient
 from .diffrax_private import member as _member
 from .diffrax_private import register
-from .statistics import ProjectionStatistics
 
 _SMALLER = (
     "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes with "
@@ -44,6 +45,60 @@ _FIRST = register(
     "constraints may contradict each other or the bounds. " + _ENTRY,
 )
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
+
+
+@final
+class ProjectionStatistics(eqx.Module):
+    """Totals over the accepted steps of a solve, including those of earlier solves that it
+    continues.
+
+    **Attributes:**
+
+    - `num_projections`: the number of projected steps.
+    - `num_iterations`, `max_iterations`: the number of iterations of all projections, and the
+        largest number of a single one.
+    - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
+        state, relative to the scale of its constraint.
+    - `correction`: the largest Euclidean norm of a projected state minus its candidate.
+    - `roundoff`: the largest share of a scale that the gradient does not show; see
+        [`diffrax_conserve.ProjectionInfo`][].
+    - `worst`: the position of the entry of the manifold that failed last, as
+        [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
+    """
+
+    num_projections: Int[Array, "..."]
+    num_iterations: Int[Array, "..."]
+    max_iterations: Int[Array, "..."]
+    residual_before: Float[Array, "..."]
+    residual_after: Float[Array, "..."]
+    correction: Float[Array, "..."]
+    roundoff: Float[Array, "..."]
+    worst: Int[Array, "..."]
+
+    @classmethod
+    def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
+        count, size = jnp.asarray(0), jnp.zeros((), dtype)
+        return cls(count, count, count, size, size, size, size, jnp.asarray(-1))
+
+    def __str__(self) -> str:
+        if is_traced(self):
+            return repr(self)
+        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        if np.all(np.asarray(self.worst) < 0):
+            del rows["worst"]
+        return printed("projections of the accepted steps", rows)
+
+    def add(self, info: ProjectionInfo, due: Array | None) -> "ProjectionStatistics":
+        return ProjectionStatistics(
+            self.num_projections + (1 if due is None else due.astype(int)),
+            self.num_iterations + info.num_steps,
+            jnp.maximum(self.max_iterations, info.num_steps),
+            jnp.maximum(self.residual_before, info.residual_before),
+            jnp.maximum(self.residual_after, info.residual_after),
+            jnp.maximum(self.correction, info.correction),
+            jnp.maximum(self.roundoff, info.roundoff),
+            jnp.where(info.ok, self.worst, info.worst),
+        )
 
 
 class State(eqx.Module):

@@ -1,72 +1,10 @@
-"""Statistics of the projections of a solve, carried in the solver state."""
-
-import dataclasses
-from typing import Any, final
+"""The statistics of a solve, found in its solution."""
 
 import diffrax as dfx
-import equinox as eqx
-import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, Float, Int
 
 from .._options import check_solution
-from .._printing import is_traced, printed
-from .._projection.base import ProjectionInfo
-
-
-@final
-class ProjectionStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve, including those of earlier solves that it
-    continues.
-
-    **Attributes:**
-
-    - `num_projections`: the number of projected steps.
-    - `num_iterations`, `max_iterations`: the number of iterations of all projections, and the
-        largest number of a single one.
-    - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
-        state, relative to the scale of its constraint.
-    - `correction`: the largest Euclidean norm of a projected state minus its candidate.
-    - `roundoff`: the largest share of a scale that the gradient does not show; see
-        [`diffrax_conserve.ProjectionInfo`][].
-    - `worst`: the position of the entry of the manifold that failed last, as
-        [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
-    """
-
-    num_projections: Int[Array, "..."]
-    num_iterations: Int[Array, "..."]
-    max_iterations: Int[Array, "..."]
-    residual_before: Float[Array, "..."]
-    residual_after: Float[Array, "..."]
-    correction: Float[Array, "..."]
-    roundoff: Float[Array, "..."]
-    worst: Int[Array, "..."]
-
-    @classmethod
-    def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
-        count, size = jnp.asarray(0), jnp.zeros((), dtype)
-        return cls(count, count, count, size, size, size, size, jnp.asarray(-1))
-
-    def __str__(self) -> str:
-        if is_traced(self):
-            return repr(self)
-        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        if np.all(np.asarray(self.worst) < 0):
-            del rows["worst"]
-        return printed("projections of the accepted steps", rows)
-
-    def add(self, info: ProjectionInfo, due: Array | None) -> "ProjectionStatistics":
-        return ProjectionStatistics(
-            self.num_projections + (1 if due is None else due.astype(int)),
-            self.num_iterations + info.num_steps,
-            jnp.maximum(self.max_iterations, info.num_steps),
-            jnp.maximum(self.residual_before, info.residual_before),
-            jnp.maximum(self.residual_after, info.residual_after),
-            jnp.maximum(self.correction, info.correction),
-            jnp.maximum(self.roundoff, info.roundoff),
-            jnp.where(info.ok, self.worst, info.worst),
-        )
+from .state import ProjectionStatistics
 
 
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:
@@ -126,15 +64,13 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```
     """
     check_solution(sol, "statistics")
-    found = _instances(sol.solver_state, ProjectionStatistics)
+    leaves = jtu.tree_leaves(
+        sol.solver_state, is_leaf=lambda x: isinstance(x, ProjectionStatistics)
+    )
+    found = [x for x in leaves if isinstance(x, ProjectionStatistics)]
     if not found:
         raise ValueError(
             "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
             "and with `saveat=SaveAt(..., solver_state=True)`."
         )
     return found[0]
-
-
-def _instances(tree: Any, kind: type) -> list[Any]:
-    leaves = jtu.tree_leaves(tree, is_leaf=lambda x: isinstance(x, kind))
-    return [x for x in leaves if isinstance(x, kind)]
