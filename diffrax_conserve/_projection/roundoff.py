@@ -17,6 +17,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .scalars import walk
+
 # What other operations contain is taken as one function.
 _NAMES = """
 add add_any sub reduce_sum dot_general cumsum conv_general_dilated
@@ -32,11 +34,11 @@ def hidden_terms(
     """The roundoff of `fn(y)` in units of roundoff."""
     evaluated = ft.partial(_evaluated, jax.make_jaxpr(fn)(y))
     like: list[Array] = []
-    jax.eval_shape(lambda y: evaluated([y], lambda x: like.append(x) or x), y)
+    jax.eval_shape(lambda y: evaluated(y, lambda x: like.append(x) or x), y)
 
     def shifted(shifts: list[Array]) -> tuple[Array, list[Array]]:
         given, operands = iter(shifts), []
-        out = evaluated([y], lambda x: operands.append(x) or x + next(given))[0]
+        out = evaluated(y, lambda x: operands.append(x) or x + next(given))
         return out, operands
 
     zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
@@ -51,30 +53,18 @@ def hidden_terms(
     return largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
 
 
-def _evaluated(
-    jaxpr: Any, inputs: list[Any], changed: Callable[[Any], Any], moving: list[bool] | None = None
-) -> list[Any]:
-    """The outputs of a closed jaxpr with `changed` operands. What does not depend on the `moving`
-    inputs, by default all, remains what it is."""
-    jaxpr, consts = jaxpr.jaxpr, jaxpr.consts
-    given_moving = [True] * len(inputs) if moving is None else moving
-    # Each variable, and whether it depends on the inputs.
-    env: dict[Any, tuple[Any, bool]] = {}
-    env.update(zip(jaxpr.constvars, ((x, False) for x in consts), strict=True))
-    env.update(zip(jaxpr.invars, zip(inputs, given_moving, strict=True), strict=True))
+def _evaluated(closed: Any, y: Array, changed: Callable[[Any], Any]) -> Array:
+    """The value of a jaxpr whose operands are `changed` where they depend on `y`."""
 
-    def operand(x: Any, moves: bool) -> Any:
-        return changed(x) if moves and jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
+    def equation(eqn: Any, given: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
+        inputs = [x for x, _ in given]
+        if eqn.primitive.name in _COUNTED or list(jex.jaxprs_in_params(eqn.params)):
+            moving = [
+                moves and jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x, moves in given
+            ]
+            inputs = [changed(x) if moves else x for x, moves in zip(inputs, moving, strict=True)]
+        outs = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
+        outs = outs if eqn.primitive.multiple_results else [outs]
+        return [(x, any(moves for _, moves in given)) for x in outs]
 
-    for eqn in jaxpr.eqns:
-        read = [(x.val, False) if isinstance(x, jex.Literal) else env[x] for x in eqn.invars]
-        given, moves = [x for x, _ in read], [flag for _, flag in read]
-        if eqn.primitive.name == "jit":
-            outs = _evaluated(eqn.params["jaxpr"], given, changed, moves)
-        else:
-            if eqn.primitive.name in _COUNTED or list(jex.jaxprs_in_params(eqn.params)):
-                given = [operand(x, flag) for x, flag in read]
-            outs = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-            outs = outs if eqn.primitive.multiple_results else [outs]
-        env.update(zip(eqn.outvars, ((x, any(moves)) for x in outs), strict=True))
-    return [x.val if isinstance(x, jex.Literal) else env[x][0] for x in jaxpr.outvars]
+    return walk(closed, [(y, True)], lambda x: (x, False), equation)[0][0]

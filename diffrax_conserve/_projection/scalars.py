@@ -72,6 +72,32 @@ def in_scalars(
     return written
 
 
+def walk(
+    closed: Any,
+    inputs: list[Any],
+    constant: Callable[[Any], Any],
+    equation: Callable[[Any, list[Any]], Iterable[Any]],
+) -> list[Any]:
+    """The outputs of a jaxpr that is evaluated otherwise: `constant(x)` and `equation(eqn, inputs)`
+    take the place of the values of its constants and equations."""
+    env = dict(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
+    env.update(zip(closed.jaxpr.invars, inputs, strict=True))
+
+    def read(var: Any) -> Any:
+        if isinstance(var, jex.Literal):
+            return constant(np.asarray(var.val, _dtype(var)))
+        return env[var]
+
+    for eqn in closed.jaxpr.eqns:
+        given = [read(var) for var in eqn.invars]
+        if eqn.primitive.name == "jit":
+            outs = walk(eqn.params["jaxpr"], given, constant, equation)
+        else:
+            outs = equation(eqn, given)
+        env.update(zip(eqn.outvars, outs, strict=True))
+    return [read(var) for var in closed.jaxpr.outvars]
+
+
 def components(x: Array) -> Any:
     """The elements of an array; a scalar remains what it is."""
     if jnp.ndim(x) == 0:
@@ -200,33 +226,16 @@ class _WriteOut:
     ) -> list[Array]:
         places = [self._add(x, shape) for x, shape in zip(inputs, shapes, strict=True)]
         try:
-            outputs = self._jaxpr(closed.jaxpr, closed.consts, places)
+            outputs = walk(closed, places, self._constant, self._equation)
         except (KeyError, TypeError) as error:
             # In another version of jax a parameter may have been renamed or added.
             raise _NotWrittenOut from error
         return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
 
-    def _jaxpr(self, jaxpr: Any, consts: list[Any], inputs: list[_Places]) -> list[_Places]:
-        env: dict[Any, _Places] = {}
-
-        def read(var: Any) -> _Places:
-            if isinstance(var, jex.Literal):
-                return self._constant(np.asarray(var.val, _dtype(var)))
-            return env[var]
-
-        env.update(zip(jaxpr.constvars, map(self._constant, consts), strict=True))
-        env.update(zip(jaxpr.invars, inputs, strict=True))
-        for eqn in jaxpr.eqns:
-            outs = self._equation(eqn, [read(var) for var in eqn.invars])
-            env.update(zip(eqn.outvars, outs, strict=True))
-        return [read(var) for var in jaxpr.outvars]
-
     def _equation(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params = eqn.primitive.name, eqn.params
         if eqn.effects:
             raise _NotWrittenOut
-        if name == "jit":
-            return self._jaxpr(params["jaxpr"].jaxpr, params["jaxpr"].consts, inputs)
         # Parameters that are `None` have no effect.
         given = {
             key: value
