@@ -86,7 +86,7 @@ def working_dtype(y: Y) -> jnp.dtype:
 
 def tree_size(a: PyTree[Array]) -> int:
     """The number of scalars in `a`."""
-    return sum(jnp.size(x) for x in jtu.tree_leaves(a))
+    return sum(math.prod(jnp.shape(x)) for x in jtu.tree_leaves(a))
 
 
 def tree_shapes(a: Any) -> Any:

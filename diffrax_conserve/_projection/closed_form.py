@@ -48,7 +48,9 @@ class ClosedForm(AbstractProjection):
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
-        check_function("fn", "ClosedForm", self.fn, "t, y, args, values", "the projected state")
+        check_function(
+            "`fn` of a `ClosedForm`", self.fn, "fn(t, y, args, values)", "the projected state"
+        )
         check_options(self)
 
     def solve(
@@ -56,7 +58,12 @@ class ClosedForm(AbstractProjection):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
         y = self.fn(problem.t, state, problem.args, problem.values)
-        _check_like(y, state)
+        got, expected = _shapes_and_dtypes(y), _shapes_and_dtypes(state)
+        if not eqx.tree_equal(got, expected):
+            raise ValueError(
+                f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a "
+                "state of the same structure, shapes and dtypes."
+            )
         y = ravel(y)
         return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
 
@@ -76,15 +83,5 @@ is not shaped like the state.
 """
 
 
-def _check_like(y: Any, candidate: Any) -> None:
-    def shape(x: Any) -> tuple[Any, Any]:
-        return jnp.shape(x), jnp.result_type(x)
-
-    got, expected = (jtu.tree_structure(x) for x in (y, candidate))
-    if got == expected:
-        got, expected = ([shape(x) for x in jtu.tree_leaves(tree)] for tree in (y, candidate))
-    if got != expected:
-        raise ValueError(
-            f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a state "
-            "of the same structure, shapes and dtypes."
-        )
+def _shapes_and_dtypes(tree: Any) -> Any:
+    return jtu.tree_map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .._along import slope_like
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
@@ -18,12 +17,14 @@ from .._manifold import (
     check_manifold,
     check_outputs,
     check_values,
+    check_vector_field,
     conserved_values,
     evaluate,
     named_entries,
     rate_of,
+    slope_like,
 )
-from .._options import check_number, check_vector_field
+from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
 from .base import positive_weights
 from .equations import equations_of
@@ -105,20 +106,17 @@ def tangent(
         al., "Stabilized neural differential equations for learning dynamics with explicit
         constraints", NeurIPS 2023.
     """
-    check_vector_field(vector_field, "tangent(vector_field, manifold)")
+    check_vector_field(vector_field)
     check_manifold(manifold)
     check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
-        if damped and isinstance(entry, FirstIntegral) and entry.value is None:
+        no_value = isinstance(entry, FirstIntegral) and entry.value is None
+        if damped and (no_value or rate_of(entry) is not None):
             raise ValueError(
-                f"`gain` is {gain}, but `{name}` has no value that it could return to. Write "
-                "`FirstIntegral(fn, value=...)`, or leave `gain` out."
-            )
-        if damped and rate_of(entry) is not None:
-            raise ValueError(
-                f"`gain` is {gain}, but the value of `{name}` changes at its `rate`, and a vector "
-                "field does not know it. Leave `gain` out."
+                f"`gain` is {gain}, but `{name}` "
+                + ("has no value that it could return to" if no_value else "changes at its `rate`")
+                + ". Write `FirstIntegral(fn, value=...)` without a `rate`, or leave `gain` out."
             )
     return TangentField(vector_field, manifold, positive_weights(metric), gain)
 
@@ -150,8 +148,7 @@ class TangentField(eqx.Module):
 
         A PyTree shaped like the values of the functions of the manifold.
         """
-        _, _, multiplier = self._solve(t, y, args)
-        return multiplier
+        return self._solve(t, y, args)[2]
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
         """The given field, the correction that is added to it, and the multipliers."""
@@ -159,14 +156,22 @@ class TangentField(eqx.Module):
         check_state(y, "`tangent`", jnp.inexact)
         check_metric(self.metric, y)
         check_outputs(self.manifold, t, y, args)
-        slope = slope_like(y, self.vector_field(t, y, args))
         values = conserved_values(self.manifold, t, y, args)
         check_values(self.manifold, values, t, y, args)
-        wrong = self._wrong_rates(t, y, args, slope, values)
+        slope = slope_like(y, self.vector_field(t, y, args))
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
         weights = inverse_metric(self.metric, y)
+
+        def residual(t: RealScalarLike, y: Y) -> Array:
+            return ravel(evaluate(self.manifold, t, y, args)) - numbers
+
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        g, along = jax.jvp(residual, (t, y), (jnp.ones_like(t), slope))
+        # That of a balance law, otherwise zero.
+        rate = ravel(rates(self.manifold, t, y, args))
+        wrong = (rate - along - self.gain * g).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             vector, wrong = given
@@ -179,24 +184,5 @@ class TangentField(eqx.Module):
             multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
             return combined(multiplier, rows), multiplier / sizes
 
-        correction, multiplier = written_out(solved, (vector, wrong.astype(vector.dtype)))
+        correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)
-
-    def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
-        """`rate - (∂g/∂t + G f + gain g)`, where `rate` is that of a balance law and otherwise
-        zero."""
-        t = jnp.asarray(t, jnp.result_type(float, t))
-
-        def residuals(t: RealScalarLike, y: Y) -> Values:
-            return evaluate(self.manifold, t, y, args)
-
-        now, along = jax.jvp(residuals, (t, y), (jnp.ones_like(t), slope))
-        meant = rates(self.manifold, t, y, args)
-        parts = jtu.tree_map(
-            lambda rate, a, x, v: jnp.ravel(rate - a - self.gain * (x - v)),
-            meant,
-            along,
-            now,
-            values,
-        )
-        return jnp.concatenate(jtu.tree_leaves(parts))
