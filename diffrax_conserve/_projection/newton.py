@@ -1,5 +1,6 @@
 """Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
 
+import dataclasses
 from typing import Any, ClassVar, final
 
 import equinox as eqx
@@ -37,15 +38,13 @@ class Newton(AbstractProjection):
     in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
     $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: the
     iteration can pass near points where gradients are parallel, and converges quadratically
-    elsewhere. Then the same iteration on both equations moves along the manifold to the point
-    nearest to the candidate. If that fails, or if there are more than 512 unknowns and constraints,
-    the result of the first phase is returned: it is on the manifold, but not the nearest point, and
-    its derivative is NaN. For the close candidates of an integrator use
-    [`diffrax_conserve.SimplifiedNewton`][].
+    elsewhere. Then the same iteration on both equations moves along the manifold to the nearest
+    point. If that fails, or with more than 512 unknowns and constraints, the result of the first
+    phase is returned: it is on the manifold, but not the nearest point, and its derivative is NaN.
+    For the close candidates of an integrator use [`diffrax_conserve.SimplifiedNewton`][].
 
-    Success is judged at the returned state, relative to the scale of the constraints there. The
-    result is differentiated by the implicit function theorem for both equations. The derivative is
-    NaN where the gradients of the constraints are nearly parallel at the projected state but not
+    The result is differentiated by the implicit function theorem for both equations. The derivative
+    is NaN where the gradients of the constraints are nearly parallel at the projected state but not
     everywhere.
 
     !!! example
@@ -123,35 +122,31 @@ def _nearest(
         bounded = box.compose(equations)
         z, _, count = solve(bounded, candidate, directions=rows, max_steps=2 * max_steps)
         y = box.clip(z)
-    multiplier = jnp.zeros_like(equations.magnitude)
-    n, unknowns = y.size, y.size + multiplier.size
-    if unknowns > _NEAREST_MAX:
-        return y, multiplier, jnp.asarray(False), count
+    n, m = y.size, equations.magnitude.size
+    if n + m > _NEAREST_MAX:
+        return y, jnp.zeros_like(equations.magnitude), jnp.asarray(False), count
     _, jacobian = equations.linearise(y)
-    rows = equations.weighted(jacobian)
-    gram = gram_matrix(jacobian, rows)
-    multiplier = gram_solve(gram, jacobian @ (y - candidate))
+    gram = gram_matrix(jacobian, equations.weighted(jacobian))
+    start = jnp.concatenate([y, gram_solve(gram, jacobian @ (y - candidate))])
     # In these units the condition number does not depend on the user's.
-    lengths = jnp.diagonal(gram)
-    units = [jnp.ones(n, y.dtype) if equations.weights is None else equations.weights]
-    units += [1 / jnp.where(lengths > 0, lengths, 1)]
-    hidden = jnp.concatenate([jnp.zeros_like(y), equations.hidden])
-    magnitude = jnp.concatenate([jnp.abs(candidate), equations.magnitude])
-    optimality = Equations(
-        (_Optimality(equations, candidate, box),),
-        magnitude,
-        hidden,
-        jnp.concatenate(units),
-        equations.rtol,
-        equations.atol,
+    units = jnp.ones_like(y) if equations.weights is None else equations.weights
+    optimality = dataclasses.replace(
+        equations,
+        parts=(_Optimality(equations, candidate, box),),
+        magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
+        hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
+        weights=jnp.concatenate([units, 1 / _positive(jnp.diagonal(gram))]),
     )
-    start = jnp.concatenate([y, multiplier])
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
         found = found & equations.judged(end[:n])
     nearest = jnp.where(found, end, start)
     return nearest[:n], nearest[n:], found, count + more
+
+
+def _positive(x: Array) -> Array:
+    return jnp.where(x > 0, x, 1)
 
 
 @_nearest.def_jvp
@@ -168,10 +163,11 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     right = jnp.zeros_like(unknowns) if right is None else right
     _, jacobian = equations.linearise(y)
     lengths = jnp.diagonal(gram_matrix(jacobian, equations.weighted(jacobian)))
-    roots = jnp.ones_like(y) if equations.weights is None else jnp.sqrt(equations.weights)
-    norms = jnp.sqrt(jnp.where(lengths > 0, lengths, 1))
-    rows = jnp.concatenate([jnp.where(roots > 0, roots, 1), norms])
-    columns = jnp.concatenate([jnp.where(roots > 0, roots, 1), 1 / norms])
+    norms = jnp.sqrt(_positive(lengths))
+    roots = jnp.ones_like(y)
+    if equations.weights is not None:
+        roots = jnp.sqrt(_positive(equations.weights))
+    rows, columns = jnp.concatenate([roots, norms]), jnp.concatenate([roots, 1 / norms])
     matrix = jax.jacfwd(_Optimality(*primals))(unknowns) / rows[:, None] * columns
     tangent = -columns * _shortest(matrix, right / rows)
     # Only the nearest point has a derivative; that of a failed projection is not used.

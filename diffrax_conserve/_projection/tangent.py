@@ -50,7 +50,7 @@ def tangent(
 
     so that along a solution $g' = -\text{gain} \cdot g$: the residual is constant, or with a `gain`
     decays (Baumgarte's stabilisation; the stabilised neural equations of White et al.). The field
-    is the nearest to $f$ in the metric with this property, and differentiable.
+    is the nearest to $f$ in the metric with this property.
 
     **Mechanisms.** For positions $q$ and velocities $v$ with masses $m$ and forces $F$ let
     $f = (v, F/m)$, take the velocity constraint that [`diffrax_conserve.Constraint.derivative`][]
@@ -76,8 +76,8 @@ def tangent(
     **Raises:**
 
     `TypeError` or `ValueError` if an argument does not fit, or if a `gain` is given for a
-    `FirstIntegral` without a `value`; and, when it is called, if the value of the field is not
-    shaped like the state.
+    `FirstIntegral` without a `value` or with a `rate`; and, when it is called, if the value of the
+    field is not shaped like the state.
 
     !!! example
 
