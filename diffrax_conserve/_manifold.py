@@ -1,6 +1,5 @@
 """First integrals, constraints, and the PyTrees of them that define a manifold."""
 
-import abc
 from collections.abc import Callable
 from typing import Any, final
 
@@ -14,16 +13,6 @@ from ._options import check_function, check_numbers, dtype_of, is_real
 from ._tree import tree_shapes, tree_size
 
 
-class AbstractConserved(eqx.Module):
-    """One entry of a manifold."""
-
-    fn: eqx.AbstractVar[ConstraintFn]
-
-    @abc.abstractmethod
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        """The value of `fn` that a solve started at `(t, y, args)` conserves."""
-
-
 def _arrays(value: Values | None) -> Values | None:
     check_numbers("value", value)
     # Arrays, so that a different value does not trigger another compilation.
@@ -31,7 +20,7 @@ def _arrays(value: Values | None) -> Values | None:
 
 
 @final
-class FirstIntegral(AbstractConserved):
+class FirstIntegral(eqx.Module):
     r"""A function $I(t, y, args)$ that is constant along the exact solution, or has a known rate.
 
     The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
@@ -66,9 +55,6 @@ class FirstIntegral(AbstractConserved):
             returns = "the derivative of `fn` along the solution"
             check_function("`rate` of a `FirstIntegral`", self.rate, "rate(t, y, args)", returns)
 
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        return self.fn(t, y, args) if self.value is None else self.value
-
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
@@ -82,7 +68,7 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 
 @final
-class Constraint(AbstractConserved):
+class Constraint(eqx.Module):
     r"""A function $g(t, y, args)$ that is zero along the exact solution.
 
     The manifold is $\{y : g(t, y, args) = 0\}$.
@@ -138,9 +124,6 @@ class Constraint(AbstractConserved):
         check_vector_field(vector_field)
         return Constraint(Along(self.fn, vector_field))
 
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
-
 
 Constraint.__init__.__doc__ = r"""**Arguments:**
 
@@ -184,7 +167,7 @@ def check_vector_field(vector_field: Any) -> None:
 
 
 def is_entry(x: Any) -> bool:
-    return isinstance(x, AbstractConserved)
+    return isinstance(x, FirstIntegral | Constraint)
 
 
 def rate_of(entry: Any) -> ConstraintFn | None:
@@ -214,7 +197,7 @@ def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
 
 
 def entry_name(manifold: Manifold, position: int) -> str:
-    """The name of an entry of a manifold; the message of a failed solve gives only its number.
+    """The name of an entry of a manifold; the report on a failed projection gives its number.
 
     **Arguments:**
 
@@ -223,7 +206,7 @@ def entry_name(manifold: Manifold, position: int) -> str:
 
     **Returns:**
 
-    The path to the entry, such as `manifold['energy']`.
+    The path to the entry.
 
     **Raises:**
 
@@ -236,7 +219,7 @@ def entry_name(manifold: Manifold, position: int) -> str:
         import jax.numpy as jnp
 
         sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-        print(dfc.entry_name({"sphere": sphere}, 0))  # manifold['sphere']
+        print(dfc.entry_name({"sphere": sphere}, 0))
         ```
 
         ```text
@@ -260,12 +243,16 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
 
 
 def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`manifold` with each entry replaced by its conserved value, zero for a constraint."""
-    return jtu.tree_map(
-        lambda entry: jtu.tree_map(jnp.asarray, entry.conserved_value(t, y, args)),
-        manifold,
-        is_leaf=is_entry,
-    )
+    """`manifold` with each entry replaced by the value of `fn` that a solve started at
+    `(t, y, args)` conserves, zero for a constraint."""
+
+    def conserved(entry: FirstIntegral | Constraint) -> Values:
+        if isinstance(entry, FirstIntegral) and entry.value is not None:
+            return entry.value
+        change = jnp.zeros_like if isinstance(entry, Constraint) else jnp.asarray
+        return jtu.tree_map(change, entry.fn(t, y, args))
+
+    return jtu.tree_map(conserved, manifold, is_leaf=is_entry)
 
 
 _CONSTRAINTS_MAX = 2048
@@ -303,12 +290,11 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
 
 
 def _check_rate(name: str, rates: Any, output: Any) -> None:
-    for leaf in jtu.tree_leaves(rates):
-        if not is_real(leaf):
-            raise TypeError(
-                f"`rate` of `{name}` returns {dtype_of(leaf)}, but it must return real numbers, as "
-                "`fn` does. Return their real part."
-            )
+    if not all(map(is_real, jtu.tree_leaves(rates))):
+        raise TypeError(
+            f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must return real "
+            "numbers, as `fn` does. Return their real part."
+        )
     if tree_shapes(rates) != tree_shapes(output):
         raise ValueError(
             f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "

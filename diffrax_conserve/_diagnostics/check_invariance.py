@@ -16,9 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import (
-    AbstractConserved,
     Along,
     Constraint,
+    FirstIntegral,
     check_manifold,
     conserved_values,
     evaluate,
@@ -29,6 +29,8 @@ from .._manifold import (
 from .._projection.equations import equations_of, relative
 from .._projection.roundoff import hidden_terms
 from .._tree import ravel, unravel
+
+Entry = FirstIntegral | Constraint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,7 +200,7 @@ def _times(t: Real[ArrayLike, "*states"], ys: PyTree[Array]) -> Float[Array, " s
     return jnp.broadcast_to(t, shape)
 
 
-def _entries(manifold: Manifold) -> list[tuple[str, AbstractConserved]]:
+def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(jtu.keystr(path, simple=True, separator=".") or "manifold", e) for path, e in flat]
 
@@ -217,7 +219,7 @@ def _measure(
 
 
 def _relative_sizes(
-    entry: AbstractConserved, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
+    entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
 ) -> tuple[Array, Array, Array]:
     """The largest relative defect and residual of an entry, and whether its gradient is zero."""
     vector = ravel(y)
@@ -254,7 +256,7 @@ def _relative_sizes(
 
 def _verdict(
     name: str,
-    entry: AbstractConserved,
+    entry: Entry,
     rtol: float,
     defects: np.ndarray,
     residuals: np.ndarray,

@@ -1,6 +1,7 @@
 """The drift of a solution from a manifold."""
 
 from collections.abc import Callable
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,7 +13,6 @@ from jaxtyping import Array
 from .._balance import has_rates, integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
-    AbstractConserved,
     FirstIntegral,
     check_manifold,
     conserved_values,
@@ -124,7 +124,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     gained = _gained(sol, manifold, args, values)
 
     # The rates are integrated from the start of the solve, at which a given `value` holds.
-    def at_start(entry: AbstractConserved, value: Values, gained: Values) -> Values:
+    def at_start(entry: Any, value: Values, gained: Values) -> Values:
         given = isinstance(entry, FirstIntegral) and entry.value is not None
         return value if given else tree_sub(value, gained)
 

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -85,7 +84,7 @@ class Staged(AbstractProjection):
             )
         y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
-            check_metric(projection.metric, problem.state(candidate))
+            check_metric(projection.metric, problem.like)
             part = _restricted(problem, self.names[:number], projection)
             y, info = projection.solve(part, y)
             infos.append(info)
