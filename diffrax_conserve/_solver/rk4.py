@@ -50,12 +50,7 @@ class RK4(dfx.AbstractSolver[None]):
         return 4
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> None:
         del terms, t0, t1, y0, args
 
@@ -77,11 +72,14 @@ class RK4(dfx.AbstractSolver[None]):
         def stage(t: RealScalarLike, y: Y) -> Y:
             return terms.vf_prod(t, y, args, control)
 
+        def moved(y: Y, part: float, k: Y) -> Y:
+            return jtu.tree_map(lambda a, b: a + part * b, y, k)
+
         def end(y0: Y) -> Y:
             k1 = stage(t0, y0)
-            k2 = stage(middle, _axpy(0.5, k1, y0))
-            k3 = stage(middle, _axpy(0.5, k2, y0))
-            k4 = stage(t1, _axpy(1.0, k3, y0))
+            k2 = stage(middle, moved(y0, 0.5, k1))
+            k3 = stage(middle, moved(y0, 0.5, k2))
+            k4 = stage(t1, moved(y0, 1.0, k3))
             return jtu.tree_map(
                 lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4
             )
@@ -95,7 +93,3 @@ class RK4(dfx.AbstractSolver[None]):
 
 
 RK4.__init__.__doc__ = """**Arguments:** None"""
-
-
-def _axpy(factor: float, k: Y, y: Y) -> Y:
-    return jtu.tree_map(lambda a, b: b + factor * a, k, y)

@@ -18,11 +18,11 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 
     diffrax keeps the stages $k_i = f(t + c_i h, y + h \sum_j a_{ij} k_j)$ of a step in one array,
     which a loop over the stages updates in place. In a batch every stage then goes through memory.
-    Written out, the whole step is one expression, which XLA keeps in registers. The method, steps,
-    error estimate and dense output are the same up to the order of summation, and a batch of small
+    Written out, the whole step is one expression, which XLA keeps in registers: with the same
+    method, steps, error estimate and dense output, up to the order of summation, a batch of small
     systems is about ten times as fast (`benchmarks/cost/overhead.py`). Compile time grows with the
-    number of stages times the size of the vector field. For a large system or a single long solve
-    there is no gain.
+    number of stages times the size of the vector field. A large system or a single long solve gains
+    nothing.
 
     !!! example
 
@@ -82,9 +82,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> VF | None:
-        """The first slope, if the method reuses the last stage of a step in the next ("first same
-        as last")."""
-        del t1
+        del t1  # "First same as last": such a method reuses the last stage of a step in the next.
         return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
 
     def step(
@@ -100,7 +98,10 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         tableau = self.solver.tableau
         control = terms.contr(t0, t1)
 
-        slope = _first_slope(terms, t0, y0, args, solver_state, made_jump)
+        if solver_state is None or made_jump is True:
+            slope = terms.vf(t0, y0, args)
+        else:
+            slope = lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
         increments, y = [terms.prod(slope, control)], y0
         for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
             y = _displaced(y0, row, increments)
@@ -125,30 +126,15 @@ Unrolled.__init__.__doc__ = """**Arguments:**
 """
 
 
-def _first_slope(
-    terms: dfx.AbstractTerm,
-    t0: RealScalarLike,
-    y0: Y,
-    args: Args,
-    known: VF | None,
-    made_jump: BoolScalarLike,
-) -> VF:
-    """The slope at the start of a step: the `known` one from the last step, unless there was a
-    jump."""
-    if known is None:
-        return terms.vf(t0, y0, args)
-    if made_jump is False:
-        return known
-    return lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: known)
-
-
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
     """The weighted sum of the increments, without those whose weight is zero."""
     used = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
     factors, terms = zip(*used, strict=True)
-    return jtu.tree_map(
-        lambda *leaves: sum(w * x for w, x in zip(factors, leaves, strict=True)), *terms
-    )
+
+    def total(*leaves: Any) -> Any:
+        return sum(w * x for w, x in zip(factors, leaves, strict=True))
+
+    return jtu.tree_map(total, *terms)
 
 
 def _displaced(y: Y, weights: np.ndarray, increments: list[Y]) -> Y:
