@@ -1,6 +1,7 @@
 """A check by autodiff that a manifold is conserved by a vector field."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,7 @@ from .._manifold import (
     rate_of,
     slope_like,
 )
+from .._printing import printed
 from .._projection.equations import equations_of, relative
 from .._projection.roundoff import hidden_terms
 from .._tree import ravel, unravel
@@ -67,19 +69,18 @@ class InvarianceReport:
         return all(entry.ok for entry in self.entries)
 
     def __str__(self) -> str:
-        width = max(len(entry.name) for entry in self.entries)
         verdict = "conserved" if self.ok else "NOT CONSERVED"
-        lines = [
+        title = (
             f"{verdict}: derivatives along the flow at {self.num_states} states, "
-            f"relative tolerance {self.rtol:.1e}",
-            f"  {'':{width}}  {'':14}  largest relative defect",
-        ]
+            f"relative tolerance {self.rtol:.1e}"
+        )
+        rows = {"": f"{'':14}  largest relative defect"}
         for entry in self.entries:
             result = "conserved" if entry.ok else f"NOT conserved, see state {entry.state}"
             if entry.is_constant:
                 result += "; its gradient is zero at every state: nothing is kept"
-            lines.append(f"  {entry.name:{width}}  {entry.kind:14}  {entry.defect:<8.1e}  {result}")
-        return "\n".join(lines)
+            rows[entry.name] = f"{entry.kind:14}  {entry.defect:<8.1e}  {result}"
+        return printed(title, rows)
 
 
 def check_invariance(
@@ -150,8 +151,7 @@ def check_invariance(
     check_manifold(manifold)
     if isinstance(vector_field, dfx.ODETerm):
         vector_field = vector_field.vector_field
-    ys = _batch(states, jr.key(0) if key is None else key, num_states)
-    ts = _times(t, ys)
+    ts, ys = _batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
     try:
@@ -173,31 +173,28 @@ def check_invariance(
 _ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
 
 
-def _batch(states: Any, key: PRNGKeyArray, num_states: int) -> PyTree[Array]:
+def _batch(
+    t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
+) -> tuple[Float[Array, " states"], PyTree[Array]]:
     if callable(states):
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
     states = jtu.tree_map(jnp.asarray, states)
     leaves = jtu.tree_leaves(states)
-    sizes = {x.shape[0] if x.ndim else None for x in leaves}
-    if len(sizes) != 1 or sizes & {None, 0} or not all(map(eqx.is_inexact_array, leaves)):
+    sizes = {x.shape[:1] for x in leaves}
+    if len(sizes) != 1 or sizes & {(), (0,)} or not all(map(eqx.is_inexact_array, leaves)):
         raise ValueError(
             "`states` must be a sampler `key -> y`, or a PyTree of floating point arrays with the "
             f"same leading axis over the states, but it is {eqx.tree_pformat(states)}. "
             + _ONE_STATE
         )
-    return states
-
-
-def _times(t: Real[ArrayLike, "*states"], ys: PyTree[Array]) -> Float[Array, " states"]:
-    leaves = jtu.tree_leaves(ys)
+    (shape,) = sizes
     t = jnp.asarray(t, jnp.finfo(jnp.result_type(*leaves)).dtype)
-    shape = (leaves[0].shape[0],)
     if t.shape not in ((), shape):
         raise ValueError(
             f"`t` must be one time or one for each of the {shape[0]} states, but it has shape "
             f"{t.shape}."
         )
-    return jnp.broadcast_to(t, shape)
+    return jnp.broadcast_to(t, shape), states
 
 
 def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
@@ -206,22 +203,17 @@ def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
 
 
 @eqx.filter_jit
+@ft.partial(eqx.filter_vmap, in_axes=(None, None, 0, 0, None))
 def _measure(
-    vector_field: Callable, manifold: Manifold, ts: Float[Array, " states"], ys: Any, args: Args
-) -> list[tuple[Float[Array, " states"], Float[Array, " states"], Bool[Array, " states"]]]:
-    """The relative defects and residuals of each entry at each state, largest over elements, and
-    whether its gradient is zero there."""
-
-    def at_one_state(t: Float[Array, ""], y: Any) -> list[tuple[Array, Array, Array]]:
-        return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
-
-    return jax.vmap(at_one_state)(ts, ys)
+    vector_field: Callable, manifold: Manifold, t: Float[Array, ""], y: Any, args: Args
+) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]]:
+    """The largest relative defect and residual of each entry, and whether its gradient is zero."""
+    return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
 
 
 def _relative_sizes(
     entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
 ) -> tuple[Array, Array, Array]:
-    """The largest relative defect and residual of an entry, and whether its gradient is zero."""
     vector = ravel(y)
     dtype = vector.dtype
     t = t.astype(dtype)
