@@ -35,18 +35,15 @@ class PackedTarget(eqx.Module):
     """A `Target` in the form in which `dense_info` stores it: only arrays are leaves."""
 
     arrays: PyTree[Array]
-    static: Any = eqx.field(static=True)
+    static: Target = eqx.field(static=True)
 
     def __init__(self, target: Target):
         # Python numbers are kept static, because a function may use them as a shape or an index.
-        arrays, static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
+        arrays, self.static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
-        leaves, treedef = jtu.tree_flatten(static)
-        self.static = (tuple(leaves), treedef)
 
     def unpack(self) -> Target:
-        leaves, treedef = self.static
-        return eqx.combine(self.arrays, jtu.tree_unflatten(treedef, leaves))
+        return eqx.combine(self.arrays, self.static)
 
 
 @final

@@ -23,25 +23,20 @@ def _arrays(value: Values | None) -> Values | None:
 class FirstIntegral(eqx.Module):
     r"""A function $I(t, y, args)$ that is constant along the exact solution, or has a known rate.
 
-    The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
-    that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
+    The manifold is $\{y : I(t, y, args) = \text{conserved value}\}$. The conserved value is
+    $I(t_0, y_0, args)$ of the solve in which it is used, or `value`.
 
-    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*: the conserved
-    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve computes
-    this integral step by step, by Gauss quadrature with four nodes along the dense output of the
-    wrapped solver, and carries it in the solver state. Examples are the balance of energy and
-    dissipated power, and an entropy that decreases; see "Balance laws" in the guide.
+    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*, such as that of
+    energy and dissipated power: the conserved value at $t$ is larger by $\int_{t_0}^t
+    \mathrm{rate}(s, y(s), args)\, ds$, which a solve computes by Gauss quadrature with four nodes
+    along the dense output of the wrapped solver. See "Balance laws" in the guide.
 
     !!! example
 
         ```python
         import diffrax_conserve as dfc
 
-        def energy(t, y, args):
-            q, p = y
-            return 0.5 * (p**2 + q**2)
-
-        integral = dfc.FirstIntegral(energy)
+        energy = dfc.FirstIntegral(lambda t, y, args: (y[0] ** 2 + y[1] ** 2) / 2)
         ```
     """
 
@@ -60,18 +55,16 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every element is one first integral.
-- `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
-    from the initial state of the solve. With `rate` it is the value at the start of the solve.
+- `value`: the conserved value at the start of a solve, a PyTree like the one that `fn` returns.
+    Default: that of the initial state.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
-    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
+    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. Default: zero.
 """
 
 
 @final
 class Constraint(eqx.Module):
     r"""A function $g(t, y, args)$ that is zero along the exact solution.
-
-    The manifold is $\{y : g(t, y, args) = 0\}$.
 
     !!! example
 
@@ -99,13 +92,9 @@ class Constraint(eqx.Module):
 
         - `vector_field`: $f$, called as `vector_field(t, y, args)`.
 
-        **Returns:**
-
-        A [`diffrax_conserve.Constraint`][].
-
         **Raises:**
 
-        `TypeError` if `vector_field` is not callable.
+        `TypeError` if `vector_field` cannot be called so.
 
         !!! example
 
@@ -127,9 +116,8 @@ class Constraint(eqx.Module):
 
 Constraint.__init__.__doc__ = r"""**Arguments:**
 
-- `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
-    be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
-    constraint.
+- `fn`: a callable `fn(t, y, args)`, as of a [`diffrax_conserve.FirstIntegral`][]. Every element of
+    what it returns is one scalar constraint.
 """
 
 

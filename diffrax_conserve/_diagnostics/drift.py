@@ -44,9 +44,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too (as in
-        `SaveAt(t0=True, steps=True)`) to get the drift from the initial state. For a batch of
-        solutions use `jax.vmap`. Values saved by a `SaveAt(fn=...)` are treated as states.
+    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too, as in
+        `SaveAt(t0=True, steps=True)`, for the drift from the initial state. For a batch of
+        solutions use `jax.vmap`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
@@ -70,16 +70,11 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         import jax.numpy as jnp
 
         square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-        sol = diffrax.diffeqsolve(
-            term,
-            dfc.ManifoldProjection(diffrax.Tsit5(), square),
-            t0=0,
-            t1=9,
-            dt0=0.1,
-            y0=jnp.array([1.0, 0.0]),
-            saveat=diffrax.SaveAt(t0=True, steps=True),
-        )
+        saveat = diffrax.SaveAt(t0=True, steps=True)
+        y0 = jnp.array([1.0, 0.0])
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, y0, saveat=saveat)
         print(f"{jnp.max(jnp.abs(dfc.drift(sol, square))):.0e}")
         ```
 

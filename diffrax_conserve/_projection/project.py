@@ -52,10 +52,9 @@ def project(
 
     **Returns:**
 
-    The state on the manifold, shaped like `y`, and a
-    [`diffrax_conserve.ProjectionInfo`][]. `info.ok` tells whether it succeeded: nothing is
-    raised at run time. If it did, each residual is within 16 units of roundoff of its scale, to
-    which the terms count that cancel inside `fn`, unless `projection` has other tolerances.
+    The state on the manifold, shaped like `y`, and a [`diffrax_conserve.ProjectionInfo`][], whose
+    `ok` tells whether it succeeded: nothing is raised at run time. If it did, each residual is
+    within 16 units of roundoff of its scale, unless `projection` has other tolerances.
 
     **Raises:**
 

@@ -53,25 +53,24 @@ def tangent(
     is the nearest to $f$ in the metric with this property.
 
     **Mechanisms.** For positions $q$ and velocities $v$ with masses $m$ and forces $F$ let
-    $f = (v, F/m)$, take the velocity constraint that [`diffrax_conserve.Constraint.derivative`][]
-    derives from the position constraint, and the metric $(\infty, m)$: then
-    $m v' = F + G^\top \lambda$, the equations of motion, whose `multipliers` are the forces of the
-    constraints. Projecting the solution of $f$ does not solve these equations. See "Constrained
-    mechanics" in the guide.
+    $f = (v, F/m)$, with the velocity constraint from [`diffrax_conserve.Constraint.derivative`][]
+    and the metric $(\infty, m)$: then $m v' = F + G^\top \lambda$, the equations of motion, whose
+    `multipliers` are the forces of the constraints. Projecting the solution of $f$ does not solve
+    these equations. See "Constrained mechanics" in the guide.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same arguments. A
         `FirstIntegral` with a `rate` changes at that rate.
-    - `metric`: a PyTree like the state of positive weights, scalars or arrays shaped like the
-        leaves. An infinite weight leaves its component of the field unchanged. Default: Euclidean.
+    - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][]; an infinite weight leaves its
+        component of the field unchanged.
     - `gain`: the decay rate of the residual, in units of one over time; negative for a solve
         backward in time.
 
     **Returns:**
 
-    A [`diffrax_conserve.TangentField`][], which is called like `vector_field`.
+    A [`diffrax_conserve.TangentField`][].
 
     **Raises:**
 
@@ -123,10 +122,8 @@ def tangent(
 
 @final
 class TangentField(eqx.Module):
-    """A vector field made tangent to a manifold; see [`diffrax_conserve.tangent`][].
-
-    Call it as any vector field, `field(t, y, args)`.
-    """
+    """A vector field made tangent to a manifold, called as any other one, `field(t, y, args)`; see
+    [`diffrax_conserve.tangent`][]."""
 
     vector_field: Callable[[RealScalarLike, Any, Args], Any]
     manifold: Manifold
