@@ -102,12 +102,8 @@ class Constraint(eqx.Module):
             import diffrax_conserve as dfc
             import jax.numpy as jnp
 
-            def free_fall(t, y, args):
-                q, v = y
-                return v, jnp.array([0.0, -9.81])
-
             rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
-            along_the_circle = rod.derivative(free_fall)
+            velocity = rod.derivative(lambda t, y, args: (y[1], jnp.array([0.0, -9.81])))
             ```
         """
         check_vector_field(vector_field)
@@ -204,14 +200,12 @@ def entry_name(manifold: Manifold, position: int) -> str:
 
         ```python
         import diffrax_conserve as dfc
-        import jax.numpy as jnp
 
-        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-        print(dfc.entry_name({"sphere": sphere}, 0))
+        print(dfc.entry_name(dfc.systems.RigidBody().manifold, 0))
         ```
 
         ```text
-        manifold['sphere']
+        manifold['energy']
         ```
     """
     names = [name for name, _ in named_entries(manifold)]
@@ -235,10 +229,9 @@ def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) ->
     `(t, y, args)` conserves, zero for a constraint."""
 
     def conserved(entry: FirstIntegral | Constraint) -> Values:
-        if isinstance(entry, FirstIntegral) and entry.value is not None:
-            return entry.value
-        change = jnp.zeros_like if isinstance(entry, Constraint) else jnp.asarray
-        return jtu.tree_map(change, entry.fn(t, y, args))
+        given = getattr(entry, "value", None)
+        found = entry.fn(t, y, args) if given is None else given
+        return jtu.tree_map(jnp.zeros_like if isinstance(entry, Constraint) else jnp.asarray, found)
 
     return jtu.tree_map(conserved, manifold, is_leaf=is_entry)
 
@@ -261,7 +254,13 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
                 )
         count += tree_size(output)
         if rate_of(entry) is not None:
-            _check_rate(name, eqx.filter_eval_shape(entry.rate, t, y, args), output)
+            rates = eqx.filter_eval_shape(entry.rate, t, y, args)
+            _check_shapes(f"`rate` of `{name}` returns", rates, output)
+            if not all(map(is_real, jtu.tree_leaves(rates))):
+                raise TypeError(
+                    f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must "
+                    "return real numbers, as `fn` does. Return their real part."
+                )
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
     if count > unknowns:
@@ -274,19 +273,6 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
             f"`manifold` has {count} scalar constraints, but a projection solves with a full "
             f"matrix of at most {_CONSTRAINTS_MAX} rows. Project parts of the state by solves of "
             "their own."
-        )
-
-
-def _check_rate(name: str, rates: Any, output: Any) -> None:
-    if not all(map(is_real, jtu.tree_leaves(rates))):
-        raise TypeError(
-            f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must return real "
-            "numbers, as `fn` does. Return their real part."
-        )
-    if tree_shapes(rates) != tree_shapes(output):
-        raise ValueError(
-            f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "
-            f"{tree_shapes(output)}. Return the derivative of each element in its place."
         )
 
 
@@ -305,8 +291,12 @@ def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, ar
         if isinstance(entry, FirstIntegral):
             check_numbers("value", value)
             output = eqx.filter_eval_shape(entry.fn, t, y, args)
-            if tree_shapes(output) != tree_shapes(value):
-                raise ValueError(
-                    f"The conserved value of `{name}` has the structure {tree_shapes(value)}, but "
-                    f"its `fn(t, y, args)` returns {tree_shapes(output)}. Both must be the same."
-                )
+            _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
+
+
+def _check_shapes(what: str, given: Any, output: Any) -> None:
+    if tree_shapes(given) != tree_shapes(output):
+        raise ValueError(
+            f"{what} {tree_shapes(given)}, but its `fn(t, y, args)` returns {tree_shapes(output)}. "
+            "Both must be the same."
+        )

@@ -69,17 +69,12 @@ class Directional(AbstractProjection):
                 f"`Directional` moves along one direction, but `manifold` has {size} scalar "
                 "constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
             )
-        if problem.step is None:
-            raise ValueError(
-                "`Directional` moves along the error estimate of a step, but there is no step "
-                "here. Use it in a `ManifoldProjection`. Elsewhere pass `projection=Newton()`."
-            )
-        error = problem.step.error
+        error = None if problem.step is None else problem.step.error
         if error is None:
             raise ValueError(
-                "`Directional` moves along the error estimate of the wrapped solver, but this has "
-                "none. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, or pass "
-                "`projection=SimplifiedNewton()`."
+                "`Directional` moves along the error estimate of a step of the wrapped solver, but "
+                "there is none. In a `ManifoldProjection` wrap a solver with an embedded method, "
+                "such as `diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
         # Normalised: the result does not depend on the length, and products with the gradient do
         # not overflow or underflow.
@@ -97,7 +92,7 @@ Directional.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`ValueError`, when it is used and before compilation: with more than one scalar constraint, with a
-solver that has no error estimate, or in [`diffrax_conserve.project`][], where there is no step.
-`ValueError` from `ManifoldProjection` for a `diffrax.HalfSolver`, whose error estimate has no sign.
+`ValueError`, before compilation: with more than one scalar constraint, with a solver that has no
+error estimate, in [`diffrax_conserve.project`][], where there is no step, and with a
+`diffrax.HalfSolver`, whose error estimate has no sign.
 """

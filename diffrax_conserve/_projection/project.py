@@ -121,15 +121,14 @@ def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> N
     dtypes = [dtype_of(x) for x in jtu.tree_leaves(y)]
     for leaf, dtype in zip(jtu.tree_leaves(y), dtypes, strict=True):
         if not jnp.issubdtype(dtype, kind):
-            remedy = (
-                "floating-point states, real or complex. Convert it, for example by "
-                "`jnp.asarray(..., dtype=float)`."
-                if kind is jnp.inexact
-                else "real floating-point states. Split a complex leaf into its real and its "
-                "imaginary part."
-            )
             got = f"a leaf of dtype {dtype}" if eqx.is_array_like(leaf) else f"the leaf {leaf!r}"
-            raise TypeError(f"The state has {got}, but {user} needs {remedy}")
+            wanted = "floating-point states, real or complex"
+            if kind is jnp.floating:
+                wanted = "real floating-point states; split a complex leaf into two"
+            raise TypeError(
+                f"The state has {got}, but {user} needs {wanted}. Convert it, for example by "
+                "`jnp.asarray(..., dtype=float)`."
+            )
     if len({jnp.finfo(dtype).dtype for dtype in dtypes}) > 1:
         raise TypeError(
             f"The state has leaves of the dtypes {', '.join(map(str, dtypes))}, but {user} needs "

@@ -85,8 +85,7 @@ def tangent(
         import jax.numpy as jnp
 
         def free_fall(t, y, args):
-            q, v = y
-            return v, jnp.array([0.0, -9.81])
+            return y[1], jnp.array([0.0, -9.81])
 
         rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
         pendulum = dfc.tangent(free_fall, rod.derivative(free_fall), metric=(jnp.inf, 1.0))
