@@ -1,6 +1,5 @@
 """The classical fourth-order Runge-Kutta method, written out."""
 
-from collections.abc import Callable
 from typing import ClassVar, final
 
 import diffrax as dfx
@@ -21,8 +20,7 @@ class RK4(dfx.AbstractSolver[None]):
 
     It has no error estimate: use it with `diffrax.ConstantStepSize` or `diffrax.StepTo`, or inside
     `diffrax.HalfSolver` for adaptive steps. Dense output is the cubic Hermite polynomial through
-    both ends, of fourth order too; the vector field at the end of a step is evaluated only if dense
-    output is requested.
+    both ends, of fourth order too.
 
     !!! example
 
@@ -41,9 +39,7 @@ class RK4(dfx.AbstractSolver[None]):
     """
 
     term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.ThirdOrderHermitePolynomialInterpolation]] = (
-        dfx.ThirdOrderHermitePolynomialInterpolation
-    )
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
 
     def order(self, terms: dfx.AbstractTerm) -> int:
         del terms

@@ -36,10 +36,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         solver = dfc.ManifoldProjection(dfc.Unrolled(diffrax.Dopri8()), radius)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
 
-        @jax.vmap
-        def solve(y0):
-            return diffrax.diffeqsolve(term, solver, t0=0, t1=9, dt0=0.3, y0=y0).ys
-
+        solve = jax.vmap(lambda y0: diffrax.diffeqsolve(term, solver, 0, 9, 0.3, y0).ys)
         ys = solve(jnp.ones((1000, 2)))
         ```
 
