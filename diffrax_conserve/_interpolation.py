@@ -24,7 +24,7 @@ from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.equations import any_lane
 from ._projection.step import Step
 from ._projection.target import Target
-from ._tree import tree_add, tree_scale, tree_sub, tree_tangents
+from ._tree import tree_scale, tree_sub, tree_tangents
 
 # The candidates that are tried, closer and closer to the end of the step; the last is the end.
 _CANDIDATES = 12
@@ -99,14 +99,13 @@ def _projected(
         index, going, last = carry
         share = 0.5 ** (index * (index + 1) // 2)
         share = jnp.where(index == _CANDIDATES - 1, 0, share)
-        between = tree_add(end, tree_scale(share, tree_sub(candidate, end)))
+
         # The ends are taken as they are: one may not be finite, and a sum is rounded.
-        start = jtu.tree_map(
-            lambda a, b, c: jnp.where(index == 0, a, jnp.where(share == 0, b, c)),
-            candidate,
-            end,
-            between,
-        )
+        def between(a: Array, b: Array) -> Array:
+            inside = b + share.astype(b.real.dtype) * (a - b)
+            return jnp.where(index == 0, a, jnp.where(share == 0, b, inside))
+
+        start = jtu.tree_map(between, candidate, end)
         y, ok = project(t, start, step)
         y = jtu.tree_map(lambda x, y: jnp.where(going, jnp.where(ok, x, jnp.nan), y), y, last)
         more = going & ~ok & (index + 1 < _CANDIDATES)

@@ -33,19 +33,18 @@ def check_number(
 ) -> None:
     """Raises unless `value` is a real number, an array of real numbers (for a `vmap`), a tracer,
     or, if `optional`, `None`. It must be at least `least` and greater than `above`; NaN is
-    rejected.
-    """
+    rejected."""
     if isinstance(value, jax.core.Tracer) or (optional and value is None):
         return
     ending = ", or `None`." if optional else "."
     if not is_real(value):
         raise TypeError(f"`{name}` is {value!r}, but it must be a real number{ending}")
-    number = np.asarray(value)
+    number, wanted = np.asarray(value), ""
     if above is not None and not np.all(number > above):
         wanted = "positive" if above == 0 else f"greater than {above:g}"
-        raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
     if least is not None and not np.all(number >= least):
         wanted = f"at least {least:g}" if np.isfinite(least) else "a number"
+    if wanted:
         raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
 
 

@@ -30,7 +30,6 @@ def tree_add(a: Y, b: Y) -> Y:
 
 
 def tree_sub(a: Y, b: Y) -> Y:
-    """`a - b`."""
     return jtu.tree_map(lambda x, y: x - y, a, b)
 
 

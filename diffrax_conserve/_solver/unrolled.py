@@ -1,5 +1,7 @@
 """Explicit Runge-Kutta methods with their stages written out."""
 
+import functools as ft
+import operator
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
@@ -125,13 +127,12 @@ Unrolled.__init__.__doc__ = """**Arguments:**
 
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
     """The weighted sum of the increments, without those whose weight is zero."""
-    used = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
-    factors, terms = zip(*used, strict=True)
-
-    def total(*leaves: Any) -> Any:
-        return sum(w * x for w, x in zip(factors, leaves, strict=True))
-
-    return jtu.tree_map(total, *terms)
+    parts = [
+        jtu.tree_map(ft.partial(operator.mul, float(weight)), k)
+        for weight, k in zip(weights, increments, strict=False)
+        if weight != 0
+    ]
+    return jtu.tree_map(lambda *leaves: sum(leaves), *parts)
 
 
 def _displaced(y: Y, weights: np.ndarray, increments: list[Y]) -> Y:
