@@ -154,6 +154,11 @@ def is_entry(x: Any) -> bool:
     return isinstance(x, FirstIntegral | Constraint)
 
 
+def has_value(entry: Any) -> bool:
+    """Whether the conserved value at the start of a solve does not depend on the solve."""
+    return isinstance(entry, Constraint) or entry.value is not None
+
+
 def rate_of(entry: Any) -> ConstraintFn | None:
     return entry.rate if isinstance(entry, FirstIntegral) else None
 

@@ -1,7 +1,6 @@
 """The drift of a solution from a manifold."""
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -13,10 +12,10 @@ from jaxtyping import Array
 from .._balance import has_rates, integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
-    FirstIntegral,
     check_manifold,
     conserved_values,
     evaluate,
+    has_value,
     is_entry,
     named_entries,
 )
@@ -33,14 +32,12 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     $$\frac{I(t_k, y_k) - I_0}{|I_0| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
-    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
+    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$. Roundoff is
+    proportional to this scale.
 
     For a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
     is subtracted from the numerator. It is computed along the dense output of the (wrapped) solver,
     which the solution must have.
-
-    Roundoff is proportional to this scale. It is not zero for a momentum that vanishes as the sum
-    of large terms.
 
     **Arguments:**
 
@@ -100,7 +97,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
         )
     for name, entry in named_entries(manifold):
-        if sol.ts.size == 1 and isinstance(entry, FirstIntegral) and entry.value is None:
+        if sol.ts.size == 1 and not has_value(entry):
             raise ValueError(
                 f"`sol` holds one saved state, so the drift of `{name}` from an earlier one is "
                 "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
@@ -119,11 +116,13 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     gained = _gained(sol, manifold, args, values)
 
     # The rates are integrated from the start of the solve, at which a given `value` holds.
-    def at_start(entry: Any, value: Values, gained: Values) -> Values:
-        given = isinstance(entry, FirstIntegral) and entry.value is not None
-        return value if given else tree_sub(value, gained)
-
-    values = jtu.tree_map(at_start, manifold, values, gained(t0), is_leaf=is_entry)
+    values = jtu.tree_map(
+        lambda entry, value, gained: value if has_value(entry) else tree_sub(value, gained),
+        manifold,
+        values,
+        gained(t0),
+        is_leaf=is_entry,
+    )
 
     def at(t: Array, y: Y) -> Values:
         padded = ~jnp.isfinite(t)

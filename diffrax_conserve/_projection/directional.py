@@ -28,8 +28,7 @@ class Directional(AbstractProjection):
     Where $w$ is nearly tangent to the manifold, the correction is long, or does not exist and the
     projection fails. The order of the wrapped solver is kept if the angle between $w$ and the
     manifold does not vanish with the step size. At saved times inside a step and in dense output
-    the direction is that of the step; where the projection fails there, it starts again closer and
-    closer to the nearer end of the step.
+    the direction is that of the step.
 
     Derivatives follow from the implicit function theorem for $\lambda$; they are NaN where the sine
     of the angle between $w$ and the manifold is below the cube root of roundoff.

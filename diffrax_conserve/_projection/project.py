@@ -15,6 +15,7 @@ from .._manifold import (
     check_outputs,
     check_values,
     conserved_values,
+    has_value,
     is_entry,
     named_entries,
 )
@@ -100,7 +101,7 @@ def given_values(
     own = conserved_values(manifold, t, y, args)
     if value is None:
         for name, entry in named_entries(manifold):
-            if isinstance(entry, FirstIntegral) and entry.value is None:
+            if not has_value(entry):
                 raise ValueError(
                     f"`{name}` has no conserved value, so every state would do. Pass `value=...`, "
                     "for example `value=integral.fn(t, y_start, args)`, or write "

@@ -13,13 +13,13 @@ from jaxtyping import Array, ArrayLike, PyTree
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
-    FirstIntegral,
     check_manifold,
     check_outputs,
     check_values,
     check_vector_field,
     conserved_values,
     evaluate,
+    has_value,
     named_entries,
     rate_of,
     slope_like,
@@ -109,12 +109,12 @@ def tangent(
     check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
-        no_value = isinstance(entry, FirstIntegral) and entry.value is None
-        if damped and (no_value or rate_of(entry) is not None):
+        why = "" if has_value(entry) else "has no value that it could return to"
+        why = why if rate_of(entry) is None else "changes at its `rate`"
+        if damped and why:
             raise ValueError(
-                f"`gain` is {gain}, but `{name}` "
-                + ("has no value that it could return to" if no_value else "changes at its `rate`")
-                + ". Write `FirstIntegral(fn, value=...)` without a `rate`, or leave `gain` out."
+                f"`gain` is {gain}, but `{name}` {why}. Write `FirstIntegral(fn, value=...)` "
+                "without a `rate`, or leave `gain` out."
             )
     return TangentField(vector_field, manifold, positive_weights(metric), gain)
 

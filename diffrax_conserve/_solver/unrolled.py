@@ -5,7 +5,6 @@ import operator
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -72,17 +71,13 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     def strong_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         return self.solver.strong_order(terms)
 
-    def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
-        return self.solver.error_order(terms)
-
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
-    ) -> VF | None:
-        del t1  # "First same as last": such a method reuses the last stage of a step in the next.
-        return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
+    ) -> None:
+        del terms, t0, t1, y0, args
 
     def step(
         self,
@@ -91,27 +86,25 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: VF | None,
+        solver_state: None,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y, DenseInfo, VF | None, dfx.RESULTS]:
+    ) -> tuple[Y, Y, DenseInfo, None, dfx.RESULTS]:
+        # "First same as last" would save nothing: in a batch both branches of the choice between
+        # the last slope and a new one are computed, and a projected state has a new slope.
+        del solver_state, made_jump
         tableau = self.solver.tableau
         control = terms.contr(t0, t1)
 
-        if solver_state is None or made_jump is True:
-            slope = terms.vf(t0, y0, args)
-        else:
-            slope = lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
-        increments, y = [terms.prod(slope, control)], y0
+        increments, y = [terms.vf_prod(t0, y0, args, control)], y0
         for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
             y = _displaced(y0, row, increments)
-            slope = terms.vf(t0 + float(fraction) * (t1 - t0), y, args)
-            increments.append(terms.prod(slope, control))
+            time = t0 + float(fraction) * (t1 - t0)
+            increments.append(terms.vf_prod(time, y, args, control))
         # "Solution same as last": the last stage is evaluated at the solution.
         y1 = y if tableau.ssal else _displaced(y0, tableau.b_sol, increments)
         error = _combined(tableau.b_error, increments)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *increments)
-        state = slope if tableau.fsal else None
-        return y1, error, dict(y0=y0, y1=y1, k=k), state, dfx.RESULTS.successful
+        return y1, error, dict(y0=y0, y1=y1, k=k), None, dfx.RESULTS.successful
 
 
 Unrolled.__init__.__doc__ = """**Arguments:**
