@@ -134,16 +134,8 @@ class TangentField(eqx.Module):
         return tree_add(slope, correction)
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Values:
-        r"""The multipliers $\lambda$; in a mechanism they are the forces of the constraints.
-
-        **Arguments:**
-
-        - `t`, `y`, `args`: as for the vector field; for many states use `jax.vmap`.
-
-        **Returns:**
-
-        A PyTree shaped like the values of the functions of the manifold.
-        """
+        r"""The multipliers $\lambda$, shaped like the values of the functions of the manifold; in a
+        mechanism they are the forces of the constraints. For many states use `jax.vmap`."""
         return self._solve(t, y, args)[2]
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
