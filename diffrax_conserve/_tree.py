@@ -70,7 +70,7 @@ def working_dtype(y: Y) -> jnp.dtype:
     return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
 
 
-def tree_size(a: PyTree[Array]) -> int:
+def tree_size(a: Any) -> int:
     """The number of scalars in `a`."""
     return sum(math.prod(jnp.shape(x)) for x in jtu.tree_leaves(a))
 

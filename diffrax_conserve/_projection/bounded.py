@@ -65,13 +65,15 @@ def box_of(
 
 
 def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
+    y = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
-        bound = jtu.tree_map(lambda _: bound, like)
+        bound = jtu.tree_map(lambda _: bound, y)
     remedy = "Give one number, or one bound (or an array) for each leaf of the state."
-    check_like(name, bound, like, remedy)
-    view = jax.eval_shape(real_view, like)
+    check_like(name, bound, y, remedy)
     return ravel(
-        jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, view)
+        jtu.tree_map(
+            lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, real_view(y)
+        )
     )
 
 

@@ -84,7 +84,7 @@ class Staged(AbstractProjection):
             )
         y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
-            check_metric(projection.metric, problem.like)
+            check_metric(projection.metric, problem.state(candidate))
             part = _restricted(problem, self.names[:number], projection)
             y, info = projection.solve(part, y)
             infos.append(info)
