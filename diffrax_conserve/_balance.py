@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ._manifold import AbstractConserved, evaluate, is_entry, named_entries, rate_of
+from ._manifold import evaluate, is_entry, named_entries, rate_of
 
 # Gauss quadrature of order eight, the highest order of any solver in diffrax.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -35,7 +35,7 @@ def refuse_rates(manifold: Manifold, user: str) -> None:
 def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by its rate, zero where it has none."""
 
-    def rate(entry: AbstractConserved, like: Any) -> Values:
+    def rate(entry: Any, like: Any) -> Values:
         fn = rate_of(entry)
         if fn is None:
             return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -53,10 +53,8 @@ def integrated_rates(
     args: Args,
     direction: RealScalarLike,
 ) -> Values:
-    """The integral of each rate along `path`, zero for an entry without one.
-
-    All times are those of the solver, that is `direction` times the times of the manifold.
-    """
+    """The integral of each rate along `path`, zero for an entry without one. All times are those of
+    the solver, that is `direction` times the times of the manifold."""
     half = (end - start) / 2
 
     def at(node: RealScalarLike) -> Values:
@@ -68,6 +66,6 @@ def integrated_rates(
     weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
 
     def total(x: Array) -> Array:
-        return jnp.sum(weights.astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1)) * x, axis=0)
+        return jnp.sum(jax.vmap(jnp.multiply)(weights.astype(x.dtype), x), axis=0)
 
     return jtu.tree_map(total, found)

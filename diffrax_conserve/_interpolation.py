@@ -7,6 +7,7 @@ of an event needs.
 """
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any, final
 
@@ -23,10 +24,9 @@ from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.equations import any_lane
 from ._projection.step import Step
 from ._projection.target import Target
-from ._tree import tree_add, tree_scale, tree_sub
+from ._tree import tree_scale, tree_sub, tree_tangents
 
-# The candidates that are tried. They approach the end of the step faster and faster; the last is
-# the end itself.
+# The candidates that are tried, closer and closer to the end of the step; the last is the end.
 _CANDIDATES = 12
 
 
@@ -35,18 +35,15 @@ class PackedTarget(eqx.Module):
     """A `Target` in the form in which `dense_info` stores it: only arrays are leaves."""
 
     arrays: PyTree[Array]
-    static: Any = eqx.field(static=True)
+    static: Target = eqx.field(static=True)
 
     def __init__(self, target: Target):
         # Python numbers are kept static, because a function may use them as a shape or an index.
-        arrays, static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
+        arrays, self.static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
-        leaves, treedef = jtu.tree_flatten(static)
-        self.static = (tuple(leaves), treedef)
 
     def unpack(self) -> Target:
-        leaves, treedef = self.static
-        return eqx.combine(self.arrays, jtu.tree_unflatten(treedef, leaves))
+        return eqx.combine(self.arrays, self.static)
 
 
 @final
@@ -75,7 +72,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
         t0 = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         early = jnp.abs(t0 - self.t0) < jnp.abs(self.t1 - t0)
-        end = jtu.tree_map(lambda a, b: jnp.where(early, a, b), *self.ends)
+        end = jtu.tree_map(ft.partial(jnp.where, early), *self.ends)
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         step = target.step(self.t0, self.t1, self.ends[0], self.error, lambda: self.inner)
@@ -85,13 +82,10 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             return y, info.ok
 
         # Arrays over which the functions of the manifold close become leaves.
-        t0 = jnp.asarray(t0)
         project = eqx.filter_closure_convert(project, t0, candidate, step)
         y, _ = _projected(project, t0, candidate, step, end)
         due = self.due
-        if due is None:
-            return y
-        return jtu.tree_map(lambda a, b: jnp.where(due, a, b), y, candidate)
+        return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
 
 @eqx.filter_custom_jvp
@@ -105,16 +99,15 @@ def _projected(
         index, going, last = carry
         share = 0.5 ** (index * (index + 1) // 2)
         share = jnp.where(index == _CANDIDATES - 1, 0, share)
-        between = tree_add(end, tree_scale(share, tree_sub(candidate, end)))
-        start = jtu.tree_map(
-            lambda a, b, c: jnp.where(index == 0, a, jnp.where(share == 0, b, c)),
-            candidate,
-            end,
-            between,
-        )
+
+        # The ends are taken as they are: one may not be finite, and a sum is rounded.
+        def between(a: Array, b: Array) -> Array:
+            inside = b + share.astype(b.real.dtype) * (a - b)
+            return jnp.where(index == 0, a, jnp.where(share == 0, b, inside))
+
+        start = jtu.tree_map(between, candidate, end)
         y, ok = project(t, start, step)
-        y = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.asarray(np.nan, x.dtype)), y)
-        y = jtu.tree_map(lambda a, b: jnp.where(going, a, b), y, last)
+        y = jtu.tree_map(lambda x, y: jnp.where(going, jnp.where(ok, x, jnp.nan), y), y, last)
         more = going & ~ok & (index + 1 < _CANDIDATES)
         return index + going.astype(int), more, y
 
@@ -129,8 +122,8 @@ def _projected_jvp(primals: Any, tangents: Any) -> Any:
     y, direct = _projected(*primals)
     given = primals[:-1], tangents[:-1]
     _, t_y = eqx.filter_jvp(lambda project, *args: project(*args)[0], *given)
-    t_y = jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, y, t_y)
-    return (y, direct), (tree_scale(jnp.where(direct, 1, jnp.nan), t_y), None)
+    t_y = tree_scale(jnp.where(direct, 1, jnp.nan), tree_tangents(y, t_y))
+    return (y, direct), (t_y, None)
 
 
 @dataclasses.dataclass(frozen=True)

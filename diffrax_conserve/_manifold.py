@@ -1,7 +1,5 @@
 """First integrals, constraints, and the PyTrees of them that define a manifold."""
 
-import abc
-import math
 from collections.abc import Callable
 from typing import Any, final
 
@@ -10,93 +8,63 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from ._along import Along
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
-from ._options import check_function, check_numbers, check_vector_field, dtype_of, is_real
-from ._tree import tree_shapes
+from ._options import check_function, check_numbers, dtype_of, is_real
+from ._tree import tree_shapes, tree_size
 
 
-class AbstractConserved(eqx.Module):
-    """One entry of a manifold: a function of `(t, y, args)` and its conserved value."""
-
-    fn: eqx.AbstractVar[ConstraintFn]
-
-    @abc.abstractmethod
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        """The value of `fn` that a solve started at `(t, y, args)` conserves."""
+def _arrays(value: Values | None) -> Values | None:
+    check_numbers("value", value)
+    # Arrays, so that a different value does not trigger another compilation.
+    return jtu.tree_map(jnp.asarray, value)
 
 
 @final
-class FirstIntegral(AbstractConserved):
+class FirstIntegral(eqx.Module):
     r"""A function $I(t, y, args)$ that is constant along the exact solution, or has a known rate.
 
-    The conserved value is $I(t_0, y_0, args)$ of the solve in which it is used, or `value` where
-    that is given; the manifold is $\{y : I(t, y, args) = \text{conserved value}\}$.
+    The manifold is $\{y : I(t, y, args) = \text{conserved value}\}$. The conserved value is
+    $I(t_0, y_0, args)$ of the solve in which it is used, or `value`.
 
-    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*: the conserved
-    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$. A solve computes
-    this integral step by step, by Gauss quadrature with four nodes along the dense output of the
-    wrapped solver, and carries it in the solver state. Examples are the balance of energy and
-    dissipated power, and an entropy that decreases; see "Balance laws" in the guide.
+    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*, such as that of
+    energy and dissipated power: the conserved value at $t$ is larger by $\int_{t_0}^t
+    \mathrm{rate}(s, y(s), args)\, ds$, which a solve computes by Gauss quadrature with four nodes
+    along the dense output of the wrapped solver. See "Balance laws" in the guide.
 
     !!! example
 
         ```python
         import diffrax_conserve as dfc
 
-        def energy(t, y, args):
-            q, p = y
-            return 0.5 * (p**2 + q**2)
-
-        integral = dfc.FirstIntegral(energy)
+        energy = dfc.FirstIntegral(lambda t, y, args: (y[0] ** 2 + y[1] ** 2) / 2)
         ```
     """
 
     fn: ConstraintFn
-    value: Values | None
-    rate: ConstraintFn | None
-
-    def __init__(
-        self,
-        fn: ConstraintFn,
-        *,
-        value: Values | None = None,
-        rate: ConstraintFn | None = None,
-    ):
-        self.fn = fn
-        self.rate = rate
-        check_numbers("value", value)
-        # Arrays, so that a different value does not trigger another compilation.
-        self.value = jtu.tree_map(
-            lambda x: x if isinstance(x, jax.Array) else jnp.asarray(x), value
-        )
+    value: Values | None = eqx.field(default=None, kw_only=True, converter=_arrays)
+    rate: ConstraintFn | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        _check_fn(self)
+        check_function("`fn` of a `FirstIntegral`", self.fn, "fn(t, y, args)", "real arrays")
         if self.rate is not None:
-            what = "the derivative of `fn` along the solution"
-            check_function("rate", "FirstIntegral", self.rate, "t, y, args", what)
-
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        return self.fn(t, y, args) if self.value is None else self.value
+            returns = "the derivative of `fn` along the solution"
+            check_function("`rate` of a `FirstIntegral`", self.rate, "rate(t, y, args)", returns)
 
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every element is one first integral.
-- `value`: the conserved value, a PyTree like the one that `fn` returns. By default it is computed
-    from the initial state of the solve. With `rate` it is the value at the start of the solve.
+- `value`: the conserved value at the start of a solve, a PyTree like the one that `fn` returns.
+    Default: that of the initial state.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
-    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. By default it is zero.
+    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. Default: zero.
 """
 
 
 @final
-class Constraint(AbstractConserved):
+class Constraint(eqx.Module):
     r"""A function $g(t, y, args)$ that is zero along the exact solution.
-
-    The manifold is $\{y : g(t, y, args) = 0\}$.
 
     !!! example
 
@@ -111,7 +79,7 @@ class Constraint(AbstractConserved):
     fn: ConstraintFn
 
     def __check_init__(self):
-        _check_fn(self)
+        check_function("`fn` of a `Constraint`", self.fn, "fn(t, y, args)", "real arrays")
 
     def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
         r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
@@ -124,13 +92,9 @@ class Constraint(AbstractConserved):
 
         - `vector_field`: $f$, called as `vector_field(t, y, args)`.
 
-        **Returns:**
-
-        A [`diffrax_conserve.Constraint`][].
-
         **Raises:**
 
-        `TypeError` if `vector_field` is not callable.
+        `TypeError` if `vector_field` cannot be called so.
 
         !!! example
 
@@ -138,35 +102,61 @@ class Constraint(AbstractConserved):
             import diffrax_conserve as dfc
             import jax.numpy as jnp
 
-            def free_fall(t, y, args):
-                q, v = y
-                return v, jnp.array([0.0, -9.81])
-
             rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
-            along_the_circle = rod.derivative(free_fall)
+            velocity = rod.derivative(lambda t, y, args: (y[1], jnp.array([0.0, -9.81])))
             ```
         """
-        check_vector_field(vector_field, "constraint.derivative(vector_field)")
+        check_vector_field(vector_field)
         return Constraint(Along(self.fn, vector_field))
-
-    def conserved_value(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        return jtu.tree_map(jnp.zeros_like, self.fn(t, y, args))
 
 
 Constraint.__init__.__doc__ = r"""**Arguments:**
 
-- `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
-    be differentiated) that returns a PyTree of real arrays. Every array element is one scalar
-    constraint.
+- `fn`: a callable `fn(t, y, args)`, as of a [`diffrax_conserve.FirstIntegral`][]. Every element of
+    what it returns is one scalar constraint.
 """
 
 
-def _check_fn(entry: AbstractConserved) -> None:
-    check_function("fn", type(entry).__name__, entry.fn, "t, y, args", "real arrays")
+class Along(eqx.Module):
+    """The derivative of a function along a vector field."""
+
+    fn: ConstraintFn
+    vector_field: Callable[[RealScalarLike, Any, Args], Any]
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        y = jtu.tree_map(jnp.asarray, y)
+        slope = slope_like(y, self.vector_field(t, y, args))
+        _, along = jax.jvp(lambda t, y: self.fn(t, y, args), (t, y), (jnp.ones_like(t), slope))
+        return along
+
+
+def slope_like(y: Y, slope: Any) -> Y:
+    """The value of a vector field, broadcast and cast to the shapes and dtypes of the state."""
+    if jtu.tree_structure(slope) == jtu.tree_structure(y):
+        pairs = zip(jtu.tree_leaves(slope), jtu.tree_leaves(y), strict=True)
+        if all(jnp.shape(f) in ((), jnp.shape(x)) for f, x in pairs):
+            return jtu.tree_map(
+                lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope
+            )
+    raise ValueError(
+        f"`vector_field` returns the structure {tree_shapes(slope)}, but it must return a PyTree "
+        f"like `y`, which has {tree_shapes(y)}."
+    )
+
+
+def check_vector_field(vector_field: Any) -> None:
+    returns = "the slope at `y`; of a `diffrax.ODETerm` pass its `vector_field`"
+    check_function("`vector_field`", vector_field, "vector_field(t, y, args)", returns)
 
 
 def is_entry(x: Any) -> bool:
-    return isinstance(x, AbstractConserved)
+    return isinstance(x, FirstIntegral | Constraint)
+
+
+def has_value(entry: Any) -> bool:
+    """Whether the conserved value at the start of a solve does not depend on the solve."""
+    return isinstance(entry, Constraint) or entry.value is not None
 
 
 def rate_of(entry: Any) -> ConstraintFn | None:
@@ -176,23 +166,18 @@ def rate_of(entry: Any) -> ConstraintFn | None:
 def check_manifold(manifold: Manifold) -> None:
     """Raises unless `manifold` is a non-empty PyTree of `FirstIntegral`s and `Constraint`s."""
     entries = named_entries(manifold)
-    for name, entry in entries:
-        if not is_entry(entry):
-            remedy = (
-                "Wrap it: `FirstIntegral(fn)` keeps `fn(t, y, args)` at its initial value, "
-                "`Constraint(fn)` keeps it at zero."
-                if callable(entry)
-                else "Each leaf must be a `FirstIntegral(fn)` or a `Constraint(fn)`."
-            )
-            raise TypeError(
-                f"`{name}` is {entry!r}, which is neither a `FirstIntegral` nor a `Constraint`. "
-                + remedy
-            )
     if not entries:
         raise ValueError(
             f"`manifold` is {manifold!r}, which holds no `FirstIntegral` and no `Constraint`: "
             "there is nothing to conserve. Give at least one, or use the solver without projection."
         )
+    for name, entry in entries:
+        if not is_entry(entry):
+            raise TypeError(
+                f"`{name}` is {entry!r}, which is neither a `FirstIntegral` nor a `Constraint`. "
+                "Wrap a function: `FirstIntegral(fn)` keeps `fn(t, y, args)` at its initial value, "
+                "`Constraint(fn)` keeps it at zero."
+            )
 
 
 def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
@@ -201,7 +186,7 @@ def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
 
 
 def entry_name(manifold: Manifold, position: int) -> str:
-    """The name of an entry of a manifold; the message of a failed solve gives only its number.
+    """The name of an entry of a manifold; the report on a failed projection gives its number.
 
     **Arguments:**
 
@@ -210,7 +195,7 @@ def entry_name(manifold: Manifold, position: int) -> str:
 
     **Returns:**
 
-    The path to the entry, such as `manifold['energy']`.
+    The path to the entry.
 
     **Raises:**
 
@@ -220,14 +205,12 @@ def entry_name(manifold: Manifold, position: int) -> str:
 
         ```python
         import diffrax_conserve as dfc
-        import jax.numpy as jnp
 
-        sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-        print(dfc.entry_name({"sphere": sphere}, 0))  # manifold['sphere']
+        print(dfc.entry_name(dfc.systems.RigidBody().manifold, 0))
         ```
 
         ```text
-        manifold['sphere']
+        manifold['energy']
         ```
     """
     names = [name for name, _ in named_entries(manifold)]
@@ -247,12 +230,15 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
 
 
 def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`manifold` with each entry replaced by its conserved value, zero for a constraint."""
-    return jtu.tree_map(
-        lambda entry: jtu.tree_map(jnp.asarray, entry.conserved_value(t, y, args)),
-        manifold,
-        is_leaf=is_entry,
-    )
+    """`manifold` with each entry replaced by the value of `fn` that a solve started at
+    `(t, y, args)` conserves, zero for a constraint."""
+
+    def conserved(entry: FirstIntegral | Constraint) -> Values:
+        given = getattr(entry, "value", None)
+        found = entry.fn(t, y, args) if given is None else given
+        return jtu.tree_map(jnp.zeros_like if isinstance(entry, Constraint) else jnp.asarray, found)
+
+    return jtu.tree_map(conserved, manifold, is_leaf=is_entry)
 
 
 _CONSTRAINTS_MAX = 2048
@@ -261,13 +247,25 @@ _CONSTRAINTS_MAX = 2048
 def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless the functions of the manifold return real floating-point arrays, in total at
     least one scalar and at most as many as the state has unknowns."""
-    count = 0
+    count, unknowns = 0, tree_size(y)
     for name, entry in named_entries(manifold):
-        for leaf in jtu.tree_leaves(eqx.filter_eval_shape(entry.fn, t, y, args)):
-            _check_output(name, leaf)
-            count += math.prod(jnp.shape(leaf))
-        _check_rate(name, entry, t, y, args)
-    unknowns = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
+        output = eqx.filter_eval_shape(entry.fn, t, y, args)
+        for leaf in jtu.tree_leaves(output):
+            if not jnp.issubdtype(dtype_of(leaf), jnp.floating):
+                raise TypeError(
+                    f"`fn` of `{name}` must return a PyTree of real floating-point arrays, but it "
+                    f"returned {leaf!r}. Convert it, for example by `jnp.asarray(..., "
+                    "dtype=float)`, or split a complex value into its real and its imaginary part."
+                )
+        count += tree_size(output)
+        if rate_of(entry) is not None:
+            rates = eqx.filter_eval_shape(entry.rate, t, y, args)
+            _check_shapes(f"`rate` of `{name}` returns", rates, output)
+            if not all(map(is_real, jtu.tree_leaves(rates))):
+                raise TypeError(
+                    f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must "
+                    "return real numbers, as `fn` does. Return their real part."
+                )
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
     if count > unknowns:
@@ -283,26 +281,8 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
         )
 
 
-def _check_rate(name: str, entry: Any, t: RealScalarLike, y: Y, args: Args) -> None:
-    if rate_of(entry) is None:
-        return
-    rates, outputs = (eqx.filter_eval_shape(fn, t, y, args) for fn in (entry.rate, entry.fn))
-    for leaf in jtu.tree_leaves(rates):
-        if not is_real(leaf):
-            raise TypeError(
-                f"`rate` of `{name}` returns {dtype_of(leaf)}, but it must return real numbers, as "
-                "`fn` does. Return their real part."
-            )
-    if tree_shapes(rates) != tree_shapes(outputs):
-        raise ValueError(
-            f"`rate` of `{name}` returns {tree_shapes(rates)}, but its `fn(t, y, args)` returns "
-            f"{tree_shapes(outputs)}. Return the derivative of each element in its place."
-        )
-
-
 def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
     """Raises unless the conserved values have the shapes of what the first integrals return."""
-    entries = named_entries(manifold)
     treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
     try:
         flat = treedef.flatten_up_to(values)
@@ -312,27 +292,16 @@ def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, ar
             f"`manifold`, {treedef}. Put the conserved value in the place of each `FirstIntegral` "
             "and `None` in the place of each `Constraint`."
         ) from error
-    for (name, entry), value in zip(entries, flat, strict=True):
-        check_numbers("value", value)
-        output = eqx.filter_eval_shape(entry.fn, t, y, args)
-        if isinstance(entry, FirstIntegral) and tree_shapes(output) != tree_shapes(value):
-            raise ValueError(
-                f"The conserved value of `{name}` has the structure {tree_shapes(value)}, but its "
-                f"`fn(t, y, args)` returns {tree_shapes(output)}. Both must be the same."
-            )
+    for (name, entry), value in zip(named_entries(manifold), flat, strict=True):
+        if isinstance(entry, FirstIntegral):
+            check_numbers("value", value)
+            output = eqx.filter_eval_shape(entry.fn, t, y, args)
+            _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
 
 
-def _check_output(name: str, leaf: Any) -> None:
-    if not hasattr(leaf, "dtype"):
-        if isinstance(leaf, float):
-            return
-        got = f"{leaf!r}, which is no array"
-    elif not jnp.issubdtype(leaf.dtype, jnp.floating):
-        got = f"an array of dtype {leaf.dtype}"
-    else:
-        return
-    raise TypeError(
-        f"`fn` of `{name}` must return a PyTree of real floating-point arrays, but it returned "
-        f"{got}. Convert it, for example by `jnp.asarray(..., dtype=float)`, or split a complex "
-        "value into its real and its imaginary part."
-    )
+def _check_shapes(what: str, given: Any, output: Any) -> None:
+    if tree_shapes(given) != tree_shapes(output):
+        raise ValueError(
+            f"{what} {tree_shapes(given)}, but its `fn(t, y, args)` returns {tree_shapes(output)}. "
+            "Both must be the same."
+        )

@@ -1,7 +1,6 @@
 """Checks of the numbers and functions that a user passes."""
 
 import inspect
-from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -34,19 +33,18 @@ def check_number(
 ) -> None:
     """Raises unless `value` is a real number, an array of real numbers (for a `vmap`), a tracer,
     or, if `optional`, `None`. It must be at least `least` and greater than `above`; NaN is
-    rejected.
-    """
+    rejected."""
     if isinstance(value, jax.core.Tracer) or (optional and value is None):
         return
     ending = ", or `None`." if optional else "."
     if not is_real(value):
         raise TypeError(f"`{name}` is {value!r}, but it must be a real number{ending}")
-    number = np.asarray(value)
+    number, wanted = np.asarray(value), ""
     if above is not None and not np.all(number > above):
         wanted = "positive" if above == 0 else f"greater than {above:g}"
-        raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
     if least is not None and not np.all(number >= least):
         wanted = f"at least {least:g}" if np.isfinite(least) else "a number"
+    if wanted:
         raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
 
 
@@ -64,30 +62,19 @@ def check_count(name: str, value: Any) -> None:
         raise ValueError(f"`{name}` is {value}, but it must be at least 1.")
 
 
-def check_function(name: str, owner: str, fn: Any, takes: str, returns: str) -> None:
-    """Raises unless `fn` can be called with the arguments `takes`, such as `"t, y, args"`."""
-    remedy = f"Pass a function `{name}({takes})` that returns {returns}."
+def check_function(name: str, fn: Any, call: str, returns: str) -> None:
+    """Raises unless `fn` takes as many arguments as `call`, such as `"fn(t, y, args)"`."""
+    remedy = f"Pass a function `{call}` that returns {returns}."
     if not callable(fn):
-        raise TypeError(f"`{name}` of a `{owner}` is {fn!r}, which is not callable. {remedy}")
+        raise TypeError(f"{name} is {fn!r}, which is not callable. {remedy}")
     try:
         signature = inspect.signature(fn)
     except ValueError:  # as for some builtins
         return
     try:
-        signature.bind(*takes.split(", "))
+        signature.bind(*call.split(", "))
     except TypeError as error:
-        raise TypeError(
-            f"`{name}` of a `{owner}` has the parameters `{signature}`. {remedy}"
-        ) from error
-
-
-def check_vector_field(vector_field: Callable, example: str) -> None:
-    """Raises unless `vector_field` is callable; the message shows `example` as the correct call."""
-    if not callable(vector_field):
-        raise TypeError(
-            f"`vector_field` is {vector_field!r}, which is not callable. Pass the function, not a "
-            f"`diffrax.ODETerm` of it: `{example}`."
-        )
+        raise TypeError(f"{name} has the parameters `{signature}`. {remedy}") from error
 
 
 def check_solution(sol: Any, user: str) -> None:

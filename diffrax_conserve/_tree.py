@@ -15,19 +15,9 @@ from ._custom_types import RealScalarLike, Y
 
 
 def real_view(y: Any) -> Any:
-    """`y` with the real and the imaginary part of each complex leaf along a new first axis.
-
-    Projections work on this view only: they minimise a distance and take gradients of real
-    functions with respect to real and imaginary parts. A weight shaped like the leaf still
-    broadcasts.
-    """
+    """`y` with the real and the imaginary part of each complex leaf along a new first axis, so that
+    a weight shaped like the leaf still broadcasts. Projections work on this view only."""
     return jtu.tree_map(lambda x: jnp.stack([jnp.real(x), jnp.imag(x)]) if _is_complex(x) else x, y)
-
-
-def from_view(view: Any, like: Any) -> Any:
-    """The state whose `real_view` is `view`, complex where `like` is. Only the dtypes of `like` are
-    used."""
-    return jtu.tree_map(lambda v, x: lax.complex(v[0], v[1]) if _is_complex(x) else v, view, like)
 
 
 def _is_complex(x: Any) -> bool:
@@ -40,7 +30,6 @@ def tree_add(a: Y, b: Y) -> Y:
 
 
 def tree_sub(a: Y, b: Y) -> Y:
-    """`a - b`."""
     return jtu.tree_map(lambda x, y: x - y, a, b)
 
 
@@ -51,11 +40,8 @@ def tree_scale(factor: RealScalarLike, a: Y) -> Y:
 
 def tree_max(a: Y) -> Real[Array, ""]:
     """The largest modulus in `a`."""
-    dtype = working_dtype(a)
-    return ft.reduce(
-        jnp.maximum,
-        [jnp.max(jnp.abs(x), initial=0).astype(dtype) for x in jtu.tree_leaves(a)],
-    )
+    sizes = [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(a)]
+    return ft.reduce(jnp.maximum, [x.astype(working_dtype(a)) for x in sizes])
 
 
 def tree_all_finite(a: PyTree[Array]) -> Array:
@@ -84,9 +70,9 @@ def working_dtype(y: Y) -> jnp.dtype:
     return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
 
 
-def tree_size(a: PyTree[Array]) -> int:
+def tree_size(a: Any) -> int:
     """The number of scalars in `a`."""
-    return sum(jnp.size(x) for x in jtu.tree_leaves(a))
+    return sum(math.prod(jnp.shape(x)) for x in jtu.tree_leaves(a))
 
 
 def tree_shapes(a: Any) -> Any:
@@ -112,4 +98,5 @@ def ravel(y: Any) -> Any:
 
 def unravel(vector: Any, like: Any) -> Any:
     """The state whose `ravel` is `vector`, with the structure, shapes and dtypes of `like`."""
-    return from_view(unflatten(vector, jax.eval_shape(real_view, like)), like)
+    view = unflatten(vector, jax.eval_shape(real_view, like))
+    return jtu.tree_map(lambda v, x: lax.complex(v[0], v[1]) if _is_complex(x) else v, view, like)

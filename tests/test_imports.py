@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 _TYPES = {"_custom_types"}
 _PRINTING = {"_printing"}
 _TREE = _TYPES | {"_tree"}
-_ENTRIES = _TREE | {"_options", "_along"}
+_ENTRIES = _TREE | {"_options"}
 _MANIFOLD = _ENTRIES | {"_manifold"}
 _BALANCE = _MANIFOLD | {"_balance"}
 _PROJECTION = _BALANCE | _PRINTING | {"_projection"}
@@ -35,7 +35,6 @@ MAY_IMPORT = {
     "_replace_file": set(),
     "_options": set(),
     "_tree": _TYPES,
-    "_along": _TREE,
     "_manifold": _ENTRIES,
     "_balance": _MANIFOLD,
     "_projection": _BALANCE | _PRINTING,

@@ -1,6 +1,7 @@
 """A check by autodiff that a manifold is conserved by a vector field."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -15,20 +16,33 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import AbstractConserved, Constraint, check_manifold, conserved_values, rate_of
-from .._projection.equations import Equations, equations_of, measure, relative
+from .._manifold import (
+    Along,
+    Constraint,
+    FirstIntegral,
+    check_manifold,
+    conserved_values,
+    evaluate,
+    is_entry,
+    rate_of,
+    slope_like,
+)
+from .._printing import printed
+from .._projection.equations import equations_of, relative
 from .._projection.roundoff import hidden_terms
-from .._tree import ravel, tree_all_finite, tree_max, unravel
+from .._tree import ravel, unravel
+
+Entry = FirstIntegral | Constraint
 
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceEntry:
     """The result of `check_invariance` for one entry of the manifold.
 
-    `kind` is "first integral", "balance" (with a `rate`) or "constraint". `defect` is the largest
-    relative defect over all states and elements, and `state` the index of the state where it was
-    found. `is_constant` tells that the gradient is zero at every state: a function that does not
-    depend on the state, or that autodiff does not see through, is conserved by any field.
+    `kind` is "first integral", "balance" (with a `rate`) or "constraint"; `defect` is the largest
+    relative defect, found at the state with the index `state`. `is_constant` tells that the
+    gradient is zero at every state: a function that does not depend on the state, or that autodiff
+    does not see through, is conserved by any field.
     """
 
     name: str
@@ -43,8 +57,7 @@ class InvarianceEntry:
 class InvarianceReport:
     """The verdict of `check_invariance`; print it to read it as a table.
 
-    `ok` is true if every entry is conserved, to within the relative tolerance `rtol`, at every one
-    of the `num_states` states.
+    `ok` is true if every entry is conserved, within `rtol`, at each of the `num_states` states.
     """
 
     entries: tuple[InvarianceEntry, ...]
@@ -56,19 +69,18 @@ class InvarianceReport:
         return all(entry.ok for entry in self.entries)
 
     def __str__(self) -> str:
-        width = max(len(entry.name) for entry in self.entries)
         verdict = "conserved" if self.ok else "NOT CONSERVED"
-        lines = [
+        title = (
             f"{verdict}: derivatives along the flow at {self.num_states} states, "
-            f"relative tolerance {self.rtol:.1e}",
-            f"  {'':{width}}  {'':14}  largest relative defect",
-        ]
+            f"relative tolerance {self.rtol:.1e}"
+        )
+        rows = {"": f"{'':14}  largest relative defect"}
         for entry in self.entries:
             result = "conserved" if entry.ok else f"NOT conserved, see state {entry.state}"
             if entry.is_constant:
                 result += "; its gradient is zero at every state: nothing is kept"
-            lines.append(f"  {entry.name:{width}}  {entry.kind:14}  {entry.defect:<8.1e}  {result}")
-        return "\n".join(lines)
+            rows[entry.name] = f"{entry.kind:14}  {entry.defect:<8.1e}  {result}"
+        return printed(title, rows)
 
 
 def check_invariance(
@@ -90,21 +102,18 @@ def check_invariance(
     f_i|},$$
 
     which is a few units of roundoff if $I$ is a first integral, and of order one at almost every
-    state if it is not. This tests the equations without a solver; it reveals a misprint in either
-    $I$ or $f$. For a [`diffrax_conserve.Constraint`][] the same derivative must vanish where the
-    constraints hold, so the states must satisfy all constraints of the manifold. A
-    [`diffrax_conserve.FirstIntegral`][] next to constraints is thus tested only where they hold, as
-    it should be. A `rate` is subtracted from the derivative, and its size is added to the
-    denominator.
+    state if it is not: a misprint in either $I$ or $f$ is found without a solver. The derivative of
+    a [`diffrax_conserve.Constraint`][] must vanish only where the constraints hold, so the states
+    must satisfy all constraints of the manifold. A `rate` is subtracted from the derivative, and
+    its size is added to the denominator.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`, or a `diffrax.ODETerm` of it.
-    - `manifold`: a [`diffrax_conserve.FirstIntegral`][], a [`diffrax_conserve.Constraint`][] or a
-        PyTree of them.
-    - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree of arrays like `y` with an
-        additional leading axis over the states. Take states in general position: at an equilibrium
-        every function is conserved.
+    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
+    - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree like `y` with a leading
+        axis over the states. Take states in general position: at an equilibrium every function is
+        conserved.
     - `t`: the time, or one for each state. Give several for integrals that depend on time.
     - `args`: passed to `vector_field` and to the functions of the manifold.
     - `key`: seeds the sampler; by default `jax.random.key(0)`.
@@ -114,8 +123,7 @@ def check_invariance(
 
     **Returns:**
 
-    An `InvarianceReport`: `ok` is the verdict, `str` returns a table, and `entries` has the largest
-    relative defect of each entry of the manifold.
+    An [`diffrax_conserve.InvarianceReport`][].
 
     **Raises:**
 
@@ -143,157 +151,124 @@ def check_invariance(
     check_manifold(manifold)
     if isinstance(vector_field, dfx.ODETerm):
         vector_field = vector_field.vector_field
-    ys = _batch(states, jr.key(0) if key is None else key, num_states)
-    ts = _times(t, ys)
+    ts, ys = _batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
-    _check_like_y(vector_field, ts[0], jtu.tree_map(lambda x: x[0], ys), args)
-    found = _measure(vector_field, manifold, ts, ys, args)
+    try:
+        found = _measure(vector_field, manifold, ts, ys, args)
+    except (IndexError, TypeError) as error:
+        if any(x.ndim > 1 for x in jtu.tree_leaves(ys)):
+            raise
+        raise ValueError(
+            "`vector_field` or a function of `manifold` cannot be called with one of the `states`, "
+            "which are numbers. " + _ONE_STATE
+        ) from error
     entries = [
-        _verdict(
-            name, entry, np.asarray(defects), np.asarray(residuals), np.asarray(constant), rtol
-        )
-        for (name, entry), (defects, residuals, constant) in zip(
-            _entries(manifold), found, strict=True
-        )
+        _verdict(name, entry, rtol, *map(np.asarray, measured))
+        for (name, entry), measured in zip(_entries(manifold), found, strict=True)
     ]
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
 
-_KINDS = ("first integral", "balance")
 _ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
 
 
-def _batch(states: Any, key: PRNGKeyArray, num_states: int) -> PyTree[Array]:
+def _batch(
+    t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
+) -> tuple[Float[Array, " states"], PyTree[Array]]:
     if callable(states):
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
     states = jtu.tree_map(jnp.asarray, states)
     leaves = jtu.tree_leaves(states)
-    sizes = {x.shape[0] if x.ndim else None for x in leaves}
-    if len(sizes) != 1 or sizes & {None, 0} or not all(map(eqx.is_inexact_array, leaves)):
+    sizes = {x.shape[:1] for x in leaves}
+    if len(sizes) != 1 or sizes & {(), (0,)} or not all(map(eqx.is_inexact_array, leaves)):
         raise ValueError(
             "`states` must be a sampler `key -> y`, or a PyTree of floating point arrays with the "
             f"same leading axis over the states, but it is {eqx.tree_pformat(states)}. "
             + _ONE_STATE
         )
-    return states
-
-
-def _times(t: Real[ArrayLike, "*states"], ys: PyTree[Array]) -> Float[Array, " states"]:
-    leaves = jtu.tree_leaves(ys)
+    (shape,) = sizes
     t = jnp.asarray(t, jnp.finfo(jnp.result_type(*leaves)).dtype)
-    shape = (leaves[0].shape[0],)
     if t.shape not in ((), shape):
         raise ValueError(
             f"`t` must be one time or one for each of the {shape[0]} states, but it has shape "
             f"{t.shape}."
         )
-    return jnp.broadcast_to(t, shape)
+    return jnp.broadcast_to(t, shape), states
 
 
-def _check_like_y(vector_field: Callable, t: RealScalarLike, y: Any, args: Args) -> None:
-    try:
-        out = eqx.filter_eval_shape(vector_field, t, y, args)
-    except (IndexError, TypeError, ValueError) as error:
-        if any(jnp.ndim(x) for x in jtu.tree_leaves(y)):
-            raise
-        raise ValueError(
-            "`vector_field` cannot be called with one of the `states`, which is "
-            f"{eqx.tree_pformat(y)}. " + _ONE_STATE
-        ) from error
-    same_structure = jtu.tree_structure(out) == jtu.tree_structure(y)
-    if not same_structure or not all(
-        getattr(a, "shape", ()) == b.shape
-        for a, b in zip(jtu.tree_leaves(out), jtu.tree_leaves(y), strict=True)
-    ):
-        raise ValueError(
-            f"`vector_field(t, y, args)` must return a PyTree like `y`, {eqx.tree_pformat(y)}, but "
-            f"it returns {eqx.tree_pformat(out)}."
-        )
-
-
-def _entries(manifold: Manifold) -> list[tuple[str, AbstractConserved]]:
-    flat, _ = jtu.tree_flatten_with_path(
-        manifold, is_leaf=lambda x: isinstance(x, AbstractConserved)
-    )
+def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(jtu.keystr(path, simple=True, separator=".") or "manifold", e) for path, e in flat]
 
 
 @eqx.filter_jit
+@ft.partial(eqx.filter_vmap, in_axes=(None, None, 0, 0, None))
 def _measure(
-    vector_field: Callable, manifold: Manifold, ts: Float[Array, " states"], ys: Any, args: Args
-) -> list[tuple[Float[Array, " states"], Float[Array, " states"], Bool[Array, " states"]]]:
-    """The relative defects and residuals of each entry at each state, largest over elements, and
-    whether its gradient is zero there."""
-
-    def at_one_state(t: Float[Array, ""], y: Any) -> list[tuple[Array, Array, Array]]:
-        return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
-
-    return jax.vmap(at_one_state)(ts, ys)
+    vector_field: Callable, manifold: Manifold, t: Float[Array, ""], y: Any, args: Args
+) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]]:
+    """The largest relative defect and residual of each entry, and whether its gradient is zero."""
+    return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
 
 
 def _relative_sizes(
-    entry: AbstractConserved, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
+    entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
 ) -> tuple[Array, Array, Array]:
-    """The largest relative defect and residual of an entry, and whether its gradient is zero."""
-    values = conserved_values(entry, t, y, args)
     vector = ravel(y)
-    numbers = ravel(values).astype(vector.dtype)
+    dtype = vector.dtype
+    t = t.astype(dtype)
+    values = ravel(conserved_values(entry, t, y, args)).astype(dtype)
+    equations = equations_of(entry, values, t, y, args)
+    residual, jacobian = equations.linearise(vector)
 
-    def equations(t: Array) -> Equations:
-        return equations_of(entry, numbers, t, y, args)
+    def in_time(t: Array) -> Array:
+        return ravel(evaluate(entry, t, y, args)).astype(dtype)
 
-    t = jnp.asarray(t, vector.dtype)
-    now, in_time = jax.jvp(lambda t: equations(t).residual(vector), (t,), (jnp.ones_like(t),))
-    rate = ravel(rates(entry, t, y, args)).astype(vector.dtype)
-    _, jacobian = equations(t).linearise(vector)
+    _, partial = jax.jvp(in_time, (t,), (jnp.ones_like(t),))
+    rate = ravel(rates(entry, t, y, args)).astype(dtype)
 
-    def along(vector: Array) -> Array:
-        slope = vector_field(t, unravel(vector, y), args)
-        slope = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), slope, y)
-        return jax.jvp(equations(t).residual, (vector,), (ravel(slope),))[1]
+    def excess(vector: Array) -> Array:
+        along = Along(entry.fn, vector_field)(t, unravel(vector, y), args)
+        return ravel(along).astype(dtype) - rate
 
-    f = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), vector_field(t, y, args), y)
-    terms = jnp.sum(jnp.abs(jacobian * ravel(f)), axis=1) + jnp.abs(in_time) + jnp.abs(rate)
+    slope = ravel(slope_like(y, vector_field(t, y, args)))
+    terms = jnp.sum(jnp.abs(jacobian * slope), axis=1) + jnp.abs(partial) + jnp.abs(rate)
     # Forces may cancel inside the field.
-    hidden = hidden_terms(along, vector)
+    hidden = hidden_terms(excess, vector)
     terms = jnp.where(hidden > 4 * terms, hidden, terms)
-    change = along(vector) + in_time - rate
-    defect = tree_max(relative(change, terms))
     # An integral that is not finite at `y` counts as not conserved, although its derivative may
     # vanish.
-    defect = jnp.where(tree_all_finite(now), defect, jnp.nan)
-    violation = tree_max(relative(*measure(entry, values, t, y, args)))
-    violation = violation if isinstance(entry, Constraint) else jnp.zeros_like(violation)
-    return defect, violation, jnp.all(jacobian == 0) & jnp.all(in_time == 0)
+    defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)
+    violation = jnp.zeros_like(residual)
+    if isinstance(entry, Constraint):
+        violation = relative(residual, equations.scale(jacobian, vector))
+    defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
+    return defect, violation, jnp.all(jacobian == 0) & jnp.all(partial == 0)
 
 
 def _verdict(
     name: str,
-    entry: AbstractConserved,
+    entry: Entry,
+    rtol: float,
     defects: np.ndarray,
     residuals: np.ndarray,
     constant: np.ndarray,
-    rtol: float,
 ) -> InvarianceEntry:
-    if not np.all(residuals <= rtol):
-        worst = _worst(residuals)
+    # The first NaN, or the largest.
+    state, worst = int(np.argmax(defects)), int(np.argmax(residuals))
+    if not residuals[worst] <= rtol:
         raise ValueError(
             f"The constraint `{name}` is not zero at state {worst} of `states` (relative residual "
             f"{residuals[worst]:.1e}), so its derivative along the flow need not vanish there. "
             "Give states on the manifold, for example `dfc.project(manifold, y)[0]`, or make it a "
             "`FirstIntegral` if it is conserved at any value."
         )
-    worst = _worst(defects)
+    kind = "first integral" if rate_of(entry) is None else "balance"
     return InvarianceEntry(
         name=name,
-        kind="constraint" if isinstance(entry, Constraint) else _KINDS[rate_of(entry) is not None],
-        defect=float(defects[worst]),
-        state=worst,
-        ok=bool(defects[worst] <= rtol),
+        kind="constraint" if isinstance(entry, Constraint) else kind,
+        defect=float(defects[state]),
+        state=state,
+        ok=bool(defects[state] <= rtol),
         is_constant=bool(np.all(constant)),
     )
-
-
-def _worst(ratios: np.ndarray) -> int:
-    return int(np.argmax(np.where(np.isnan(ratios), np.inf, ratios)))

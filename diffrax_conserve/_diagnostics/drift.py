@@ -12,10 +12,10 @@ from jaxtyping import Array
 from .._balance import has_rates, integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
-    FirstIntegral,
     check_manifold,
     conserved_values,
     evaluate,
+    has_value,
     is_entry,
     named_entries,
 )
@@ -32,20 +32,18 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     $$\frac{I(t_k, y_k) - I_0}{|I_0| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
-    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$.
+    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$. Roundoff is
+    proportional to this scale.
 
     For a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
-    is subtracted from the numerator. It is computed along the dense output of the solver (of the
-    wrapped one in a `ManifoldProjection`), so the solution must have dense output.
-
-    Roundoff is proportional to this scale. It is not zero for a momentum that vanishes as the sum
-    of large terms.
+    is subtracted from the numerator. It is computed along the dense output of the (wrapped) solver,
+    which the solution must have.
 
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too (as in
-        `SaveAt(t0=True, steps=True)`) to get the drift from the initial state. For a batch of
-        solutions use `jax.vmap`. Values saved by a `SaveAt(fn=...)` are treated as states.
+    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too, as in
+        `SaveAt(t0=True, steps=True)`, for the drift from the initial state. For a batch of
+        solutions use `jax.vmap`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
@@ -57,9 +55,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     **Raises:**
 
     `ValueError` if `sol` is a batch, has no saved states, has a single one without a conserved
-    value to compare it with, or was saved by `SaveAt(subs=...)`; if the saved values do not have
-    the shapes of states (checked only with dense output); or if a balance law has no dense output.
-    `TypeError` if `sol` is not a solution.
+    value to compare it with, or was saved by `SaveAt(subs=...)`; if dense output shows that the
+    saved values are not states; or if a balance law has no dense output. `TypeError` if `sol` is
+    not a solution.
 
     !!! example
 
@@ -69,16 +67,11 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         import jax.numpy as jnp
 
         square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-        sol = diffrax.diffeqsolve(
-            term,
-            dfc.ManifoldProjection(diffrax.Tsit5(), square),
-            t0=0,
-            t1=9,
-            dt0=0.1,
-            y0=jnp.array([1.0, 0.0]),
-            saveat=diffrax.SaveAt(t0=True, steps=True),
-        )
+        saveat = diffrax.SaveAt(t0=True, steps=True)
+        y0 = jnp.array([1.0, 0.0])
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, y0, saveat=saveat)
         print(f"{jnp.max(jnp.abs(dfc.drift(sol, square))):.0e}")
         ```
 
@@ -103,67 +96,49 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             f"`drift` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch write "
             "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
         )
-    unknown = [
-        name
-        for name, entry in named_entries(manifold)
-        if isinstance(entry, FirstIntegral) and entry.value is None
-    ]
-    if sol.ts.size == 1 and unknown:
-        raise ValueError(
-            f"`sol` holds one saved state, so the drift of `{unknown[0]}` from an earlier one is "
-            "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
-            "`FirstIntegral(fn, value=...)`."
-        )
+    for name, entry in named_entries(manifold):
+        if sol.ts.size == 1 and not has_value(entry):
+            raise ValueError(
+                f"`sol` holds one saved state, so the drift of `{name}` from an earlier one is "
+                "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
+                "`FirstIntegral(fn, value=...)`."
+            )
     t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
-    _check_states(sol, y0)
+    if sol.interpolation is not None:
+        states = tree_shapes(eqx.filter_eval_shape(sol.evaluate, sol.t0))
+        if tree_shapes(y0) != states:
+            raise ValueError(
+                f"`sol` has saved {tree_shapes(y0)} at each time, but the states are {states}. "
+                "Save the states themselves, without `SaveAt(fn=...)`."
+            )
     values = conserved_values(manifold, t0, y0, args)
     _, scale = measure(manifold, values, t0, y0, args)
+    gained = _gained(sol, manifold, args, values)
 
-    gained = _gained(sol, manifold, args)
-    if gained is not None:
-        # The rates are integrated from the start of the solve, at which a given `value` holds.
-        values = tree_sub(values, _without_value(manifold, gained(t0)))
+    # The rates are integrated from the start of the solve, at which a given `value` holds.
+    values = jtu.tree_map(
+        lambda entry, value, gained: value if has_value(entry) else tree_sub(value, gained),
+        manifold,
+        values,
+        gained(t0),
+        is_leaf=is_entry,
+    )
 
     def at(t: Array, y: Y) -> Values:
         padded = ~jnp.isfinite(t)
-        y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
-        now = evaluate(manifold, jnp.where(padded, t0, t), y, args)
-        then = values if gained is None else tree_add(values, gained(jnp.where(padded, t0, t)))
-        residual = jtu.tree_map(lambda x, v: jnp.where(padded, 0, x - v), now, then)
-        return relative(residual, scale)
+        t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), (t, y), (t0, y0))
+        residual = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
+        return relative(jtu.tree_map(lambda x: jnp.where(padded, 0, x), residual), scale)
 
     return jax.vmap(at)(sol.ts, sol.ys)
 
 
-def _without_value(manifold: Manifold, gained: Values) -> Values:
-    """`gained`, and zero for the entries whose `value` is given."""
-    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
-    parts = [
-        jtu.tree_map(jnp.zeros_like, part) if getattr(entry, "value", None) is not None else part
-        for entry, part in zip(entries, treedef.flatten_up_to(gained), strict=True)
-    ]
-    return treedef.unflatten(parts)
-
-
-def _check_states(sol: dfx.Solution, y0: Y) -> None:
-    """Raises if the saved values are known not to be states."""
-    if sol.interpolation is None:
-        return
-    states = tree_shapes(eqx.filter_eval_shape(sol.evaluate, sol.t0))
-    if tree_shapes(y0) != states:
-        raise ValueError(
-            f"`sol` has saved {tree_shapes(y0)} at each time, but the states are {states}. Save "
-            "the states themselves, without `SaveAt(fn=...)`."
-        )
-
-
 def _gained(
-    sol: dfx.Solution, manifold: Manifold, args: Args
-) -> Callable[[RealScalarLike], Values] | None:
-    """The integral of the rates of the manifold up to a time, as a function of that time; `None` if
-    there are no rates."""
+    sol: dfx.Solution, manifold: Manifold, args: Args, values: Values
+) -> Callable[[RealScalarLike], Values]:
+    """The integral of the rates of the manifold up to a time, as a function of that time."""
     if not has_rates(manifold):
-        return None
+        return lambda t: jtu.tree_map(jnp.zeros_like, values)
     path = sol.interpolation
     if not isinstance(path, dfx.DenseInterpolation):
         raise ValueError(
@@ -175,19 +150,18 @@ def _gained(
     def until(step: RealScalarLike, end: RealScalarLike) -> Values:
         info = jtu.tree_map(lambda x: x[step], path.infos)
         local = path.interpolation_cls(t0=path.ts[step], t1=path.ts[step + 1], **info)
-        # For a projected solver this is the interpolation from which the solver computed its
-        # balance.
+        # That from which a projected solver computed its balance.
         local = getattr(local, "inner", local)
         return integrated_rates(manifold, path.ts[step], end, local.evaluate, args, path.direction)
 
-    steps = jnp.arange(path.ts.size - 1)
-    used = steps < path.ts_size - 1
-    # Padded steps are computed too, with the values of the first step, and discarded.
-    each = jax.vmap(lambda i, ok: until(jnp.where(ok, i, 0), path.ts[jnp.where(ok, i, 0) + 1]))
-    sums = jtu.tree_map(
-        lambda x: jnp.cumsum(jnp.where(used.reshape(-1, *[1] * (x.ndim - 1)), x, 0), axis=0),
-        each(steps, used),
-    )
+    def whole(step: Array) -> Values:
+        # Padded steps are computed too, as the first one, and discarded.
+        used = step < path.ts_size - 1
+        start = jnp.where(used, step, 0)
+        return jtu.tree_map(lambda x: jnp.where(used, x, 0), until(start, path.ts[start + 1]))
+
+    steps = jax.vmap(whole)(jnp.arange(path.ts.size - 1))
+    sums = jtu.tree_map(lambda x: jnp.cumsum(x, axis=0), steps)
 
     def gained(t: RealScalarLike) -> Values:
         t = t * path.direction

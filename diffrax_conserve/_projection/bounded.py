@@ -11,12 +11,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .._printing import is_traced
 from .._tree import ravel, real_view
 from .base import check_like
 from .equations import Equations
@@ -37,7 +37,7 @@ class Box(eqx.Module):
         beyond = z - jax.lax.stop_gradient(z)
         lower, upper = (x + _AT_BOUND * beyond for x in (self.lower, self.upper))
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
-        return jnp.where(jnp.isnan(self.lower) | jnp.isnan(self.upper), jnp.nan, clipped)
+        return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
     def compose(self, equations: Equations) -> Equations:
         """The equations as functions of `z`."""
@@ -59,32 +59,28 @@ def box_of(
     """The box for the options `lower` and `upper`, or `None` if neither is given."""
     if lower is None and upper is None:
         return None
-    return Box(_bound("lower", lower, -np.inf, like), _bound("upper", upper, np.inf, like))
+    low = _bound("lower", -np.inf if lower is None else lower, like)
+    high = _bound("upper", np.inf if upper is None else upper, like)
+    return Box(low, high)
 
 
-def _bound(name: str, bound: PyTree[ArrayLike] | None, default: float, like: Any) -> Array:
+def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
     y = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    view = real_view(y)
-    single = bound is None or jtu.treedef_is_leaf(jtu.tree_structure(bound))
-    number = default if bound is None else bound
-    if single and jnp.ndim(number) == 0:
-        return ravel(jtu.tree_map(lambda x: jnp.full_like(x, number), view))
+    if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
+        bound = jtu.tree_map(lambda _: bound, y)
     remedy = "Give one number, or one bound (or an array) for each leaf of the state."
     check_like(name, bound, y, remedy)
     return ravel(
-        jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, view)
+        jtu.tree_map(
+            lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, real_view(y)
+        )
     )
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
     """Raises if a lower bound is above its upper bound, where both are known."""
-    leaves: list[list[Any]] = [jtu.tree_leaves(x) for x in (lower, upper)]
-    if len(leaves[0]) != len(leaves[1]) or any(
-        isinstance(x, jax.core.Tracer) or not eqx.is_array_like(x) for x in [*leaves[0], *leaves[1]]
-    ):
-        return
-    for a, b in zip(*leaves, strict=True):
-        if not np.all(np.asarray(a) <= np.asarray(b)):
+    for a, b in zip(jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=False):
+        if not is_traced((a, b)) and not np.all(np.asarray(a) <= np.asarray(b)):
             raise ValueError(
                 f"`lower` is {lower}, but `upper` is {upper}. Each lower bound must be at most its "
                 "upper one."

@@ -19,8 +19,7 @@ class ClosedForm(AbstractProjection):
     r"""Projects by a formula: $y = \mathrm{fn}(t, \hat y, args, values)$.
 
     For manifolds with a known projection, such as spheres, unit quaternions and rotation matrices.
-    The residual at the returned state is checked as in every projection: if the state is not on the
-    manifold, the projection has failed.
+    If the returned state is not on the manifold, the projection has failed.
 
     !!! example
 
@@ -29,15 +28,9 @@ class ClosedForm(AbstractProjection):
         import diffrax_conserve as dfc
         import jax.numpy as jnp
 
-        def unit(t, y, args):
-            return jnp.sum(y**2) - 1
-
-        def normalise(t, y, args, values):
-            return y / jnp.linalg.norm(y)
-
-        solver = dfc.ManifoldProjection(
-            diffrax.Tsit5(), dfc.Constraint(unit), projection=dfc.ClosedForm(normalise)
-        )
+        unit = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+        normalise = dfc.ClosedForm(lambda t, y, args, values: y / jnp.linalg.norm(y))
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), unit, projection=normalise)
         ```
     """
 
@@ -48,7 +41,9 @@ class ClosedForm(AbstractProjection):
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
-        check_function("fn", "ClosedForm", self.fn, "t, y, args, values", "the projected state")
+        check_function(
+            "`fn` of a `ClosedForm`", self.fn, "fn(t, y, args, values)", "the projected state"
+        )
         check_options(self)
 
     def solve(
@@ -56,7 +51,12 @@ class ClosedForm(AbstractProjection):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
         y = self.fn(problem.t, state, problem.args, problem.values)
-        _check_like(y, state)
+        got, expected = _shapes_and_dtypes(y), _shapes_and_dtypes(state)
+        if not eqx.tree_equal(got, expected):
+            raise ValueError(
+                f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a "
+                "state of the same structure, shapes and dtypes."
+            )
         y = ravel(y)
         return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
 
@@ -65,26 +65,14 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a function `fn(t, y, args, values)` of the time, the candidate, the parameters and the
     conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
-    which returns the state on the manifold, shaped like `y`. Derivatives of the projection are
-    those of `fn`.
+    which returns a state like `y`. Derivatives of the projection are those of `fn`.
 - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
 
 **Raises:**
 
-`TypeError` if `fn` is not callable; `ValueError`, when the projection is used, if the value of `fn`
-is not shaped like the state.
+`TypeError` if `fn` cannot be called so; `ValueError`, when it is used, if it returns another state.
 """
 
 
-def _check_like(y: Any, candidate: Any) -> None:
-    def shape(x: Any) -> tuple[Any, Any]:
-        return jnp.shape(x), jnp.result_type(x)
-
-    got, expected = (jtu.tree_structure(x) for x in (y, candidate))
-    if got == expected:
-        got, expected = ([shape(x) for x in jtu.tree_leaves(tree)] for tree in (y, candidate))
-    if got != expected:
-        raise ValueError(
-            f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a state "
-            "of the same structure, shapes and dtypes."
-        )
+def _shapes_and_dtypes(tree: Any) -> Any:
+    return jtu.tree_map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)

@@ -26,16 +26,12 @@ class Directional(AbstractProjection):
     in the manifold.
 
     Where $w$ is nearly tangent to the manifold, the correction is long, or does not exist and the
-    projection fails: an adaptive solve then takes a smaller step, a solve with fixed steps ends.
-    The order of the wrapped solver is kept if the angle between $w$ and the manifold does not
-    vanish with the step size; with a `max_correction` of the `ManifoldProjection`, long corrections
-    are failures. At saved times inside a step and in dense output the direction is that of the
-    step; where the projection fails there, [`diffrax_conserve.SimplifiedNewton`][] is used instead,
-    which does not conserve linear integrals.
+    projection fails. The order of the wrapped solver is kept if the angle between $w$ and the
+    manifold does not vanish with the step size. At saved times inside a step and in dense output
+    the direction is that of the step.
 
-    Success is judged as in every projection. Derivatives follow from the implicit function theorem
-    for $\lambda$; they are NaN where the sine of the angle between $w$ and the manifold is below
-    the cube root of roundoff.
+    Derivatives follow from the implicit function theorem for $\lambda$; they are NaN where the sine
+    of the angle between $w$ and the manifold is below the cube root of roundoff.
 
     !!! example
 
@@ -66,7 +62,23 @@ class Directional(AbstractProjection):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        direction = _direction(problem)
+        size = problem.equations.magnitude.size
+        if size != 1:
+            raise ValueError(
+                f"`Directional` moves along one direction, but `manifold` has {size} scalar "
+                "constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
+            )
+        error = None if problem.step is None else problem.step.error
+        if error is None:
+            raise ValueError(
+                "`Directional` moves along the error estimate of a step of the wrapped solver, but "
+                "there is none. In a `ManifoldProjection` wrap a solver with an embedded method, "
+                "such as `diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
+            )
+        # Normalised: the result does not depend on the length, and products with the gradient do
+        # not overflow or underflow.
+        length = lax.stop_gradient(jnp.max(jnp.abs(error)))
+        direction = error[None] / jnp.where(length > 0, length, 1)
         equations = problem.tolerating(self.rtol, self.atol)
         y, ok, count = project_along(equations, candidate, direction, max_steps=self.max_steps)
         return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol, ok=ok)
@@ -79,31 +91,7 @@ Directional.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`ValueError`, when it is used and before compilation: with more than one scalar constraint, with a
-solver that has no error estimate, or in [`diffrax_conserve.project`][], where there is no step.
-`ValueError` from `ManifoldProjection` for a `diffrax.HalfSolver`, whose error estimate has no sign.
+`ValueError`, before compilation: with more than one scalar constraint, with a solver that has no
+error estimate, in [`diffrax_conserve.project`][], where there is no step, and with a
+`diffrax.HalfSolver`, whose error estimate has no sign.
 """
-
-
-def _direction(problem: Problem) -> Float[Array, "1 n"]:
-    size = problem.equations.magnitude.size
-    if size != 1:
-        raise ValueError(
-            f"`Directional` moves along one direction, but `manifold` has {size} "
-            "scalar constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
-        )
-    if problem.step is None:
-        raise ValueError(
-            "`Directional` moves along the error estimate of a step, but there is no step here. "
-            "Use it in a `ManifoldProjection`. Elsewhere pass `projection=Newton()`."
-        )
-    if problem.step.error is None:
-        raise ValueError(
-            "`Directional` moves along the error estimate of the wrapped solver, but this has "
-            "none. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, or pass "
-            "`projection=SimplifiedNewton()`."
-        )
-    # Normalised: the result does not depend on the length, and products with the gradient do not
-    # overflow or underflow.
-    size = lax.stop_gradient(jnp.max(jnp.abs(problem.step.error)))
-    return problem.step.error[None] / jnp.where(size > 0, size, 1)

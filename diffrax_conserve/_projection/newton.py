@@ -1,5 +1,6 @@
 """Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
 
+import dataclasses
 from typing import Any, ClassVar, final
 
 import equinox as eqx
@@ -37,15 +38,13 @@ class Newton(AbstractProjection):
     in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
     $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: the
     iteration can pass near points where gradients are parallel, and converges quadratically
-    elsewhere. Then the same iteration on both equations moves along the manifold to the point
-    nearest to the candidate. If that fails, or if there are more than 512 unknowns and constraints,
-    the result of the first phase is returned: it is on the manifold, but not the nearest point, and
-    its derivative is NaN. For the close candidates of an integrator use
-    [`diffrax_conserve.SimplifiedNewton`][].
+    elsewhere. Then the same iteration on both equations moves along the manifold to the nearest
+    point. If that fails, or with more than 512 unknowns and constraints, the result of the first
+    phase is returned: it is on the manifold, but not the nearest point, and its derivative is NaN.
+    For the close candidates of an integrator use [`diffrax_conserve.SimplifiedNewton`][].
 
-    Success is judged at the returned state, relative to the scale of the constraints there. The
-    result is differentiated by the implicit function theorem for both equations. The derivative is
-    NaN where the gradients of the constraints are nearly parallel at the projected state but not
+    The result is differentiated by the implicit function theorem for both equations. The derivative
+    is NaN where the gradients of the constraints are nearly parallel at the projected state but not
     everywhere.
 
     !!! example
@@ -87,7 +86,8 @@ class Newton(AbstractProjection):
             )
         equations = problem.tolerating(self.rtol, self.atol)
         box = box_of(self.lower, self.upper, problem.like)
-        y, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
+        unknowns, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
+        y = unknowns[: candidate.size]
         return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol)
 
 
@@ -108,14 +108,12 @@ class _Optimality(eqx.Module):
         return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
 
 
-# The state, the multipliers, whether they are those of the nearest point, the number of iterations.
-_Nearest = tuple[Float[Array, " n"], Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]
-
-
 @eqx.filter_custom_jvp
 def _nearest(
     equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
-) -> _Nearest:
+) -> tuple[Float[Array, " N"], Bool[Array, ""], Int[Array, ""]]:
+    """State and multipliers, whether they are those of the nearest point, and the number of
+    iterations."""
     if box is None:
         y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
     else:
@@ -123,35 +121,31 @@ def _nearest(
         bounded = box.compose(equations)
         z, _, count = solve(bounded, candidate, directions=rows, max_steps=2 * max_steps)
         y = box.clip(z)
-    multiplier = jnp.zeros_like(equations.magnitude)
-    n, unknowns = y.size, y.size + multiplier.size
-    if unknowns > _NEAREST_MAX:
-        return y, multiplier, jnp.asarray(False), count
+    n = y.size
+    if n + equations.magnitude.size > _NEAREST_MAX:
+        return jnp.concatenate([y, 0 * equations.magnitude]), jnp.asarray(False), count
     _, jacobian = equations.linearise(y)
-    rows = equations.weighted(jacobian)
-    gram = gram_matrix(jacobian, rows)
-    multiplier = gram_solve(gram, jacobian @ (y - candidate))
-    # In these units the condition number does not depend on the user's.
-    lengths = jnp.diagonal(gram)
-    units = [jnp.ones(n, y.dtype) if equations.weights is None else equations.weights]
-    units += [1 / jnp.where(lengths > 0, lengths, 1)]
-    hidden = jnp.concatenate([jnp.zeros_like(y), equations.hidden])
-    magnitude = jnp.concatenate([jnp.abs(candidate), equations.magnitude])
-    optimality = Equations(
-        (_Optimality(equations, candidate, box),),
-        magnitude,
-        hidden,
-        jnp.concatenate(units),
-        equations.rtol,
-        equations.atol,
+    gram = gram_matrix(jacobian, equations.weighted(jacobian))
+    start = jnp.concatenate([y, gram_solve(gram, jacobian @ (y - candidate))])
+    optimality = dataclasses.replace(
+        equations,
+        parts=(_Optimality(equations, candidate, box),),
+        magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
+        hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
+        weights=_units(equations, gram, n),
     )
-    start = jnp.concatenate([y, multiplier])
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
         found = found & equations.judged(end[:n])
-    nearest = jnp.where(found, end, start)
-    return nearest[:n], nearest[n:], found, count + more
+    return jnp.where(found, end, start), found, count + more
+
+
+def _units(equations: Equations, gram: Float[Array, "m m"], n: int) -> Float[Array, " N"]:
+    """Squared units of `y` and `λ` in which the condition number does not depend on the user's."""
+    weights = jnp.ones(n, gram.dtype) if equations.weights is None else equations.weights
+    lengths = jnp.diagonal(gram)
+    return jnp.concatenate([weights, 1 / jnp.where(lengths > 0, lengths, 1)])
 
 
 @_nearest.def_jvp
@@ -159,26 +153,22 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     """From `F(y, λ) = 0`, the optimality system: its tangent at constant `y` and `λ` is cancelled
     by theirs."""
     equations, candidate, _ = primals
-    y, multiplier, found, count = _nearest(*primals, max_steps=max_steps)
-    unknowns = jnp.concatenate([y, multiplier])
+    unknowns, found, count = _nearest(*primals, max_steps=max_steps)
     if unknowns.size > _NEAREST_MAX:
-        t_y = jnp.full_like(y, jnp.nan)
-        return (y, multiplier, found, count), (t_y, jnp.zeros_like(multiplier), None, None)
+        return (unknowns, found, count), (jnp.full_like(unknowns, jnp.nan), None, None)
+    y = unknowns[: candidate.size]
     _, right = eqx.filter_jvp(lambda *p: _Optimality(*p)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right
     _, jacobian = equations.linearise(y)
-    lengths = jnp.diagonal(gram_matrix(jacobian, equations.weighted(jacobian)))
-    roots = jnp.ones_like(y) if equations.weights is None else jnp.sqrt(equations.weights)
-    norms = jnp.sqrt(jnp.where(lengths > 0, lengths, 1))
-    rows = jnp.concatenate([jnp.where(roots > 0, roots, 1), norms])
-    columns = jnp.concatenate([jnp.where(roots > 0, roots, 1), 1 / norms])
+    units = _units(equations, gram_matrix(jacobian, equations.weighted(jacobian)), y.size)
+    columns = jnp.sqrt(jnp.where(units > 0, units, 1))
+    rows = jnp.concatenate([columns[: y.size], 1 / columns[y.size :]])
     matrix = jax.jacfwd(_Optimality(*primals))(unknowns) / rows[:, None] * columns
     tangent = -columns * _shortest(matrix, right / rows)
     # Only the nearest point has a derivative; that of a failed projection is not used.
-    judged = equations.judged(y)
     doubt = jnp.where(found, certain(equations, candidate, y, jacobian), jnp.nan)
-    tangent = lax.stop_gradient(jnp.where(judged, doubt, 1)) * tangent
-    return (y, multiplier, found, count), (tangent[: y.size], tangent[y.size :], None, None)
+    doubt = lax.stop_gradient(jnp.where(equations.judged(y), doubt, 1))
+    return (unknowns, found, count), (doubt * tangent, None, None)
 
 
 def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:

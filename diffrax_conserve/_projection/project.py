@@ -15,6 +15,7 @@ from .._manifold import (
     check_outputs,
     check_values,
     conserved_values,
+    has_value,
     is_entry,
     named_entries,
 )
@@ -52,10 +53,9 @@ def project(
 
     **Returns:**
 
-    The state on the manifold, shaped like `y`, and a
-    [`diffrax_conserve.ProjectionInfo`][]. `info.ok` tells whether it succeeded: nothing is
-    raised at run time. If it did, each residual is within 16 units of roundoff of its scale, to
-    which the terms count that cancel inside `fn`, unless `projection` has other tolerances.
+    The state on the manifold, shaped like `y`, and a [`diffrax_conserve.ProjectionInfo`][], whose
+    `ok` tells whether it succeeded: nothing is raised at run time. If it did, each residual is
+    within 16 units of roundoff of its scale, unless `projection` has other tolerances.
 
     **Raises:**
 
@@ -98,50 +98,47 @@ def given_values(
     manifold: Manifold, value: Values | None, t: RealScalarLike, y: Y, args: Args
 ) -> Values:
     """The conserved values that are given by `value`, or by the entries of the manifold."""
-    for name, entry in named_entries(manifold):
-        if value is None and isinstance(entry, FirstIntegral) and entry.value is None:
-            raise ValueError(
-                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, for "
-                "example `value=integral.fn(t, y_start, args)`, or write "
-                "`FirstIntegral(fn, value=...)`."
-            )
-    values = conserved_values(manifold, t, y, args)
-    if value is not None:
-        check_values(manifold, value, t, y, args)
+    own = conserved_values(manifold, t, y, args)
+    if value is None:
+        for name, entry in named_entries(manifold):
+            if not has_value(entry):
+                raise ValueError(
+                    f"`{name}` has no conserved value, so every state would do. Pass `value=...`, "
+                    "for example `value=integral.fn(t, y_start, args)`, or write "
+                    "`FirstIntegral(fn, value=...)`."
+                )
+        check_values(manifold, own, t, y, args)
+        return own
+    check_values(manifold, value, t, y, args)
 
-        def choose(entry: FirstIntegral | Constraint, given: Values, own: Values) -> Values:
-            return own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
+    def choose(entry: FirstIntegral | Constraint, given: Values, own: Values) -> Values:
+        return own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
 
-        values = jtu.tree_map(choose, manifold, value, values, is_leaf=is_entry)
-    check_values(manifold, values, t, y, args)
-    return values
+    return jtu.tree_map(choose, manifold, value, own, is_leaf=is_entry)
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
     """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
-    leaves = jtu.tree_leaves(y)
-    if len({jnp.finfo(dtype_of(x)).dtype for x in leaves if jnp.issubdtype(dtype_of(x), kind)}) > 1:
-        raise TypeError(
-            f"The state has leaves of the dtypes {', '.join(str(dtype_of(x)) for x in leaves)}, "
-            f"but {user} needs one precision. Convert them to one."
-        )
-    for leaf in leaves:
-        dtype = dtype_of(leaf)
+    dtypes = [dtype_of(x) for x in jtu.tree_leaves(y)]
+    for leaf, dtype in zip(jtu.tree_leaves(y), dtypes, strict=True):
         if not jnp.issubdtype(dtype, kind):
-            remedy = (
-                "floating-point states, real or complex. Convert it, for example by "
-                "`jnp.asarray(..., dtype=float)`."
-                if kind is jnp.inexact
-                else "real floating-point states. Split a complex leaf into its real and its "
-                "imaginary part."
-            )
             got = f"a leaf of dtype {dtype}" if eqx.is_array_like(leaf) else f"the leaf {leaf!r}"
-            raise TypeError(f"The state has {got}, but {user} needs {remedy}")
+            wanted = "floating-point states, real or complex"
+            if kind is jnp.floating:
+                wanted = "real floating-point states; split a complex leaf into two"
+            raise TypeError(
+                f"The state has {got}, but {user} needs {wanted}. Convert it, for example by "
+                "`jnp.asarray(..., dtype=float)`."
+            )
+    if len({jnp.finfo(dtype).dtype for dtype in dtypes}) > 1:
+        raise TypeError(
+            f"The state has leaves of the dtypes {', '.join(map(str, dtypes))}, but {user} needs "
+            "one precision. Convert them to one."
+        )
 
 
 def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
     """Raises unless `metric` is structured like the state."""
-    if metric is None:
-        return
-    remedy = "Give one weight (or an array of weights) for each leaf of the state."
-    check_like("metric", metric, y, remedy)
+    if metric is not None:
+        remedy = "Give one weight (or an array of weights) for each leaf of the state."
+        check_like("metric", metric, y, remedy)

@@ -1,11 +1,11 @@
 """Projection in stages, for example positions first and then velocities."""
 
 import dataclasses
+import itertools as it
 from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -21,11 +21,13 @@ class Staged(AbstractProjection):
     r"""Projects to the parts of a manifold in a given order, keeping the earlier ones satisfied.
 
     Stage $k$ projects the result of the previous stage to the set where the parts $1, \dots, k$
-    hold, by its own projection in its own metric. An infinite weight freezes its component in that
-    stage. For example, positions are projected first with the velocities frozen, then velocities
-    with the positions frozen, so that errors of the velocities do not move the positions. Compare
-    it with the joint projection for your problem: on a pendulum at tolerance 1e-7 it is 19 times as
-    accurate with Tsit5, equally accurate with Dopri5, and less accurate with Kvaerno5.
+    hold, by its own projection in its own metric, where an infinite weight freezes its component.
+    For example, positions are projected with the velocities frozen, then velocities with the
+    positions frozen, so that errors of the velocities do not move the positions. Compare it with
+    the joint projection: on a pendulum at tolerance 1e-7 it is 19 times as accurate with Tsit5,
+    equally accurate with Dopri5, and less accurate with Kvaerno5.
+
+    Success is judged for all parts at the returned state.
 
     !!! example
 
@@ -44,8 +46,6 @@ class Staged(AbstractProjection):
         )
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), manifold, projection=staged)
         ```
-
-    Success is judged for all parts at the returned state.
 
     ??? cite "Reference"
 
@@ -82,14 +82,15 @@ class Staged(AbstractProjection):
                 f"The stages of `Staged` are {self.names}, but the entries of `manifold` are "
                 f"{tuple(dict.fromkeys(problem.keys))}. Give each entry one stage."
             )
-        y, count, last = candidate, jnp.asarray(0), None
+        y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
             check_metric(projection.metric, problem.state(candidate))
             part = _restricted(problem, self.names[:number], projection)
-            y, last = projection.solve(part, y)
-            count = count + last.num_steps
+            y, info = projection.solve(part, y)
+            infos.append(info)
+        count = sum(info.num_steps for info in infos)
         # The last stage has judged all parts, by its own tolerances.
-        return y, problem.judge(candidate, y, count, ok=None if last is None else last.ok)
+        return y, problem.judge(candidate, y, count, ok=infos[-1].ok)
 
 
 Staged.__init__.__doc__ = r"""**Arguments:**
@@ -108,11 +109,10 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
     """The problem restricted to the entries with these keys, in the metric of the projection."""
     y = jax.eval_shape(ravel, problem.like)
     wanted = [key in keys for key in problem.keys]
-    parts = [(part, want) for part, want in zip(problem.equations.parts, wanted, strict=True)]
-    sizes = [eqx.filter_eval_shape(part, y).size for part, _ in parts]
+    sizes = [eqx.filter_eval_shape(part, y).size for part in problem.equations.parts]
     rows = np.flatnonzero(np.repeat(wanted, sizes))
     equations = Equations(
-        tuple(part for part, want in parts if want),
+        tuple(it.compress(problem.equations.parts, wanted)),
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
         inverse_metric(projection.metric, problem.like),

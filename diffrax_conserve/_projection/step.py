@@ -14,15 +14,12 @@ from .._tree import ravel
 class Step(eqx.Module):
     r"""The step of a solve in which a projection is called.
 
-    All times are those of the vector field; in a solve backwards in time `t1 < t0`. At a saved time
-    inside the step and in dense output this is the same step, and the candidate is the dense output
-    at `Problem.t`.
+    Times are those of the vector field, states are real vectors. At a saved time inside the step
+    and in dense output this is the same step, and the candidate is the dense output at `Problem.t`.
 
     **Attributes:**
 
-    States are real vectors, as in [`diffrax_conserve.Problem`][].
-
-    - `t0`, `t1`: where the step starts, and where it ends; the step size is `t1 - t0`.
+    - `t0`, `t1`: where the step starts and ends; in a solve backwards in time `t1 < t0`.
     - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
     - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
     """
@@ -35,14 +32,6 @@ class Step(eqx.Module):
     direction: RealScalarLike
 
     def evaluate(self, t: RealScalarLike) -> Float[Array, " n"]:
-        """The dense output of the wrapped solver, before any projection.
-
-        **Arguments:**
-
-        - `t`: a time between `t0` and `t1`.
-
-        **Returns:**
-
-        The state at `t`, a candidate.
-        """
+        """The dense output of the wrapped solver, before any projection, at a time `t` between `t0`
+        and `t1`."""
         return ravel(self.path.evaluate(t * self.direction))

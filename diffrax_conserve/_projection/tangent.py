@@ -10,20 +10,21 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .._along import slope_like
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
-    FirstIntegral,
     check_manifold,
     check_outputs,
     check_values,
+    check_vector_field,
     conserved_values,
     evaluate,
+    has_value,
     named_entries,
     rate_of,
+    slope_like,
 )
-from .._options import check_number, check_vector_field
+from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
 from .base import positive_weights
 from .equations import equations_of
@@ -49,34 +50,33 @@ def tangent(
 
     so that along a solution $g' = -\text{gain} \cdot g$: the residual is constant, or with a `gain`
     decays (Baumgarte's stabilisation; the stabilised neural equations of White et al.). The field
-    is the nearest to $f$ in the metric with this property, and differentiable.
+    is the nearest to $f$ in the metric with this property.
 
     **Mechanisms.** For positions $q$ and velocities $v$ with masses $m$ and forces $F$ let
-    $f = (v, F/m)$, take the velocity constraint that [`diffrax_conserve.Constraint.derivative`][]
-    derives from the position constraint, and the metric $(\infty, m)$: then
-    $m v' = F + G^\top \lambda$, the equations of motion, whose `multipliers` are the forces of the
-    constraints. Projecting the solution of $f$ does not solve these equations. See "Constrained
-    mechanics" in the guide.
+    $f = (v, F/m)$, with the velocity constraint from [`diffrax_conserve.Constraint.derivative`][]
+    and the metric $(\infty, m)$: then $m v' = F + G^\top \lambda$, the equations of motion, whose
+    `multipliers` are the forces of the constraints. Projecting the solution of $f$ does not solve
+    these equations. See "Constrained mechanics" in the guide.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same arguments. A
         `FirstIntegral` with a `rate` changes at that rate.
-    - `metric`: a PyTree like the state of positive weights, scalars or arrays shaped like the
-        leaves. An infinite weight leaves its component of the field unchanged. Default: Euclidean.
+    - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][]; an infinite weight leaves its
+        component of the field unchanged.
     - `gain`: the decay rate of the residual, in units of one over time; negative for a solve
         backward in time.
 
     **Returns:**
 
-    A [`diffrax_conserve.TangentField`][], which is called like `vector_field`.
+    A [`diffrax_conserve.TangentField`][].
 
     **Raises:**
 
     `TypeError` or `ValueError` if an argument does not fit, or if a `gain` is given for a
-    `FirstIntegral` without a `value`; and, when it is called, if the value of the field is not
-    shaped like the state.
+    `FirstIntegral` without a `value` or with a `rate`; and, when it is called, if the value of the
+    field is not shaped like the state.
 
     !!! example
 
@@ -85,8 +85,7 @@ def tangent(
         import jax.numpy as jnp
 
         def free_fall(t, y, args):
-            q, v = y
-            return v, jnp.array([0.0, -9.81])
+            return y[1], jnp.array([0.0, -9.81])
 
         rod = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
         pendulum = dfc.tangent(free_fall, rod.derivative(free_fall), metric=(jnp.inf, 1.0))
@@ -105,30 +104,25 @@ def tangent(
         al., "Stabilized neural differential equations for learning dynamics with explicit
         constraints", NeurIPS 2023.
     """
-    check_vector_field(vector_field, "tangent(vector_field, manifold)")
+    check_vector_field(vector_field)
     check_manifold(manifold)
     check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
-        if damped and isinstance(entry, FirstIntegral) and entry.value is None:
+        why = "" if has_value(entry) else "has no value that it could return to"
+        why = why if rate_of(entry) is None else "changes at its `rate`"
+        if damped and why:
             raise ValueError(
-                f"`gain` is {gain}, but `{name}` has no value that it could return to. Write "
-                "`FirstIntegral(fn, value=...)`, or leave `gain` out."
-            )
-        if damped and rate_of(entry) is not None:
-            raise ValueError(
-                f"`gain` is {gain}, but the value of `{name}` changes at its `rate`, and a vector "
-                "field does not know it. Leave `gain` out."
+                f"`gain` is {gain}, but `{name}` {why}. Write `FirstIntegral(fn, value=...)` "
+                "without a `rate`, or leave `gain` out."
             )
     return TangentField(vector_field, manifold, positive_weights(metric), gain)
 
 
 @final
 class TangentField(eqx.Module):
-    """A vector field made tangent to a manifold; see [`diffrax_conserve.tangent`][].
-
-    Call it as any vector field, `field(t, y, args)`.
-    """
+    """A vector field made tangent to a manifold, called as any other one, `field(t, y, args)`; see
+    [`diffrax_conserve.tangent`][]."""
 
     vector_field: Callable[[RealScalarLike, Any, Args], Any]
     manifold: Manifold
@@ -140,18 +134,9 @@ class TangentField(eqx.Module):
         return tree_add(slope, correction)
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Values:
-        r"""The multipliers $\lambda$; in a mechanism they are the forces of the constraints.
-
-        **Arguments:**
-
-        - `t`, `y`, `args`: as for the vector field; for many states use `jax.vmap`.
-
-        **Returns:**
-
-        A PyTree shaped like the values of the functions of the manifold.
-        """
-        _, _, multiplier = self._solve(t, y, args)
-        return multiplier
+        r"""The multipliers $\lambda$, shaped like the values of the functions of the manifold; in a
+        mechanism they are the forces of the constraints. For many states use `jax.vmap`."""
+        return self._solve(t, y, args)[2]
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
         """The given field, the correction that is added to it, and the multipliers."""
@@ -159,14 +144,22 @@ class TangentField(eqx.Module):
         check_state(y, "`tangent`", jnp.inexact)
         check_metric(self.metric, y)
         check_outputs(self.manifold, t, y, args)
-        slope = slope_like(y, self.vector_field(t, y, args))
         values = conserved_values(self.manifold, t, y, args)
         check_values(self.manifold, values, t, y, args)
-        wrong = self._wrong_rates(t, y, args, slope, values)
+        slope = slope_like(y, self.vector_field(t, y, args))
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
         weights = inverse_metric(self.metric, y)
+
+        def residual(t: RealScalarLike, y: Y) -> Array:
+            return ravel(evaluate(self.manifold, t, y, args)) - numbers
+
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        g, along = jax.jvp(residual, (t, y), (jnp.ones_like(t), slope))
+        # That of a balance law, otherwise zero.
+        rate = ravel(rates(self.manifold, t, y, args))
+        wrong = (rate - along - self.gain * g).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             vector, wrong = given
@@ -179,24 +172,5 @@ class TangentField(eqx.Module):
             multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
             return combined(multiplier, rows), multiplier / sizes
 
-        correction, multiplier = written_out(solved, (vector, wrong.astype(vector.dtype)))
+        correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)
-
-    def _wrong_rates(self, t: RealScalarLike, y: Y, args: Args, slope: Y, values: Values) -> Array:
-        """`rate - (∂g/∂t + G f + gain g)`, where `rate` is that of a balance law and otherwise
-        zero."""
-        t = jnp.asarray(t, jnp.result_type(float, t))
-
-        def residuals(t: RealScalarLike, y: Y) -> Values:
-            return evaluate(self.manifold, t, y, args)
-
-        now, along = jax.jvp(residuals, (t, y), (jnp.ones_like(t), slope))
-        meant = rates(self.manifold, t, y, args)
-        parts = jtu.tree_map(
-            lambda rate, a, x, v: jnp.ravel(rate - a - self.gain * (x - v)),
-            meant,
-            along,
-            now,
-            values,
-        )
-        return jnp.concatenate(jtu.tree_leaves(parts))

@@ -1,5 +1,7 @@
 """Checks of the arguments of a `ManifoldProjection`, and the innermost of nested solvers."""
 
+from typing import Any
+
 import diffrax as dfx
 import equinox as eqx
 
@@ -23,21 +25,22 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
         )
 
 
-def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    # `HalfSolver` does not forward the root finder and its options.
-    while issubclass(type(solver), dfx.AbstractWrappedSolver):
-        solver = solver.solver  # pyright: ignore
-    return solver
-
-
 def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
-    if not isinstance(projection, Directional):
-        return
-    while issubclass(type(solver), dfx.AbstractWrappedSolver):
-        if type(solver) is dfx.HalfSolver:
-            raise ValueError(
-                "`Directional` moves along the error estimate of the wrapped solver, but "
-                "`diffrax.HalfSolver` gives it without its sign. Wrap a solver with an embedded "
-                "method, such as `diffrax.Tsit5()`, or pass `projection=SimplifiedNewton()`."
-            )
-        solver = solver.solver  # pyright: ignore
+    halved = any(type(x) is dfx.HalfSolver for x in _layers(solver))
+    if halved and isinstance(projection, Directional):
+        raise ValueError(
+            "`Directional` moves along the error estimate of the wrapped solver, but "
+            "`diffrax.HalfSolver` gives it without its sign. Wrap a solver with an embedded "
+            "method, such as `diffrax.Tsit5()`, or pass `projection=SimplifiedNewton()`."
+        )
+
+
+def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
+    return _layers(solver)[-1]
+
+
+def _layers(solver: Any) -> list[dfx.AbstractSolver]:
+    """The solver, the one that it wraps, and so on."""
+    # Not by `isinstance`, which diffrax forwards to the wrapped solver.
+    wraps = issubclass(type(solver), dfx.AbstractWrappedSolver)
+    return [solver, *(_layers(solver.solver) if wraps else [])]

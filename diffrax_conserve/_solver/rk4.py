@@ -1,6 +1,5 @@
 """The classical fourth-order Runge-Kutta method, written out."""
 
-from collections.abc import Callable
 from typing import ClassVar, final
 
 import diffrax as dfx
@@ -21,8 +20,7 @@ class RK4(dfx.AbstractSolver[None]):
 
     It has no error estimate: use it with `diffrax.ConstantStepSize` or `diffrax.StepTo`, or inside
     `diffrax.HalfSolver` for adaptive steps. Dense output is the cubic Hermite polynomial through
-    both ends, of fourth order too; the vector field at the end of a step is evaluated only if dense
-    output is requested.
+    both ends, of fourth order too.
 
     !!! example
 
@@ -41,21 +39,14 @@ class RK4(dfx.AbstractSolver[None]):
     """
 
     term_structure: ClassVar = dfx.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., dfx.ThirdOrderHermitePolynomialInterpolation]] = (
-        dfx.ThirdOrderHermitePolynomialInterpolation
-    )
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
 
     def order(self, terms: dfx.AbstractTerm) -> int:
         del terms
         return 4
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> None:
         del terms, t0, t1, y0, args
 
@@ -77,11 +68,14 @@ class RK4(dfx.AbstractSolver[None]):
         def stage(t: RealScalarLike, y: Y) -> Y:
             return terms.vf_prod(t, y, args, control)
 
+        def moved(y: Y, part: float, k: Y) -> Y:
+            return jtu.tree_map(lambda a, b: a + part * b, y, k)
+
         def end(y0: Y) -> Y:
             k1 = stage(t0, y0)
-            k2 = stage(middle, _axpy(0.5, k1, y0))
-            k3 = stage(middle, _axpy(0.5, k2, y0))
-            k4 = stage(t1, _axpy(1.0, k3, y0))
+            k2 = stage(middle, moved(y0, 0.5, k1))
+            k3 = stage(middle, moved(y0, 0.5, k2))
+            k4 = stage(t1, moved(y0, 1.0, k3))
             return jtu.tree_map(
                 lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4
             )
@@ -95,7 +89,3 @@ class RK4(dfx.AbstractSolver[None]):
 
 
 RK4.__init__.__doc__ = """**Arguments:** None"""
-
-
-def _axpy(factor: float, k: Y, y: Y) -> Y:
-    return jtu.tree_map(lambda a, b: b + factor * a, k, y)

@@ -1,9 +1,10 @@
 """Explicit Runge-Kutta methods with their stages written out."""
 
+import functools as ft
+import operator
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -18,11 +19,11 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 
     diffrax keeps the stages $k_i = f(t + c_i h, y + h \sum_j a_{ij} k_j)$ of a step in one array,
     which a loop over the stages updates in place. In a batch every stage then goes through memory.
-    Written out, the whole step is one expression, which XLA keeps in registers. The method, steps,
-    error estimate and dense output are the same up to the order of summation, and a batch of small
+    Written out, the whole step is one expression, which XLA keeps in registers: with the same
+    method, steps, error estimate and dense output, up to the order of summation, a batch of small
     systems is about ten times as fast (`benchmarks/cost/overhead.py`). Compile time grows with the
-    number of stages times the size of the vector field. For a large system or a single long solve
-    there is no gain.
+    number of stages times the size of the vector field. A large system or a single long solve gains
+    nothing.
 
     !!! example
 
@@ -36,10 +37,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         solver = dfc.ManifoldProjection(dfc.Unrolled(diffrax.Dopri8()), radius)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
 
-        @jax.vmap
-        def solve(y0):
-            return diffrax.diffeqsolve(term, solver, t0=0, t1=9, dt0=0.3, y0=y0).ys
-
+        solve = jax.vmap(lambda y0: diffrax.diffeqsolve(term, solver, 0, 9, 0.3, y0).ys)
         ys = solve(jnp.ones((1000, 2)))
         ```
 
@@ -73,19 +71,13 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     def strong_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         return self.solver.strong_order(terms)
 
-    def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
-        return self.solver.error_order(terms)
-
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
-    ) -> VF | None:
-        """The first slope, if the method reuses the last stage of a step in the next ("first same
-        as last")."""
-        del t1
-        return terms.vf(t0, y0, args) if self.solver.tableau.fsal else None
+    ) -> None:
+        del terms, t0, t1, y0, args
 
     def step(
         self,
@@ -94,24 +86,25 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         t1: RealScalarLike,
         y0: Y,
         args: Args,
-        solver_state: VF | None,
+        solver_state: None,
         made_jump: BoolScalarLike,
-    ) -> tuple[Y, Y, DenseInfo, VF | None, dfx.RESULTS]:
+    ) -> tuple[Y, Y, DenseInfo, None, dfx.RESULTS]:
+        # "First same as last" would save nothing: in a batch both branches of the choice between
+        # the last slope and a new one are computed, and a projected state has a new slope.
+        del solver_state, made_jump
         tableau = self.solver.tableau
         control = terms.contr(t0, t1)
 
-        slope = _first_slope(terms, t0, y0, args, solver_state, made_jump)
-        increments, y = [terms.prod(slope, control)], y0
+        increments, y = [terms.vf_prod(t0, y0, args, control)], y0
         for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
             y = _displaced(y0, row, increments)
-            slope = terms.vf(t0 + float(fraction) * (t1 - t0), y, args)
-            increments.append(terms.prod(slope, control))
+            time = t0 + float(fraction) * (t1 - t0)
+            increments.append(terms.vf_prod(time, y, args, control))
         # "Solution same as last": the last stage is evaluated at the solution.
         y1 = y if tableau.ssal else _displaced(y0, tableau.b_sol, increments)
         error = _combined(tableau.b_error, increments)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *increments)
-        state = slope if tableau.fsal else None
-        return y1, error, dict(y0=y0, y1=y1, k=k), state, dfx.RESULTS.successful
+        return y1, error, dict(y0=y0, y1=y1, k=k), None, dfx.RESULTS.successful
 
 
 Unrolled.__init__.__doc__ = """**Arguments:**
@@ -125,30 +118,14 @@ Unrolled.__init__.__doc__ = """**Arguments:**
 """
 
 
-def _first_slope(
-    terms: dfx.AbstractTerm,
-    t0: RealScalarLike,
-    y0: Y,
-    args: Args,
-    known: VF | None,
-    made_jump: BoolScalarLike,
-) -> VF:
-    """The slope at the start of a step: the `known` one from the last step, unless there was a
-    jump."""
-    if known is None:
-        return terms.vf(t0, y0, args)
-    if made_jump is False:
-        return known
-    return lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: known)
-
-
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
     """The weighted sum of the increments, without those whose weight is zero."""
-    used = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
-    factors, terms = zip(*used, strict=True)
-    return jtu.tree_map(
-        lambda *leaves: sum(w * x for w, x in zip(factors, leaves, strict=True)), *terms
-    )
+    parts = [
+        jtu.tree_map(ft.partial(operator.mul, float(weight)), k)
+        for weight, k in zip(weights, increments, strict=False)
+        if weight != 0
+    ]
+    return jtu.tree_map(lambda *leaves: sum(leaves), *parts)
 
 
 def _displaced(y: Y, weights: np.ndarray, increments: list[Y]) -> Y:
