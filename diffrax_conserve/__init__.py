@@ -33,13 +33,13 @@ from ._manifold import entry_name as entry_name
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
+from ._projection.base import Step as Step
 from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
-from ._projection.step import Step as Step
 from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection

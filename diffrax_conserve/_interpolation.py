@@ -21,9 +21,8 @@ import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
+from ._projection.base import Step, Target
 from ._projection.equations import any_lane
-from ._projection.step import Step
-from ._projection.target import Target
 from ._tree import tree_scale, tree_sub, tree_tangents
 
 # The candidates that are tried, closer and closer to the end of the step; the last is the end.

@@ -1,23 +1,54 @@
-"""The interface of projections: the problem, the report, and the checks of options."""
+"""The interface of projections: the problem, the report, and the target of a solver."""
 
 import abc
 import dataclasses
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, final
 
+import diffrax as dfx
 import equinox as eqx
-import jax.core
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, Real
 
-from .._custom_types import Args, IntScalarLike, RealScalarLike, Values, Y
-from .._options import check_count, check_number, check_numbers
+from .._balance import integrated_rates
+from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
+from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
-from .._tree import tree_stop_gradient, unravel
-from .equations import Equations, relative
-from .step import Step
+from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
+from .equations import Equations, equations_of, relative
+from .options import inverse_metric
+
+
+@final
+class Step(eqx.Module):
+    r"""The step of a solve in which a projection is called.
+
+    Times are those of the vector field, states are real vectors. At a saved time inside the step
+    and in dense output this is the same step, and the candidate is the dense output at `Problem.t`.
+
+    **Attributes:**
+
+    - `t0`, `t1`: where the step starts and ends; in a solve backwards in time `t1 < t0`.
+    - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
+    - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
+    """
+
+    t0: RealScalarLike
+    t1: RealScalarLike
+    y0: Float[Array, " n"]
+    error: Float[Array, " n"] | None
+    path: dfx.AbstractLocalInterpolation
+    direction: RealScalarLike
+
+    def evaluate(self, t: RealScalarLike) -> Float[Array, " n"]:
+        """The dense output of the wrapped solver, before any projection, at a time `t` between `t0`
+        and `t1`."""
+        return ravel(self.path.evaluate(t * self.direction))
 
 
 class ProjectionInfo(eqx.Module):
@@ -173,36 +204,6 @@ class AbstractProjection(eqx.Module):
         """
 
 
-def option(default: Any, **kwargs: Any) -> Any:
-    """An optional, keyword-only field."""
-    return eqx.field(default=default, kw_only=True, **kwargs)
-
-
-def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
-    """Raises unless `option` is structured like the state, with scalars or arrays as leaves."""
-    if jtu.tree_structure(option) != jtu.tree_structure(y):
-        raise ValueError(
-            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
-            f"{jtu.tree_structure(y)}. {remedy}"
-        )
-    for given, leaf in zip(jtu.tree_leaves(option), jtu.tree_leaves(y), strict=True):
-        if jnp.shape(given) not in ((), jnp.shape(leaf)):
-            raise ValueError(
-                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
-                f"{jnp.shape(leaf)}. Give a scalar or an array of the same shape."
-            )
-
-
-def check_options(projection: Any) -> None:
-    """Raises unless the options common to the projections are valid."""
-    for name in ("rtol", "atol"):
-        check_number(name, getattr(projection, name), least=0.0)
-    if hasattr(projection, "max_steps"):
-        check_count("max_steps", projection.max_steps)
-    for name in ("lower", "upper"):
-        check_numbers(name, getattr(projection, name, None), least=-np.inf)
-
-
 def check_projection(projection: Any) -> None:
     """Raises unless `projection` is an instance of a projection, not a class."""
     if not isinstance(projection, AbstractProjection):
@@ -212,46 +213,101 @@ def check_projection(projection: Any) -> None:
         )
 
 
-# The options that the Newton iterations share.
-NEWTON_OPTIONS = r"""**Arguments:**
+class Target(eqx.Module):
+    """Everything that a projection needs except the time and the candidate.
 
-- `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
-    state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
-    every projection ends well below it.
-- `atol`: an absolute tolerance, added to the relative one. Default: 0.
-- `max_steps`: the largest number of iterations, with bounds twice as many. A projection that is
-    not within its tolerance by then has failed.
-- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
-    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
-    freezes its component. Default: Euclidean.
-- `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
-    PyTrees like the state of scalars or arrays. The result is
-    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, which is always within the bounds and for
-    linear constraints is the nearest such point of the manifold. If there is no such point, the
-    projection fails. In derivatives, components at a bound are constant. For a complex component
-    the bounds apply to both parts. Default: none.
+    **Attributes:**
 
-**Raises:**
+    - `values`: the conserved values at the start of the solve.
+    - `hidden`: the part of the scales that the gradients do not show.
+    - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
+    - `gained`: the integrals of the rates of the manifold since the start of the solve.
+    """
 
-`TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
-less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
-projection is used, the bounds are not shaped like the state.
-"""
+    projection: AbstractProjection
+    manifold: Manifold
+    values: Float[Array, " m"]
+    hidden: Float[Array, " m"]
+    args: Args
+    direction: Real[Array, ""]
+    gained: Float[Array, " m"] | None = None
+
+    def advanced(
+        self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
+    ) -> "Target":
+        """The target at `end`, at the end of a step or inside it, given the `path` of the solution
+        from `start`."""
+        if self.gained is None:
+            return self
+        gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
+        gained = self.gained + ravel(gained).astype(self.gained.dtype)
+        return dataclasses.replace(self, gained=gained)
+
+    def step(
+        self,
+        start: RealScalarLike,
+        end: RealScalarLike,
+        y0: Y,
+        error: Y | None,
+        path: Callable[[], dfx.AbstractLocalInterpolation],
+    ) -> Step | None:
+        """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
+        if not self.projection.sees_step:
+            return None
+        start, end = start * self.direction, end * self.direction
+        error = None if error is None else ravel(error)
+        return Step(start, end, ravel(y0), error, path(), self.direction)
+
+    def project(
+        self, t: RealScalarLike, candidate: Y, step: Step | None = None
+    ) -> tuple[Y, ProjectionInfo]:
+        return _project(self, t * self.direction, candidate, step)
+
+    def project_if(
+        self, due: Bool[Array, ""] | None, t: RealScalarLike, candidate: Y, step: Step | None = None
+    ) -> tuple[Y, ProjectionInfo]:
+        """As `project` where a projection is `due`; otherwise the candidate, if it is finite."""
+        if due is None:
+            return self.project(t, candidate, step)
+        needed = due | ~tree_all_finite(candidate)
+        like = eqx.filter_eval_shape(self.project, t, candidate, step)[1]
+        idle = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        idle = dataclasses.replace(idle, ok=jnp.asarray(True))
+        return lax.cond(needed, lambda: self.project(t, candidate, step), lambda: (candidate, idle))
 
 
-def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
-    """`metric`, checked now if its values are known, and at run time if they are tracers."""
-    message = (
-        "`metric` has a weight that is not positive. Every weight must be greater than 0; they are "
-        "per component, not a matrix."
+@eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
+def _project(
+    target: Target, t: RealScalarLike, candidate: Y, step: Step | None
+) -> tuple[Y, ProjectionInfo]:
+    values = target.values if target.gained is None else target.values + target.gained
+    problem = problem_of(
+        target.projection, target.manifold, values, target.hidden, t, candidate, target.args, step
     )
+    y, info = target.projection.solve(problem, ravel(candidate))
+    return unravel(y, problem.like), info
 
-    def check(weight: ArrayLike) -> ArrayLike:
-        check_number("metric", weight)
-        if isinstance(weight, jax.core.Tracer):
-            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
-        if not np.all(np.asarray(weight) > 0):
-            raise ValueError(message)
-        return weight
 
-    return jtu.tree_map(check, metric)
+def problem_of(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Float[Array, " m"],
+    hidden: Float[Array, " m"],
+    t: RealScalarLike,
+    like: Any,
+    args: Args,
+    step: Step | None = None,
+) -> Problem:
+    """The problem of a projection at a time, for states like `like`."""
+    like = jax.eval_shape(lambda: like)
+    equations = equations_of(manifold, values, t, like, args, hidden)
+    weights = inverse_metric(projection.metric, like)
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+    keys = tuple(_key(path[0]) if path else None for path, _ in flat)
+    shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
+    equations = dataclasses.replace(equations, weights=weights)
+    return Problem(equations, t, args, shaped, like, keys, step)
+
+
+def _key(entry: Any) -> Any:
+    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))

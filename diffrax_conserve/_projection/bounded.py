@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._printing import is_traced
-from .._tree import ravel, real_view
-from .base import check_like
 from .equations import Equations
+from .loop import Solved, project_along
+from .options import check_like, spread
 
 # A component beyond its bound has this derivative: with zero, a constraint all of whose components
 # are at bounds would never change.
@@ -65,16 +65,21 @@ def box_of(
 
 
 def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
-    y = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
-        bound = jtu.tree_map(lambda _: bound, y)
+        bound = jtu.tree_map(lambda _: bound, like)
     remedy = "Give one number, or one bound (or an array) for each leaf of the state."
-    check_like(name, bound, y, remedy)
-    return ravel(
-        jtu.tree_map(
-            lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), bound, real_view(y)
-        )
-    )
+    check_like(name, bound, like, remedy)
+    return spread(bound, like)
+
+
+def project_within(
+    box: Box, equations: Equations, candidate: Float[Array, " n"], *, max_steps: int
+) -> Solved:
+    """`loop.project_along` the gradients at the candidate, within bounds."""
+    rows = equations.weighted(equations.linearise(candidate)[1])
+    bounded = box.compose(equations)
+    z, ok, count = project_along(bounded, candidate, rows, max_steps=2 * max_steps)
+    return box.clip(z), ok, count
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from .._custom_types import RealScalarLike, Values
 from .._options import check_function
 from .._tree import ravel
-from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .options import check_options, option
 
 
 @final

@@ -7,8 +7,9 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import AbstractProjection, Problem, ProjectionInfo, check_options, option
+from .base import AbstractProjection, Problem, ProjectionInfo
 from .loop import project_along
+from .options import check_options, option
 
 
 @final

@@ -9,19 +9,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from .base import (
-    NEWTON_OPTIONS,
-    AbstractProjection,
-    Problem,
-    ProjectionInfo,
-    check_options,
-    option,
-    positive_weights,
-)
-from .bounded import Box, box_of, check_bounds
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .bounded import Box, box_of, check_bounds, project_within
 from .equations import Equations
 from .gram import gram_matrix, gram_solve
 from .loop import certain, solve
+from .options import NEWTON_OPTIONS, check_options, option, positive_weights
 
 # The largest number of unknowns and constraints for which the nearest point is sought.
 _NEAREST_MAX = 512
@@ -117,10 +110,7 @@ def _nearest(
     if box is None:
         y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
     else:
-        rows = equations.weighted(equations.linearise(candidate)[1])
-        bounded = box.compose(equations)
-        z, _, count = solve(bounded, candidate, directions=rows, max_steps=2 * max_steps)
-        y = box.clip(z)
+        y, _, count = project_within(box, equations, candidate, max_steps=max_steps)
     n = y.size
     if n + equations.magnitude.size > _NEAREST_MAX:
         return jnp.concatenate([y, 0 * equations.magnitude]), jnp.asarray(False), count

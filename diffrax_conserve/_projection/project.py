@@ -1,11 +1,8 @@
 """`project`, and the checks of what is projected."""
 
-from typing import Any
-
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import (
@@ -19,13 +16,12 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
-from .._options import dtype_of
 from .._tree import ravel, tree_stop_gradient
-from .base import AbstractProjection, ProjectionInfo, check_like, check_projection
+from .base import AbstractProjection, ProjectionInfo, Target, check_projection
 from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of
 from .newton import Newton
+from .options import check_metric, check_state
 from .roundoff import hidden_terms
-from .target import Target
 
 
 def project(
@@ -115,30 +111,3 @@ def given_values(
         return own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
 
     return jtu.tree_map(choose, manifold, value, own, is_leaf=is_entry)
-
-
-def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
-    """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
-    dtypes = [dtype_of(x) for x in jtu.tree_leaves(y)]
-    for leaf, dtype in zip(jtu.tree_leaves(y), dtypes, strict=True):
-        if not jnp.issubdtype(dtype, kind):
-            got = f"a leaf of dtype {dtype}" if eqx.is_array_like(leaf) else f"the leaf {leaf!r}"
-            wanted = "floating-point states, real or complex"
-            if kind is jnp.floating:
-                wanted = "real floating-point states; split a complex leaf into two"
-            raise TypeError(
-                f"The state has {got}, but {user} needs {wanted}. Convert it, for example by "
-                "`jnp.asarray(..., dtype=float)`."
-            )
-    if len({jnp.finfo(dtype).dtype for dtype in dtypes}) > 1:
-        raise TypeError(
-            f"The state has leaves of the dtypes {', '.join(map(str, dtypes))}, but {user} needs "
-            "one precision. Convert them to one."
-        )
-
-
-def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
-    """Raises unless `metric` is structured like the state."""
-    if metric is not None:
-        remedy = "Give one weight (or an array of weights) for each leaf of the state."
-        check_like("metric", metric, y, remedy)

@@ -34,7 +34,9 @@ def hidden_terms(
     """The roundoff of `fn(y)` in units of roundoff."""
     evaluated = ft.partial(_evaluated, jax.make_jaxpr(fn)(y))
     like: list[Array] = []
-    jax.eval_shape(lambda y: evaluated(y, lambda x: like.append(x) or x), y)
+    out = jax.eval_shape(lambda y: evaluated(y, lambda x: like.append(x) or x), y)
+    if not like:
+        return jnp.zeros(out.shape, out.dtype)
 
     def shifted(shifts: list[Array]) -> tuple[Array, list[Array]]:
         given, operands = iter(shifts), []

@@ -5,17 +5,10 @@ from typing import ClassVar, final
 
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .base import (
-    NEWTON_OPTIONS,
-    AbstractProjection,
-    Problem,
-    ProjectionInfo,
-    check_options,
-    option,
-    positive_weights,
-)
-from .bounded import box_of, check_bounds
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .bounded import box_of, check_bounds, project_within
 from .loop import project_along
+from .options import NEWTON_OPTIONS, check_options, option, positive_weights
 
 
 @final
@@ -76,10 +69,7 @@ class SimplifiedNewton(AbstractProjection):
         if box is None:
             y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
         else:
-            rows = equations.weighted(equations.linearise(candidate)[1])
-            bounded = box.compose(equations)
-            z, ok, count = project_along(bounded, candidate, rows, max_steps=2 * self.max_steps)
-            y = box.clip(z)
+            y, ok, count = project_within(box, equations, candidate, max_steps=self.max_steps)
         return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol, ok=ok)
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .equations import Equations
+from .options import inverse_metric
 from .project import check_metric
-from .target import inverse_metric
 
 
 @final

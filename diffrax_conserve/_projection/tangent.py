@@ -26,12 +26,11 @@ from .._manifold import (
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
-from .base import positive_weights
 from .equations import equations_of
 from .gram import combined, gram_matrix, gram_solve
+from .options import inverse_metric, positive_weights
 from .project import check_metric, check_state
 from .scalars import written_out
-from .target import inverse_metric
 
 
 def tangent(

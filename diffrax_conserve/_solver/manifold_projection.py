@@ -29,13 +29,11 @@ from .._manifold import (
     named_entries,
 )
 from .._options import check_count, check_number
-from .._projection.base import AbstractProjection, check_projection, option
-from .._projection.project import check_metric, check_state
+from .._projection.base import AbstractProjection, Target, check_projection
+from .._projection.options import check_metric, check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._projection.target import Target
-from .checks import check_direction, check_nested, innermost
 from .state import ProjectionStatistics, State, member, started, verdict
-from .terms import is_backsolve, is_ode, time_direction
+from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 
 
 @final

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection.base import option
+from ..._projection.options import option
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
 from ..._tree import tree_max, tree_sub, working_dtype

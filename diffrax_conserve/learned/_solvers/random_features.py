@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection.base import option
-from ..._projection.project import check_state
+from ..._projection.options import check_state, option
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import check_ode
 from .chebyshev import ChebyshevInterpolation

@@ -14,7 +14,7 @@ from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_outputs
 from ..._options import check_number
-from ..._projection.project import check_state
+from ..._projection.options import check_state
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box

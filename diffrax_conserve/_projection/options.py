@@ -1,0 +1,130 @@
+"""The options of projections: their checks, and their vectors."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
+
+from .._custom_types import Y
+from .._options import check_count, check_number, check_numbers, dtype_of
+from .._tree import ravel, real_view
+
+
+def option(default: Any, **kwargs: Any) -> Any:
+    """An optional, keyword-only field."""
+    return eqx.field(default=default, kw_only=True, **kwargs)
+
+
+def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
+    """Raises unless `option` is structured like the state, with scalars or arrays as leaves."""
+    if jtu.tree_structure(option) != jtu.tree_structure(y):
+        raise ValueError(
+            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
+            f"{jtu.tree_structure(y)}. {remedy}"
+        )
+    for given, leaf in zip(jtu.tree_leaves(option), jtu.tree_leaves(y), strict=True):
+        if jnp.shape(given) not in ((), jnp.shape(leaf)):
+            raise ValueError(
+                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
+                f"{jnp.shape(leaf)}. Give a scalar or an array of the same shape."
+            )
+
+
+def check_options(projection: Any) -> None:
+    """Raises unless the options common to the projections are valid."""
+    for name in ("rtol", "atol"):
+        check_number(name, getattr(projection, name), least=0.0)
+    if hasattr(projection, "max_steps"):
+        check_count("max_steps", projection.max_steps)
+    for name in ("lower", "upper"):
+        check_numbers(name, getattr(projection, name, None), least=-np.inf)
+
+
+# The options that the Newton iterations share.
+NEWTON_OPTIONS = r"""**Arguments:**
+
+- `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
+    state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
+    every projection ends well below it.
+- `atol`: an absolute tolerance, added to the relative one. Default: 0.
+- `max_steps`: the largest number of iterations, with bounds twice as many. A projection that is
+    not within its tolerance by then has failed.
+- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
+    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
+    freezes its component. Default: Euclidean.
+- `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
+    PyTrees like the state of scalars or arrays. The result is
+    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, which is always within the bounds and for
+    linear constraints is the nearest such point of the manifold. If there is no such point, the
+    projection fails. In derivatives, components at a bound are constant. For a complex component
+    the bounds apply to both parts. Default: none.
+
+**Raises:**
+
+`TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
+less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
+projection is used, the bounds are not shaped like the state.
+"""
+
+
+def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
+    """`metric`, checked now if its values are known, and at run time if they are tracers."""
+    message = (
+        "`metric` has a weight that is not positive. Every weight must be greater than 0; they are "
+        "per component, not a matrix."
+    )
+
+    def check(weight: ArrayLike) -> ArrayLike:
+        check_number("metric", weight)
+        if isinstance(weight, jax.core.Tracer):
+            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+        if not np.all(np.asarray(weight) > 0):
+            raise ValueError(message)
+        return weight
+
+    return jtu.tree_map(check, metric)
+
+
+def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
+    """`M⁻¹` as a vector; an infinite weight freezes its component."""
+    return None if metric is None else 1 / spread(metric, like)
+
+
+def spread(tree: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
+    """Scalars or arrays for the leaves of a state, as a vector like the state."""
+    view = jax.eval_shape(real_view, like)
+    return ravel(
+        jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), tree, view)
+    )
+
+
+def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
+    """Raises unless every leaf of the state is a floating-point array, as `user` needs."""
+    dtypes = [dtype_of(x) for x in jtu.tree_leaves(y)]
+    for leaf, dtype in zip(jtu.tree_leaves(y), dtypes, strict=True):
+        if not jnp.issubdtype(dtype, kind):
+            got = f"a leaf of dtype {dtype}" if eqx.is_array_like(leaf) else f"the leaf {leaf!r}"
+            wanted = "floating-point states, real or complex"
+            if kind is jnp.floating:
+                wanted = "real floating-point states; split a complex leaf into two"
+            raise TypeError(
+                f"The state has {got}, but {user} needs {wanted}. Convert it, for example by "
+                "`jnp.asarray(..., dtype=float)`."
+            )
+    if len({jnp.finfo(dtype).dtype for dtype in dtypes}) > 1:
+        raise TypeError(
+            f"The state has leaves of the dtypes {', '.join(map(str, dtypes))}, but {user} needs "
+            "one precision. Convert them to one."
+        )
+
+
+def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
+    """Raises unless `metric` is structured like the state."""
+    if metric is not None:
+        remedy = "Give one weight (or an array of weights) for each leaf of the state."
+        check_like("metric", metric, y, remedy)
