@@ -57,4 +57,4 @@ from .learned._solvers.pinn_solver import PINNSolver as PINNSolver
 from .learned._solvers.random_features import RandomFeatureSolver as RandomFeatureSolver
 from .learned._training.fit import fit as fit
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
