@@ -1,8 +1,8 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
 from . import paper as paper
-from ._files.save import pretrained_path as pretrained_path
-from ._files.save import read_info as read_info
+from ._files import pretrained_path as pretrained_path
+from ._files import read_info as read_info
 from ._networks.cores import Concatenated as Concatenated
 from ._networks.cores import Gated as Gated
 from ._networks.cores import Product as Product

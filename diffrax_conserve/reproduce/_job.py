@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from .._replace_file import replace_file
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
-from ..learned._files.save import save
+from ..learned._files import save
 from ..systems import AbstractSystem
 from ._compare import compare
 from ._setup import SetupError, check_times, import_plot, make_writable

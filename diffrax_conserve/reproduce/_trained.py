@@ -13,7 +13,7 @@ from jaxtyping import Array, PRNGKeyArray
 from .._projection.newton import Newton
 from .._solver.manifold_projection import ManifoldProjection
 from ..learned import ConservativeLayer, FitLog, paper, pretrained_path, read_info
-from ..learned._files.save import load
+from ..learned._files import load
 from ..learned._networks.deeponet import DeepONet
 from ..learned._networks.pinn import PINN
 from ..learned._solvers.flow_map_solver import DeepONetSolver
