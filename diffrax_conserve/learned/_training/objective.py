@@ -13,7 +13,6 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -91,7 +90,6 @@ class Objective(eqx.Module):
 
     problem: Problem
     static: Any  # the model without its weights
-    optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
     typical: Float[Array, ""]
     linear: Bool[Array, " weights"]  # marks those of the last layer
@@ -140,20 +138,17 @@ class Objective(eqx.Module):
 
 @eqx.filter_jit
 def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tuple[Objective, Carry]:
-    recipe, (points_key, key) = problem.recipe, jr.split(key)
+    points_key, key = jr.split(key)
     trained = _marked(model, "weights", eqx.is_inexact_array)
     weights, static = eqx.partition(model, trained)
     points = problem.draw(model, points_key)
-    optimiser = recipe.optimiser
-    if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
-        optimiser = optax.chain(optax.clip_by_global_norm(recipe.max_gradient_norm), optimiser)
     last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     domain = domain_of(model) if isinstance(problem.sample, Pool) else None
     carry = Carry(
         weights=weights,
-        optimiser_state=optimiser.init(weights),
+        optimiser_state=problem.recipe.optimiser.init(weights),
         points=points,
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
@@ -161,12 +156,12 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
         skipped=jnp.asarray(0),
         domain=domain,
         best_domain=domain,
-        losses=jnp.full(recipe.epochs, jnp.nan, dtype),
+        losses=jnp.full(problem.recipe.epochs, jnp.nan, dtype),
     )
     # No array is weakly typed, because the compiled epochs return none that is.
     carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
     typical = problem.typical(model, points)
-    return Objective(problem, static, optimiser, points, typical, linear, key), carry
+    return Objective(problem, static, points, typical, linear, key), carry
 
 
 def _marked(model: AbstractTrainable, method: str, mark: Callable[[Any], bool]) -> Any:
@@ -218,7 +213,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If the update is not finite, continue from the best model: skipping the update is not enough,
     # because the same points would give the same result in the next epoch.
-    fresh = objective.optimiser.init(carry.best_weights)
+    fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
     carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
@@ -239,7 +234,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
     """The next weights and state of the optimiser, and the loss."""
-    optimiser, schedule = objective.optimiser, objective.schedule(epoch)
+    optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
     weights, points, state = carry.weights, carry.points, carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
