@@ -88,7 +88,7 @@ def initial_slope(net: MLP) -> float | None:
 
 
 @eqx.filter_jit
-def fresh(net: MLP, slope: float | None, size: float, key: PRNGKeyArray) -> MLP:
+def fresh(net: MLP, slope: float | None, size: Float[Array, ""], key: PRNGKeyArray) -> MLP:
     """A network of the shape of `net`, with other random weights and outputs of about `size`."""
     first, last = net.weights[0], net.weights[-1]
     (in_size, width), out_size, depth = first.shape, last.shape[1], len(net.weights) - 1

@@ -123,8 +123,8 @@ class Objective(eqx.Module):
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
         layer, recipe = self.static.layer, self.problem.recipe
-        if layer is None or layer.steps == 0:
-            return jnp.zeros_like(epoch), jnp.ones(())
+        if layer is None:
+            return self.complete()
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
@@ -211,8 +211,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     """One update, and the points for the next one."""
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
-    # If the update is not finite, continue from the best model: skipping the update is not enough,
-    # because the same points would give the same result in the next epoch.
+    # If not, continue from the best model: the same weights and points would give the same result.
     fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
     carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),

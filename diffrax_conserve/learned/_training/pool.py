@@ -34,13 +34,12 @@ class Pool(eqx.Module):
     Pass it as `sample` to [`diffrax_conserve.fit`][]. In a solve, each step of a flow map starts at
     the end of the last one, so it must be trained on such states, and it can generate them itself.
     Whenever the recipe draws new points, the network moves each state by a step of random length,
-    and the result is projected to the manifold through the state. Every state is replaced by a new
-    one from `sample` after `mean_steps` steps on average. A step is accepted only if its defect at
-    the end is small: an inaccurate network first learns the states of `sample`.
+    if its defect at the end is small, and the result is projected to the manifold through the
+    state.
 
     Construct the network with `states` that cover about the region of the solutions: they normalise
     its inputs. The `domain` of the trained network covers them and the states of the pool in the
-    second half of the epochs. (With a frame, the largest clock is unchanged, because the network
+    second half of the epochs. (With a frame the largest clock is unchanged, because the network
     scales time by it; faster states are replaced by new ones.)
 
     !!! example

@@ -31,9 +31,8 @@ def reachable_states(
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
     In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
-    such states. Between 73 % and 98 % of the trajectories leave the paper's boxes and annuli, from
-    which initial states are drawn. Pass the result as `states` to [`diffrax_conserve.DeepONet`][],
-    and as `sample` to [`diffrax_conserve.fit`][].
+    such states. Pass the result as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
+    [`diffrax_conserve.fit`][].
 
     **Arguments:**
 
@@ -71,11 +70,9 @@ def reachable_states(
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    ys, good = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
+    _, ys = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
-    if keep is not None:
-        good = good & eqx.filter_jit(jax.vmap(keep))(ys)
-    return _the_good(ys, good)
+    return ys if keep is None else _the_good(ys, eqx.filter_jit(jax.vmap(keep))(ys))
 
 
 def trajectories(
@@ -99,8 +96,7 @@ def trajectories(
     - `solver`, `dt0`: any diffrax solver; for stiff equations [`diffrax.Kvaerno5`][]. Default:
         [`diffrax.Dopri8`][]. With `dt0` its steps are fixed.
     - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
-        component of all `y0s`. If small components matter, pass a value that is small relative to
-        them.
+        component of all `y0s`.
 
     **Returns:**
 
@@ -124,11 +120,10 @@ def trajectories(
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jnp.asarray(ts, float)
-    ts = jnp.broadcast_to(times, (count, times.shape[-1]))
+    times = jnp.broadcast_to(times, (count, times.shape[-1]))
     size = max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
     atol = rtol * size if atol is None else atol
-    ys, good = _solutions(vector_field, y0s, ts, args, solver, dt0, rtol, atol)
-    return _the_good((ts, ys), good)
+    return _solutions(vector_field, y0s, times, args, solver, dt0, rtol, atol)
 
 
 def _solutions(
@@ -140,15 +135,14 @@ def _solutions(
     dt0: RealScalarLike | None,
     rtol: float,
     atol: float,
-) -> tuple[Any, Array]:
-    """The states at `ts`, and which solves succeeded."""
-    method = dfx.Dopri8() if solver is None else solver
+) -> tuple[Array, Any]:
+    """The times and states of the solves that succeeded."""
 
     def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
         adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
         found = dfx.diffeqsolve(
             dfx.ODETerm(vector_field),
-            method,
+            dfx.Dopri8() if solver is None else solver,
             0.0,
             ts[-1],
             dt0,
@@ -162,7 +156,8 @@ def _solutions(
         )
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    return eqx.filter_jit(jax.vmap(solution))(y0s, ts)
+    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, ts)
+    return _the_good((ts, ys), good)
 
 
 def _the_good(ys: Any, good: Array) -> Any:
