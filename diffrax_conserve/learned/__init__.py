@@ -7,9 +7,9 @@ from ._networks.cores import Concatenated as Concatenated
 from ._networks.cores import Gated as Gated
 from ._networks.cores import Product as Product
 from ._networks.domain import Box as Box
+from ._networks.domain import Frame as Frame
 from ._networks.flow_map import AbstractFlowMap as AbstractFlowMap
 from ._networks.flow_map import FlowMap as FlowMap
-from ._networks.frame import Frame as Frame
 from ._networks.layer import ConservativeLayer as ConservativeLayer
 from ._networks.taylor import Taylor as Taylor
 from ._networks.wrappers import BoxCox as BoxCox

@@ -27,12 +27,10 @@ from .._manifold import Constraint, FirstIntegral
 from .._replace_file import replace_file
 from ..systems import AbstractSystem
 from ..systems._registry import CLASSES
-from ._networks.cores import Concatenated, Gated, Product
+from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
 from ._networks.deeponet import DeepONet
-from ._networks.domain import Box, FramedBox
-from ._networks.frame import MakeFrame
+from ._networks.domain import Box, FramedBox, MakeFrame
 from ._networks.layer import ConservativeLayer
-from ._networks.mlp import ACTIVATIONS, MLP
 from ._networks.pinn import PINN
 from ._networks.taylor import Taylor
 from ._networks.wrappers import BoxCox, Repeated, Transformed

@@ -11,13 +11,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import AbstractCore, Concatenated, Sizes
-from .domain import Box, FramedBox
+from .cores import AbstractCore, Activation, Concatenated, Sizes, check_sizes, find_activation
+from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import as_states, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, checked_args, checked_box
-from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer
-from .mlp import Activation, check_sizes, find_activation
 from .taylor import Taylor
 from .trainable import LayerSchedule
 

@@ -17,7 +17,7 @@ from ..._projection.equations import equations_of, relative
 from ..._projection.gram import combined, gram_matrix, gram_solve
 from ..._projection.scalars import written_out
 from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
-from .mlp import check_sizes
+from .cores import check_sizes
 
 
 @final

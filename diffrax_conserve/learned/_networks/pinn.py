@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
+from .cores import MLP, Activation, check_sizes
 from .flat import as_state, flatten, stacked_vectors
 from .layer import ConservativeLayer
-from .mlp import MLP, Activation, check_sizes
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 

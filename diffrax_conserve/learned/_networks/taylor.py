@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ..._custom_types import Args, RealScalarLike, Y
-from .mlp import check_sizes
+from .cores import check_sizes
 
 
 @final

@@ -14,11 +14,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_sub, unflatten
-from .cores import AbstractCore
+from .cores import AbstractCore, check_sizes
 from .domain import Box
 from .flat import flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
-from .mlp import check_sizes
 from .trainable import LayerSchedule, Sampler
 
 _Model = TypeVar("_Model")

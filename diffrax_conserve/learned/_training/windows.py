@@ -19,8 +19,8 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._custom_types import Manifold
 from ..._manifold import conserved_values
 from ..._projection.project import project
+from .._networks.cores import fresh, initial_slope
 from .._networks.flat import flatten
-from .._networks.mlp import fresh, initial_slope
 from .._networks.pinn import PINN, Window
 from .errors import relative, window_errors
 from .loop import FitLog, Loop
