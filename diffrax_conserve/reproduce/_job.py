@@ -20,9 +20,9 @@ from ._tables import figures, metrics, table
 from ._trained import (
     KINDS,
     Learned,
+    history,
     initial_states,
     is_learned,
-    learned,
     learned_solvers,
     pretrained,
     train,
@@ -68,7 +68,7 @@ def reproduce(
     networks: dict[str, Learned] = {}
     if is_learned(system):
         networks = _train(system, out, seed, epochs) if anew else pretrained(system)
-    chosen = solvers(system, {kind: found.network for kind, found in networks.items()})
+    chosen = solvers(system, {kind: network for kind, (network, *_) in networks.items()})
     runs = {}
     for i, (name, solver) in enumerate(chosen.items(), start=1):
         progress(f"[{i}/{len(chosen)}] {name}: compiles and solves")
@@ -83,7 +83,7 @@ def reproduce(
             replace_file(out / f"{name}.{suffix}", lambda path, f=figure: plot.save(f, path))
     text = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
     replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    print(table(system, numbers, t1, dt, states))
+    print(table(system, numbers))
     if plot is None:
         print("\nThere are no figures: they need matplotlib. Install it by")
         print("    pip install 'diffrax-conserve[plots]'")
@@ -93,7 +93,7 @@ def reproduce(
 
 def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:
     """Trains the standard and the conservative network, and saves them beside the figures."""
-    networks = {}
+    networks: dict[str, Learned] = {}
     for kind in KINDS:
         print(f"Training the {kind} network: {epochs} epochs, seed {seed}")
         network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
@@ -103,5 +103,5 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
         )
         info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
         save(out / f"{kind}.network", network, info=info)
-        networks[kind] = learned(network, log)
+        networks[kind] = network, *history(log)
     return networks

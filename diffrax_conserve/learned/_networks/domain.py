@@ -18,9 +18,9 @@ from .flat import as_state, as_states, flatten
 class Box(eqx.Module):
     r"""The states between two corners, $l \le y \le u$ in every component.
 
-    The `domain` of a flow map: the option `outside` of [`diffrax_conserve.DeepONetSolver`][]
-    determines what happens to a step that starts outside it. Any Module with a method
-    `contains(y)`, which returns a boolean scalar, can take its place.
+    As the `domain` of a flow map it can be replaced by any Module with a method `contains(y)`. The
+    option `outside` of [`diffrax_conserve.DeepONetSolver`][] determines what happens to a step that
+    starts outside it.
 
     !!! example
 
@@ -108,26 +108,17 @@ Box.__init__.__doc__ = """**Arguments:**
 class Frame(eqx.Module):
     r"""The representation of a state in a moving frame.
 
-    Symmetries such as rotations, permutations or changes of scale map solutions to solutions. A
-    *frame* is a function of one state that returns
-
-    - `inputs`: a vector of $k$ invariants of the symmetries, which differ for two states unless a
-        symmetry maps one to the other;
-    - `basis`: a matrix $B$ with a row for each component of the state, whose $m$ columns are
-        transformed like the state and span all directions in which a solution can leave it;
-    - `clock`: the number of the frame's own units of time per unit of time; 1 unless the symmetries
-        include a change of scale.
-
-    With a frame, a [`diffrax_conserve.DeepONet`][] learns $m$ functions of $k + 1$ numbers, the
-    inputs and the own time $\tau$ = `clock` $h$, instead of $n$ functions of $n + 1$ numbers:
+    Symmetries such as rotations, permutations or changes of scale map solutions to solutions. With
+    a *frame*, a function of one state that returns `inputs`, `basis` and `clock`, a
+    [`diffrax_conserve.DeepONet`][] learns $m$ functions of $k + 1$ numbers, the inputs and the own
+    time $\tau$ = `clock` $h$, instead of $n$ functions of $n + 1$ numbers:
 
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
     and commutes with the symmetries for all weights. $\tau_{\max}$ is the largest own time of
-    `max_step` among the states with which it was built.
-
-    Examples are the methods `frame` of [`diffrax_conserve.systems.PointVortices`][] and of
-    [`diffrax_conserve.systems.Kepler`][], which return the three as a tuple.
+    `max_step` among the states with which it was built. Examples are the methods `frame` of
+    [`diffrax_conserve.systems.PointVortices`][] and of [`diffrax_conserve.systems.Kepler`][], which
+    return the three as a tuple.
 
     !!! example
 
@@ -168,7 +159,12 @@ class Frame(eqx.Module):
 
 Frame.__init__.__doc__ = r"""**Arguments:**
 
-- `inputs`, `basis`, `clock`: as above.
+- `inputs`: a vector of $k$ invariants of the symmetries, which differ for two states unless a
+    symmetry maps one to the other.
+- `basis`: a matrix $B$ with a row for each component of the state, whose $m$ columns are
+    transformed like the state and span all directions in which a solution can leave it.
+- `clock`: the number of the frame's own units of time per unit of time; 1 unless the symmetries
+    include a change of scale.
 """
 
 # A function from a state to its `Frame`, or to the tuple `(inputs, basis, clock)`.
@@ -226,10 +222,8 @@ class FramedBox(eqx.Module):
         return cls(make, Box(lower, upper), example)
 
     def extended(self, states: Y) -> "FramedBox":
-        """The set extended by the inputs of `states`.
-
-        The largest clock is unchanged, because the network scales time by it.
-        """
+        """The set extended by the inputs of `states`; the network scales time by the largest clock,
+        which is not changed."""
         seen = FramedBox.around(self.make, states).box
         inputs = self.box.lower[0], self.box.upper[0]
         around = Box(*inputs).extended(jnp.stack([seen.lower[0], seen.upper[0]]))

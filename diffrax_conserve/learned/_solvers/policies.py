@@ -183,27 +183,24 @@ def _check_solver(solver: Any) -> None:
 def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
     """The number of steps of a learned solver outside its flow map's domain.
 
-    It is part of the state of a solver with a policy `outside`, so `diffeqsolve` must return that
-    state, by `SaveAt(solver_state=True)`.
-
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve` with `saveat=SaveAt(..., solver_state=True)`,
-        or a batch of them from `jax.vmap`.
+    - `sol`: the solution from `diffrax.diffeqsolve` with a solver that has a policy `outside`, and
+        with `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
 
     **Returns:**
 
     An object with the attributes
 
     - `num_steps`: the number of accepted steps;
-    - `num_outside`: the number of them that were outside: a step that starts outside the flow map's
-        `domain`, or whose estimated error is above `max_error`;
+    - `num_outside`: the number of them that started outside the flow map's `domain`, or had an
+        estimated error above `max_error`;
     - `fraction_outside`: `num_outside / num_steps`;
     - `first_outside`: the time at which the first of them started; infinity if there is none.
 
     **Raises:**
 
-    `ValueError` if `sol` holds no such state.
+    `ValueError` if `sol` holds no such statistics.
 
     !!! example
 

@@ -48,22 +48,19 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 
     **Accuracy.** Steps can be long: with 16 features the error over half a period of an oscillator
     is 2e-14, over a whole one 1e-12 and over two 1e-9. The solver is fast for high accuracy or
-    stiff systems of few unknowns; see "Learned solvers" for figures.
+    stiff systems of few unknowns.
 
     **Error estimate.** The remaining defect, propagated to the end of the step by the linearised
-    equation. It agrees with the true error of the step to within some per cent, down to roundoff,
-    so adaptive steps ([`diffrax.PIDController`][]) meet their tolerances. With fixed steps it is
-    not computed.
+    equation. It agrees with the true error of the step to within some per cent, down to roundoff.
+    With fixed steps it is not computed.
 
     **Conservation.** As a least-squares fit of slopes (a continuous Galerkin method) the solver
-    conserves, for any features, the energy of every canonical Hamiltonian system,
-    $y' = J \nabla H(y)$, to the accuracy of the Gauss rule, which soon reaches roundoff. Very stiff
-    components are not damped; in such transients steps become short. To conserve other integrals
-    use [`diffrax_conserve.ManifoldProjection`][].
+    conserves the energy of every canonical Hamiltonian system, $y' = J \nabla H(y)$, to the
+    accuracy of the Gauss rule, which soon reaches roundoff. Very stiff components are not damped;
+    in such transients steps become short.
 
     If Newton's method fails, an adaptive solve tries a shorter step, and a solve with fixed steps
-    fails. Dense output is the network. Derivatives in forward and reverse mode, of any order, are
-    those of the solved equations.
+    fails. Dense output is the network. Derivatives of any order are those of the solved equations.
 
     !!! example
 
@@ -162,10 +159,9 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 RandomFeatureSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `features`: the number of directions fitted for each component of the state, from 3 to 32. More
-    features allow longer steps and smaller errors, but each step solves a few dense linear systems
-    of `features` $\cdot n$ unknowns for a state of size $n$.
-- `seed`: the seed of the random neurons. Results for two seeds differ by less than the tolerance of
-    a solve.
+    features allow longer steps, but each step solves a few dense linear systems of `features`
+    $\cdot n$ unknowns for a state of size $n$.
+- `seed`: the seed of the random neurons, which hardly matters.
 
 **Raises:**
 
