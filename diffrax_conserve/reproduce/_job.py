@@ -1,6 +1,7 @@
 """The main job: a system of the catalogue, solved with and without projection, and compared."""
 
 import json
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from .._solver.rk4 import RK4
 from ..learned._files import save
 from ..systems import AbstractSystem
 from ._compare import compare
-from ._setup import SetupError, check_times, import_plot, make_writable
 from ._solve import run
 from ._tables import figures, metrics, table
 from ._trained import (
@@ -27,6 +27,13 @@ from ._trained import (
     pretrained,
     train,
 )
+
+# The largest size of the states of all steps, which are kept in memory.
+_BYTES_MAX = 2**29
+
+
+class SetupError(Exception):
+    """The job cannot start; the message gives the reason and a remedy."""
 
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
@@ -105,3 +112,41 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
         save(out / f"{kind}.network", network, info=info)
         networks[kind] = network, *history(log)
     return networks
+
+
+# ---- Before the work starts ----
+
+
+def check_times(system: AbstractSystem, t1: float, dt: float, states: int) -> None:
+    """Raises unless the solve from 0 to `t1` in steps of `dt` is valid and fits into memory."""
+    if dt > t1:
+        raise SetupError(
+            f"dt = {dt:g} is longer than the whole solve, t1 = {t1:g}. Take at most dt = {t1:g}."
+        )
+    unknowns = states * sum(x.size for x in jtu.tree_leaves(system.y0))
+    steps_max = _BYTES_MAX // (8 * unknowns)
+    if t1 / dt > steps_max:
+        raise SetupError(
+            f"{t1 / dt:.3g} steps are too many to hold in memory; {system.name} can have "
+            f"{steps_max:.3g}. Choose a smaller t1 or a larger dt."
+        )
+
+
+def import_plot() -> Any | None:
+    """The module that draws the figures, or `None` without matplotlib."""
+    try:
+        from . import _plot as _plot
+    except ImportError:
+        return None
+    return _plot
+
+
+def make_writable(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise SetupError(
+            f"cannot write to the folder {out}: {error.strerror}. Name another one by `--out DIR`."
+        ) from error

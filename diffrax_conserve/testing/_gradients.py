@@ -61,7 +61,7 @@ def assert_gradients(
     """
     args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
     varied, fixed = eqx.partition(args, eqx.is_inexact_array)
-    names = [_name(path) for path, _ in jtu.tree_flatten_with_path(varied)[0]]
+    names = [f"args{jtu.keystr(path)}" for path, _ in jtu.tree_flatten_with_path(varied)[0]]
     if not names:
         raise ValueError("`args` holds no floating-point array, so there is nothing to vary.")
     eps = float(jnp.finfo(working_dtype(varied)).eps)
@@ -100,14 +100,9 @@ def assert_gradients(
         raise AssertionError(
             "Derivatives along random directions are wrong.\n"
             + "\n".join(lines)
-            + "\nTo look at: a `stop_gradient` or a custom derivative rule; a `where` that hides "
-            "an infinite derivative; adaptive steps or other decisions that change with the "
-            "argument; if both modes agree, the accuracy of the differences (`rtol`)."
+            + "\nTo look at: a `stop_gradient`, a custom rule, or a `where` that hides an infinite "
+            "derivative; adaptive steps; if both modes agree, the accuracy of the differences."
         )
-
-
-def _name(path: Any) -> str:
-    return f"args{jtu.keystr(path)}"
 
 
 def _random(rng: np.random.Generator, like: PyTree[Array]) -> PyTree[Array]:
