@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
-from ._reduced import Reduced
+from ._base import AbstractSystem, Reduced, real
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]
@@ -150,10 +149,6 @@ class Kepler(AbstractSystem):
             "negative. Integrate this orbit with `diffrax.diffeqsolve` instead.",
         )
         return -self.mu / (2 * energy)
-
-    @property
-    def metric(self) -> None:
-        return None
 
     def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
         return {"orbit": ys[0]}

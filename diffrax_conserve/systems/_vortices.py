@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, annulus, real
-from ._reduced import Reduced
+from ._base import AbstractIntegratedSystem, Reduced, annulus, real
 
 State = Float[Array, "vortices 2"]
 

@@ -376,6 +376,6 @@ def _advice(samples: list[_Samples], failed: list[tuple[_Samples, int]]) -> str:
         )
     return (
         "is the solver wrapped, `ManifoldProjection(solver, manifold)`, with this manifold? Are "
-        "`args` those of the solve? Is anything in a lower precision? Does the equation conserve it "
-        "(`diffrax_conserve.check_invariance`)?"
+        "`args` those of the solve? Is anything in a lower precision? Does the equation conserve "
+        "it (`diffrax_conserve.check_invariance`)?"
     )

@@ -134,6 +134,6 @@ def _check_slope(
     if not slope >= order - margin:
         raise AssertionError(
             f"The measured order is {slope:.2f}, but {order:g} is claimed:\n{table}\n"
-            "To look at: is `dt0` small enough for the method to be asymptotic? Is the state at the "
-            "end of a step moved by more than the local error?"
+            "To look at: is `dt0` small enough for the method to be asymptotic? Is the state at "
+            "the end of a step moved by more than the local error?"
         )
