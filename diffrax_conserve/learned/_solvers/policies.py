@@ -18,17 +18,14 @@ from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
+_WHEN = "`diffrax_conserve.learned.domain_statistics` tells at which time."
 _OUTSIDE = register(
-    "a step starts outside the domain of the flow map. "
-    "`diffrax_conserve.learned.domain_statistics` tells at which time. Train the flow map on "
-    "states from there, or let a classical solver take such steps, by "
-    "`outside=diffrax.Tsit5()`."
+    f"a step starts outside the domain of the flow map. {_WHEN} Train the flow map on states from "
+    "there, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
 )
 _INACCURATE = register(
-    "the estimated error of a step is above `max_error`. "
-    "`diffrax_conserve.learned.domain_statistics` tells at which time. Take shorter steps, correct "
-    "them by `corrections=...`, or let a classical solver take such steps, by "
-    "`outside=diffrax.Tsit5()`."
+    f"the estimated error of a step is above `max_error`. {_WHEN} Take shorter steps, correct them "
+    "by `corrections=...`, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
 )
 
 
@@ -143,7 +140,7 @@ def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
     if policy is None:
         if max_error is not None:
             raise ValueError(
-                "`max_error` says which steps count as outside, but these are ignored. Pass "
+                "`max_error` says which steps count as outside, but these are ignored: pass "
                 "`outside=diffrax_conserve.learned.Report()`, `Refuse()` or `diffrax.Tsit5()` too."
             )
         return
@@ -151,15 +148,14 @@ def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
         _check_solver(policy)
     elif not isinstance(policy, Report | Refuse):
         raise TypeError(
-            f"`outside` is {policy!r}, but it must be `None`, "
-            "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver that takes the "
-            "steps that the flow map cannot, such as `diffrax.Tsit5()`."
+            f"`outside` is {policy!r}, but it must be `diffrax_conserve.learned.Report()`, "
+            "`Refuse()`, or a diffrax solver, such as `diffrax.Tsit5()`."
         )
     if max_error is None and domain is None:
         raise ValueError(
-            f"`outside` is {policy!r}, but the flow map does not say what is outside: it has no "
-            "`domain`. Give it one, for example `diffrax_conserve.learned.Box.around(states)` with "
-            "the states that it was trained on, or pass `max_error`."
+            f"`outside` is {policy!r}, but the flow map does not know what that is: it has no "
+            "`domain`. Give it `diffrax_conserve.learned.Box.around(states)`, with the states that "
+            "it was trained on, or pass `max_error`."
         )
 
 
