@@ -124,14 +124,10 @@ class Sizes(NamedTuple):
 
 
 class AbstractCore(eqx.Module):
-    """The network of a [`diffrax_conserve.DeepONet`][]."""
+    """The network of a [`diffrax_conserve.DeepONet`][], at first with random weights."""
 
-    @classmethod
     @abc.abstractmethod
-    def create(
-        cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray
-    ) -> "AbstractCore":
-        """A core with random weights."""
+    def __init__(self, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray): ...
 
     @abc.abstractmethod
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
@@ -150,14 +146,13 @@ class Product(AbstractCore):
     trunk: MLP
     size: int = eqx.field(static=True)
 
-    @classmethod
-    def create(cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray) -> "Product":
+    def __init__(self, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray):
         width, depth, latent, activation = sizes
-        branch, trunk = (
+        self.branch, self.trunk = (
             MLP(k, m * latent, width, depth, activation, dtype, key=one)
             for k, one in zip((n, 1), jr.split(key), strict=True)
         )
-        return cls(branch, trunk, m)
+        self.size = m
 
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         b = self.branch(state).reshape(self.size, -1)
@@ -174,12 +169,9 @@ class Concatenated(AbstractCore):
 
     net: MLP
 
-    @classmethod
-    def create(
-        cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray
-    ) -> "Concatenated":
+    def __init__(self, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray):
         width, depth, _, activation = sizes
-        return cls(MLP(n + 1, m, width, depth, activation, dtype, key=key))
+        self.net = MLP(n + 1, m, width, depth, activation, dtype, key=key)
 
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         return self.net(jnp.append(state, step))
@@ -204,17 +196,16 @@ class Gated(AbstractCore):
     hidden: tuple[MLP, ...]
     last: MLP
 
-    @classmethod
-    def create(cls, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray) -> "Gated":
+    def __init__(self, n: int, m: int, sizes: Sizes, dtype: jnp.dtype, key: PRNGKeyArray):
         width, depth, _, activation = sizes
         # Two encoders, the last layer, and the hidden ones.
         ins = [n + 1, n + 1, width, n + 1, *([width] * (depth - 1))]
         outs = [width, width, m, *([width] * depth)]
-        one, two, last, *hidden = (
+        one, two, self.last, *hidden = (
             MLP(i, o, width, 0, activation, dtype, key=k)
             for i, o, k in zip(ins, outs, jr.split(key, depth + 3), strict=True)
         )
-        return cls((one, two), tuple(hidden), last)
+        self.encoders, self.hidden = (one, two), tuple(hidden)
 
     def __call__(self, state: Float[Array, " n"], step: Float[Array, ""]) -> Float[Array, " m"]:
         activation = self.last.activation

@@ -107,7 +107,7 @@ class DeepONet(AbstractFlowMap):
         n = seen.shape[1]
         sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core.create(n + known, m, sizes, dtype, key)
+        self.core = core(n + known, m, sizes, dtype, key)
         self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
         self.max_step, self.normalise = float(max_step), normalise
         self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
