@@ -75,10 +75,6 @@ class Box(eqx.Module):
         )
         return jnp.all(jnp.stack(jtu.tree_leaves(inside)))
 
-    def can_include(self, y: Y) -> Bool[Array, ""]:
-        del y
-        return jnp.asarray(True)
-
     def sample(self, key: PRNGKeyArray) -> Y:
         """A point of the box, drawn from the uniform distribution."""
         lower, treedef = jtu.tree_flatten(self.lower)
@@ -244,11 +240,5 @@ class FramedBox(eqx.Module):
         frame = self.frame(y)
         return self.box.contains((frame.inputs, jnp.asarray(frame.clock)))
 
-    def can_include(self, y: Y) -> Bool[Array, ""]:
-        return jnp.asarray(self.frame(y).clock <= self.fastest)
-
 
 _SLACK = 1e-6
-
-# The domains that `fit` can extend.
-AbstractDomain = Box | FramedBox

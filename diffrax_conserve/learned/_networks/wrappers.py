@@ -286,28 +286,17 @@ class OfPairs(AbstractWrapper):
         """`None`: `args` are part of the state."""
 
 
-@final
-class PairField(eqx.Module):
+def field_of_pairs(vector_field: Callable[..., Any], t: RealScalarLike, y: Any, args: None) -> Any:
     """The vector field of the pairs."""
-
-    vector_field: Callable[..., Any]
-
-    def __call__(self, t: RealScalarLike, y: Any, args: None) -> Any:
-        del args
-        y, args = y
-        return self.vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
+    del args
+    y, args = y
+    return vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
 
 
-@final
-class PairSampler(eqx.Module):
-    """Draws a state, and `args` from their domain."""
-
-    sample: Sampler
-    domain: Box
-
-    def __call__(self, key: PRNGKeyArray) -> tuple[Any, Any]:
-        state_key, args_key = jr.split(key)
-        return self.sample(state_key), self.domain.sample(args_key)
+def pair(sample: Sampler, domain: Box, key: PRNGKeyArray) -> tuple[Any, Any]:
+    """A random state, and random `args` from their domain."""
+    state_key, args_key = jr.split(key)
+    return sample(state_key), domain.sample(args_key)
 
 
 def single_precision(flow_map: _Model) -> _Model:

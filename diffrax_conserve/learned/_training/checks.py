@@ -22,7 +22,7 @@ from .._networks.flat import stacked_vectors
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, has_arrays
 from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
-from .._networks.wrappers import OfPairs, PairField, PairSampler
+from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data
 from .objective import Problem, VectorField
@@ -104,8 +104,8 @@ def _of_flow_map(
     if domain is not None:
         _check_family(sample, args)
         flow_map = OfPairs(flow_map)
-        field = field if field is None else PairField(field)
-        sample = None if sample is None else PairSampler(sample, domain)
+        field = None if field is None else eqx.Partial(field_of_pairs, field)
+        sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
     if found is not None and field is not None and sample is None:
         sample = found.sample

@@ -18,9 +18,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike
 from ..._tree import tree_all_finite, tree_sub
+from .._networks.domain import Box, FramedBox
 from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
 from .data import Data
-from .pool import Pool, domain_of, moved
+from .pool import Pool, moved
 from .recipe import Recipe
 from .second_order import LeastSquares, SecondOrder, squared_norms
 
@@ -145,7 +146,8 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
-    domain = domain_of(model) if isinstance(problem.sample, Pool) else None
+    domain = getattr(model, "domain", None) if isinstance(problem.sample, Pool) else None
+    domain = domain if isinstance(domain, Box | FramedBox) else None
     carry = Carry(
         weights=weights,
         optimiser_state=problem.recipe.optimiser.init(weights),
@@ -212,11 +214,15 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If not, continue from the best model: the same weights and points would give the same result.
-    fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
+    fresh, domain = objective.problem.recipe.optimiser.init(carry.best_weights), carry.domain
+    if domain is not None:
+        # Earlier, the network may have moved states where no solution goes.
+        late = 2 * epoch >= objective.problem.recipe.epochs
+        domain = _where(late, domain.extended(carry.points.y0s), domain)
     carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
-        domain=_seen(objective, carry, epoch),
+        domain=domain,
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
@@ -271,15 +277,6 @@ def fresh_points(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> P
     old, new, key = carry.points.y0s, points.y0s, jr.fold_in(key, 0)
     y0s = moved(problem.sample, model, problem.args, squares, objective.typical, old, new, key)
     return points._replace(y0s=y0s)
-
-
-def _seen(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Any:
-    """The domain, extended by the states of a pool."""
-    if carry.domain is None:
-        return None
-    # Earlier, the network may have moved states where no solution goes.
-    late = 2 * epoch >= objective.problem.recipe.epochs
-    return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
 
 
 def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:

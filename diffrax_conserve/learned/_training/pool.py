@@ -17,7 +17,7 @@ from ..._manifold import check_manifold, conserved_values
 from ..._options import check_number
 from ..._projection.project import project
 from ..._tree import tree_all_finite
-from .._networks.domain import AbstractDomain
+from .._networks.domain import FramedBox
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.trainable import Points
 from .states import as_sampler
@@ -114,7 +114,6 @@ def moved(
     lengths = jr.uniform(lengths_key, (count,), maxval=float(model.max_step))
     small = squares(Points(lengths, y0s)) <= pool.max_defect**2 * typical
     goes_on = small & ~jr.bernoulli(restarts_key, 1 / pool.mean_steps, (count,))
-    domain = domain_of(model)
 
     def state(y0: Y, h: Array, fresh: Y, good: Array) -> Y:
         end = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), model(y0, h), y0)
@@ -125,14 +124,8 @@ def moved(
         good = good & tree_all_finite(end)
         if pool.keep is not None:
             good = good & pool.keep(end)
-        if domain is not None:
-            good = good & domain.can_include(end)
+        if isinstance(model.domain, FramedBox):
+            good = good & (model.domain.frame(end).clock <= model.domain.fastest)
         return jtu.tree_map(lambda a, b: jnp.where(good, a, b), end, fresh)
 
     return jax.vmap(state)(y0s, lengths, fresh, goes_on)
-
-
-def domain_of(flow_map: Any) -> AbstractDomain | None:
-    """The domain of a flow map, if `fit` can extend it, otherwise `None`."""
-    domain = flow_map.domain
-    return domain if isinstance(domain, AbstractDomain) else None

@@ -1,7 +1,7 @@
 """Initial states for a flow map, taken from solutions."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, final
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -173,18 +173,12 @@ def _the_good(ys: Any, good: Array) -> Any:
 _MAX_STEPS = 10_000
 
 
-@final
-class FromStates(eqx.Module):
-    """Draws from given states, with replacement."""
-
-    states: Y
-
-    def __call__(self, key: PRNGKeyArray) -> Y:
-        count = jtu.tree_leaves(self.states)[0].shape[0]
-        index = jr.randint(key, (), 0, count)
-        return jtu.tree_map(lambda x: x[index], self.states)
-
-
 def as_sampler(sample: Any) -> Sampler | None:
-    """A function as it is; for stacked states one that draws from them."""
-    return sample if sample is None or callable(sample) else FromStates(as_states(sample))
+    """A function as it is; for stacked states one that draws from them, with replacement."""
+    given = sample is None or callable(sample)
+    return sample if given else eqx.Partial(_one_of, as_states(sample))
+
+
+def _one_of(states: Y, key: PRNGKeyArray) -> Y:
+    index = jr.randint(key, (), 0, jtu.tree_leaves(states)[0].shape[0])
+    return jtu.tree_map(lambda x: x[index], states)
