@@ -24,12 +24,11 @@ from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
-from .data import as_data
+from .data import as_data, as_sampler
 from .objective import Problem, VectorField
 from .pool import Pool
 from .recipe import Recipe, second_order
 from .state import FitState
-from .states import as_sampler
 
 
 def check_types(

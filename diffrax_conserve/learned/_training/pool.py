@@ -20,7 +20,7 @@ from ..._tree import tree_all_finite
 from .._networks.domain import FramedBox
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.trainable import Points
-from .states import as_sampler
+from .data import as_sampler
 
 # A function from steps, each given by an initial state and a length, to the squared norms of the
 # defects at their ends.
