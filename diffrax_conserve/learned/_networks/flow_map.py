@@ -216,8 +216,3 @@ def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
         return flow_map.function
     is_missing = lambda x: x is None  # noqa: E731
     return eqx.tree_at(lambda m: m.domain, flow_map.function, flow_map.domain, is_leaf=is_missing)
-
-
-def has_arrays(tree: Any) -> bool:
-    """Whether `tree` has a floating-point array, which could be trained."""
-    return any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(tree))

@@ -19,7 +19,7 @@ from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
 from .._networks.flat import stacked_vectors
-from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, has_arrays
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
@@ -86,7 +86,7 @@ def _of_flow_map(
     if sample is not None and field is None:
         raise TypeError("`sample` is only used with a `vector_field`: leave it out.")
     flow_map, domain, sample = as_flow_map(model), args_domain_of(model), as_sampler(sample)
-    if not has_arrays(flow_map.weights()):
+    if not any(map(eqx.is_inexact_array, jtu.tree_leaves(flow_map.weights()))):
         raise ValueError(
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
