@@ -135,6 +135,8 @@ def trajectory(
             getattr(ax, f"set_{axis}label")(text)
         if dimension == 3:
             ax.set_box_aspect((1, 1, 0.8), zoom=0.82)  # leaves room for the labels
+        elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq"):
+            ax.set_aspect("equal", adjustable="datalim")
         ax.locator_params(nbins=4)
         if len(parts) > 1:
             ax.set_title(part)
