@@ -47,9 +47,9 @@ from ._solver.rk4 import RK4 as RK4
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.statistics import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
-from .learned._files.save import load as load
-from .learned._files.save import load_pretrained as load_pretrained
-from .learned._files.save import save as save
+from .learned._files import load as load
+from .learned._files import load_pretrained as load_pretrained
+from .learned._files import save as save
 from .learned._networks.deeponet import DeepONet as DeepONet
 from .learned._networks.pinn import PINN as PINN
 from .learned._solvers.flow_map_solver import DeepONetSolver as DeepONetSolver

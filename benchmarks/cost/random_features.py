@@ -26,7 +26,7 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._solvers.feature_basis import feature_basis, tabulate
-from diffrax_conserve.learned._solvers.galerkin import StepEquations, solve
+from diffrax_conserve.learned._solvers.random_features import StepEquations, solve
 
 OUT = Path(__file__).parent.parent / "results" / "random_features.json"
 

@@ -121,7 +121,6 @@ def train(data, spec):
         optimiser=soap(schedule),
         refresh=1,
         check_every=max(epochs // 20, 1),
-        max_gradient_norm=None,
     )
     network = dfc.learned.Transformed(inner, BOXCOX)
     network, log = dfc.fit(network, data=data, recipe=recipe, key=jr.key(2), progress=True)

@@ -94,15 +94,14 @@ def error_of_training(plot, panels):
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for ax, (title, curves) in zip(axes, panels.items(), strict=True):
         for name, (epochs, errors) in curves.items():
-            colour = plot._colour(name, curves)
-            ax.plot(epochs, errors, "o-", markersize=3, label=name, color=colour)
+            ax.plot(epochs, errors, "o-", markersize=3, label=name)
         ax.set_xlim(left=0)
         ax.xaxis.set_major_locator(plot.MaxNLocator(5))
         ax.set_yscale("log")
         ax.set_title(title)
         ax.set_xlabel("epochs of training")
     axes[0].set_ylabel("error")
-    plot._legend(figure, *axes[0].get_legend_handles_labels())
+    plot._legend(figure, axes[0])
     return figure
 
 

@@ -1,15 +1,15 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
 from . import paper as paper
-from ._files.save import pretrained_path as pretrained_path
-from ._files.save import read_info as read_info
+from ._files import pretrained_path as pretrained_path
+from ._files import read_info as read_info
 from ._networks.cores import Concatenated as Concatenated
 from ._networks.cores import Gated as Gated
 from ._networks.cores import Product as Product
 from ._networks.domain import Box as Box
+from ._networks.domain import Frame as Frame
 from ._networks.flow_map import AbstractFlowMap as AbstractFlowMap
 from ._networks.flow_map import FlowMap as FlowMap
-from ._networks.frame import Frame as Frame
 from ._networks.layer import ConservativeLayer as ConservativeLayer
 from ._networks.taylor import Taylor as Taylor
 from ._networks.wrappers import BoxCox as BoxCox
@@ -21,11 +21,11 @@ from ._solvers.policies import Refuse as Refuse
 from ._solvers.policies import Report as Report
 from ._solvers.policies import domain_statistics as domain_statistics
 from ._solvers.sweeps import NewtonSweep as NewtonSweep
+from ._training.data import reachable_states as reachable_states
+from ._training.data import trajectories as trajectories
 from ._training.loop import FitLog as FitLog
 from ._training.pool import Pool as Pool
 from ._training.recipe import Recipe as Recipe
 from ._training.recipe import second_order as second_order
 from ._training.second_order import SPRING as SPRING
 from ._training.second_order import LevenbergMarquardt as LevenbergMarquardt
-from ._training.states import reachable_states as reachable_states
-from ._training.states import trajectories as trajectories

@@ -10,8 +10,8 @@ from pathlib import Path
 import jax
 
 from .. import __version__, systems
+from ._job import SetupError
 from ._job import reproduce as _reproduce
-from ._setup import SetupError
 
 
 def main(argv: Sequence[str] | None = None) -> int:

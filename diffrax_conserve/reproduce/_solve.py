@@ -19,12 +19,8 @@ from ..systems import AbstractSystem
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The result of one solver: its states at `ts`, which include the initial time, or the reason
-    of a failure.
-
-    The states and the drifts have a leading axis over the initial states. They are NaN after a
-    failure.
-    """
+    """The states of one solver at `ts`, which include the initial time, and their drifts, both with
+    a leading axis over the initial states; or the reason of a failure."""
 
     ts: np.ndarray
     ys: Any
@@ -93,19 +89,14 @@ def _timed(
 
     batch_drift = jax.vmap(lambda sol: drift(sol, system.manifold, system.args))
     drifts = eqx.filter_jit(batch_drift)(solution)
-    saved = np.isfinite(np.asarray(solution.ts))  # the rest is padding
-    longest = int(np.argmax(saved.sum(axis=1)))
-    count = int(saved[longest].sum())
-
-    def keep(x: Any) -> np.ndarray:
-        x = np.asarray(x)[:, :count]
-        return np.where(saved[:, :count].reshape(x.shape[:2] + (1,) * (x.ndim - 2)), x, np.nan)
-
-    ts, ys = np.asarray(solution.ts)[longest, :count], jtu.tree_map(keep, solution.ys)
-    largest = {name: keep(_largest_component(drifts[name])) for name in system.manifold}
+    largest = {name: _largest_component(drifts[name]) for name in system.manifold}
+    ts, ys = jtu.tree_map(np.asarray, (solution.ts, solution.ys))
+    counts = np.isfinite(ts).sum(axis=1)  # the rest is padding
+    failure = _failure(solution.result, counts, ts, [*jtu.tree_leaves(ys), *largest.values()])
+    # Without a failure all solves have as many steps.
+    ts, ys, largest = jtu.tree_map(lambda x: x[:, : counts[0]], (ts, ys, largest))
     steps = int(np.max(solution.stats["num_steps"]))
-    failure = _failure(solution.result, saved.sum(axis=1), ts, ys, largest)
-    return Run(ts, ys, largest, steps, seconds, compile_seconds, failure)
+    return Run(ts[0], ys, largest, steps, seconds, compile_seconds, failure)
 
 
 def _largest_component(values: Any) -> np.ndarray:
@@ -114,13 +105,12 @@ def _largest_component(values: Any) -> np.ndarray:
 
 
 def _failure(
-    result: dfx.RESULTS, counts: np.ndarray, ts: np.ndarray, ys: Any, drifts: dict[str, np.ndarray]
+    result: dfx.RESULTS, counts: np.ndarray, ts: np.ndarray, values: list[np.ndarray]
 ) -> str | None:
     """The failure at the first initial state with one, and the number of initial states with a
     failure."""
-    values = [*jtu.tree_leaves(ys), *drifts.values()]
     wrong = np.any([~np.isfinite(x).reshape(*x.shape[:2], -1).all(axis=2) for x in values], axis=0)
-    wrong &= np.arange(ts.size) < counts[:, None]
+    wrong &= np.isfinite(ts)
     stopped = np.asarray(result != dfx.RESULTS.successful)
     failed = stopped | wrong.any(axis=1)
     if not failed.any():
@@ -128,8 +118,8 @@ def _failure(
     first = int(np.argmax(failed))
     if stopped[first]:
         message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], result)]
-        reason = f"after t = {ts[counts[first] - 1]:.6g}: {' '.join(message.split())}"
+        reason = f"after t = {ts[first, counts[first] - 1]:.6g}: {' '.join(message.split())}"
     else:
-        t = ts[np.argmax(wrong[first])]
+        t = ts[first, np.argmax(wrong[first])]
         reason = f"at t = {t:.6g}: the state is not finite any more. Choose a smaller dt."
     return reason if failed.size == 1 else f"for {failed.sum()} of {failed.size}: {reason}"

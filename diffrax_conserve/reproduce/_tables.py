@@ -11,15 +11,10 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .. import __version__
-from .._tree import tree_scale
 from ..systems import AbstractSystem
-from ._compare import Comparison, take, thinned
+from ._compare import COMPARED_MAX, Comparison, take
 from ._solve import Run
 from ._trained import Learned
-
-# The labels of systems with units: the unit of time, its length in the system's own unit, and the
-# unit of the error.
-_UNITS = {"outer-solar-system": ("years", 365.25, "AU, AU/day")}
 
 FOOTER = """\
 state error: Euclidean norm of the solution minus the reference, over all components of the state.
@@ -76,17 +71,15 @@ def metrics(
     }
 
 
-def table(
-    system: AbstractSystem, metrics: dict[str, Any], t1: float, dt: float, states: int
-) -> str:
-    rows = metrics["solvers"]
+def table(system: AbstractSystem, metrics: dict[str, Any]) -> str:
+    rows, states = metrics["solvers"], metrics["initial_states"]
 
     def line(label: str, cell: Callable[[dict[str, Any]], str]) -> list[str]:
         return [label, *(cell(row) for row in rows.values())]
 
     lines = [
         ["", *rows],
-        line(f"state error at t = {t1:g}", lambda r: _number(r["state_error"])),
+        line(f"state error at t = {metrics['t1']:g}", lambda r: _number(r["state_error"])),
         line("state error, largest", lambda r: _number(r["largest_state_error"])),
         *(
             line(f"drift of {integral}", lambda r, i=integral: _number(r["drift"][i]))
@@ -106,7 +99,7 @@ def table(
         failures.append(metrics["failure"])
     if failures:
         failures.append("")
-    heading = f"{system.title}: 0 <= t <= {t1:g}, steps of {dt:g}"
+    heading = f"{system.title}: 0 <= t <= {metrics['t1']:g}, steps of {metrics['dt']:g}"
     many = [_MANY.format(states=states)] if states > 1 else []
     return "\n".join([heading, "", *text, "", *failures, FOOTER, *many])
 
@@ -124,61 +117,32 @@ def figures(
 ) -> dict[str, Any]:
     out = {}
     if networks:
-        curves = {kind: (found.epochs, found.losses) for kind, found in networks.items()}
-        out["loss"] = plot.loss(curves)
-    stride = comparison.stride
+        out["loss"] = plot.loss({kind: found[1:] for kind, found in networks.items()})
+    index = comparison.index
     succeeded = {name: run for name, run in runs.items() if run.failure is None}
     if not succeeded:
         return out
-    index = {name: thinned(len(run.ts), stride) for name, run in succeeded.items()}
-    paths = {
-        name: _paths(system, take(run.ys, (0, index[name]))) for name, run in succeeded.items()
-    }
-    reference = None if comparison.reference is None else _paths(system, comparison.reference)
-
-    time_unit, time_scale, error_unit = _UNITS.get(system.name, ("", 1.0, ""))
+    times = next(iter(succeeded.values())).ts[index]
+    paths = {name: _paths(system, take(take(r.ys, 0), index)) for name, r in succeeded.items()}
+    reference = None
+    if comparison.failure is None:
+        fine = np.linspace(times[0], times[-1], COMPARED_MAX + 1)
+        reference = _paths(system, system.reference(fine))
+    out["trajectory"] = plot.trajectory(paths, reference, system.axes)
     # The initial state has neither error nor drift.
-    times = {name: run.ts[index[name]][1:] / time_scale for name, run in succeeded.items()}
     drifts = {
         integral: {
-            name: np.maximum.reduceat(np.max(run.drift[integral], axis=0)[1:], index[name][:-1])
-            for name, run in succeeded.items()
+            name: np.max(run.drift[integral], axis=0)[index][1:] for name, run in succeeded.items()
         }
         for integral in system.manifold
     }
-    lines = {}
-    if plot.shows_lines(paths, system.axes):
-        lines = {name: _line(system, run.ts, take(run.ys, 0)) for name, run in succeeded.items()}
-    out["trajectory"] = plot.trajectory(paths, lines, reference, system.axes)
-    out["drift"] = plot.drift(times, drifts, time_unit)
+    out["drift"] = plot.drift(times[1:], drifts)
     if comparison.errors:
         errors = {name: np.median(values, axis=0)[1:] for name, values in comparison.errors.items()}
-        out["state_error"] = plot.state_error(times, errors, time_unit, error_unit)
+        out["state_error"] = plot.state_error(times[1:], errors)
     return out
 
 
 def _paths(system: AbstractSystem, ys: Any) -> dict[str, np.ndarray]:
     paths = system.trajectories(jtu.tree_map(jnp.asarray, ys))
     return {name: np.asarray(path) for name, path in paths.items()}
-
-
-# The number of points that are drawn for each step.
-_POINTS = 8
-
-
-def _line(system: AbstractSystem, ts: np.ndarray, ys: Any) -> dict[str, np.ndarray]:
-    """The path between the steps too, by cubic Hermite interpolation."""
-    ts, ys = jtu.tree_map(jnp.asarray, (ts, ys))
-
-    @jax.vmap
-    def state(t: jax.Array) -> Any:
-        k = jnp.clip(jnp.searchsorted(ts, t, side="right"), 1, ts.size - 1)
-        (t0, y0), (t1, y1) = take((ts, ys), k - 1), take((ts, ys), k)
-        k0 = tree_scale(t1 - t0, system.vector_field(t0, y0, system.args))
-        k1 = tree_scale(t1 - t0, system.vector_field(t1, y1, system.args))
-        path = dfx.ThirdOrderHermitePolynomialInterpolation(
-            t0=t0, t1=t1, y0=y0, y1=y1, k0=k0, k1=k1
-        )
-        return path.evaluate(t)
-
-    return _paths(system, state(jnp.linspace(ts[0], ts[-1], _POINTS * (ts.size - 1) + 1)))

@@ -1,6 +1,5 @@
 """The learned solvers of the paper's five systems, newly trained or pretrained."""
 
-import dataclasses
 from typing import Any
 
 import diffrax as dfx
@@ -13,7 +12,7 @@ from jaxtyping import Array, PRNGKeyArray
 from .._projection.newton import Newton
 from .._solver.manifold_projection import ManifoldProjection
 from ..learned import ConservativeLayer, FitLog, paper, pretrained_path, read_info
-from ..learned._files.save import load
+from ..learned._files import load
 from ..learned._networks.deeponet import DeepONet
 from ..learned._networks.pinn import PINN
 from ..learned._solvers.flow_map_solver import DeepONetSolver
@@ -22,6 +21,8 @@ from ..learned._training.fit import fit
 from ..systems import AbstractSystem
 
 Network = PINN | DeepONet
+# A network, and the training loss at some epochs.
+Learned = tuple[Network, np.ndarray, np.ndarray]
 
 KINDS = ("standard", "conservative")
 # The iterations of the conservative layers. The paper learns one solution of each of the first two
@@ -40,15 +41,6 @@ _STATES = 20
 # Closer vortices rotate about each other by more than half a radian in a step, for which RK4 fails
 # too.
 _SEPARATION = 0.3
-
-
-@dataclasses.dataclass(frozen=True)
-class Learned:
-    """A trained network, and its loss as a function of the epoch."""
-
-    network: Network
-    epochs: np.ndarray
-    losses: np.ndarray
 
 
 def is_learned(system: AbstractSystem) -> bool:
@@ -75,13 +67,12 @@ def initial_states(system: AbstractSystem) -> Any:
 
 def pretrained(system: AbstractSystem) -> dict[str, Learned]:
     """The networks that come with the package."""
-    found = {}
+    found: dict[str, Learned] = {}
     for kind in KINDS:
         path = pretrained_path(f"{system.name}-{kind}")
         history = read_info(path)["info"]["history"]
-        network = load(path)
-        assert isinstance(network, Network)
-        found[kind] = Learned(network, np.array(history["epochs"]), np.array(history["losses"]))
+        network: Any = load(path)
+        found[kind] = network, np.array(history["epochs"]), np.array(history["losses"])
     return found
 
 
@@ -121,10 +112,6 @@ def train(
     )
 
 
-def learned(network: Network, log: FitLog) -> Learned:
-    return Learned(network, *history(log))
-
-
 def history(log: FitLog, points: int = 250) -> tuple[np.ndarray, np.ndarray]:
     """The training loss at about `points` epochs, each the median over nearby epochs."""
     width = max(len(log.losses) // points, 1)
@@ -141,19 +128,18 @@ def learned_solvers(
     A network can be far from the manifold, so the projection is `Newton`. The conservative network
     is projected too, because its layer makes only a few iterations.
     """
-
-    def solver(network: Network) -> dfx.AbstractSolver:
-        if isinstance(network, PINN):
-            return PINNSolver(network)
-        return DeepONetSolver(network)
-
-    def projected(network: Network) -> dfx.AbstractSolver:
-        return ManifoldProjection(solver(network), system.manifold, projection=Newton())
-
+    plain = {
+        kind: PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
+        for kind, network in networks.items()
+    }
+    projected = {
+        kind: ManifoldProjection(solver, system.manifold, projection=Newton())
+        for kind, solver in plain.items()
+    }
     return {
-        "standard": solver(networks["standard"]),
-        "conservative": projected(networks["conservative"]),
-        "standard projected": projected(networks["standard"]),
+        "standard": plain["standard"],
+        "conservative": projected["conservative"],
+        "standard projected": projected["standard"],
     }
 
 

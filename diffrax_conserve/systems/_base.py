@@ -3,7 +3,7 @@ random points for initial states."""
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -23,6 +23,14 @@ else:
     from equinox import AbstractClassVar
 
 _System = TypeVar("_System", bound="AbstractSystem")
+
+
+class Reduced(NamedTuple):
+    """A state up to symmetries: the three parts of a `diffrax_conserve.learned.Frame`."""
+
+    inputs: Float[Array, " k"]
+    basis: Float[Array, "n m"]
+    clock: Float[Array, ""]
 
 
 def real(x: Any) -> Array:
@@ -86,13 +94,10 @@ class AbstractSystem(eqx.Module):
         """The period of the solution through `y0`; `None` if no closed form is known."""
 
     @property
-    @abc.abstractmethod
     def metric(self) -> Y | None:
         """Weights, shaped like `y`, with which a projection on the energy alone conserves linear
-        integrals.
-
-        `None` if the system has no such metric or does not need one.
-        """
+        integrals; `None` if the system does not need any."""
+        return None
 
     @abc.abstractmethod
     def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
@@ -112,9 +117,8 @@ class AbstractSystem(eqx.Module):
         """The states at the times `ts`, as accurate as float64 allows.
 
         They are computed from the exact solution if there is one in closed form, otherwise by an
-        eighth-order solve that steps exactly to `ts`; the page of each system says which. Over the
-        default time span the relative error of the latter is 1e-13 to 1e-12 of the largest
-        component.
+        eighth-order solve that steps exactly to `ts`; each system says which. Over the default time
+        span the error of the latter is 1e-13 to 1e-12 of the largest component.
 
         **Arguments:**
 
@@ -128,9 +132,8 @@ class AbstractSystem(eqx.Module):
 
         **Raises:**
 
-        `RuntimeError` unless `jax_enable_x64` is on, because a reference needs float64;
-        `ValueError` if `ts` is not one-dimensional or empty; at run time an error if `ts` decreases
-        or starts before `t0`.
+        `RuntimeError` unless `jax_enable_x64` is on; `ValueError` if `ts` is not one-dimensional or
+        empty; at run time an error if `ts` decreases or starts before `t0`.
         """
         if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             raise RuntimeError(
@@ -167,37 +170,30 @@ def _solution(system: AbstractSystem, ts: Float[Array, " times"], y0: Any) -> An
 class AbstractIntegratedSystem(AbstractSystem):
     """A system without a known solution in closed form: its reference is computed numerically."""
 
+    solver: ClassVar[dfx.AbstractSolver] = dfx.Dopri8()
+    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)  # relative and absolute
+
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        return integrate(self, ts, y0)
+        return integrate(self, ts, y0, self.solver, self.tolerances)
 
     def period(self, y0: Any = None) -> None:
         del y0
-
-    @property
-    def metric(self) -> None:
-        return None
 
 
 def integrate(
     system: AbstractSystem,
     ts: Float[Array, " times"],
     y0: Any,
-    *,
-    solver: dfx.AbstractSolver = dfx.Dopri8(),
-    rtol: float = 1e-15,
-    atol: float = 1e-15,
-    max_steps: int = 10**7,
+    solver: dfx.AbstractSolver = AbstractIntegratedSystem.solver,
+    tolerances: tuple[float, float] = AbstractIntegratedSystem.tolerances,
 ) -> Any:
-    """The states at `ts`, in float64 and by default by the eighth-order method of Dormand and
-    Prince.
+    """The states at `ts`, in float64.
 
     The solver steps exactly to `ts`, because dense output has errors of 1e-10 even at tolerances
     near roundoff. The tolerances are at roundoff because local errors add up: over the default time
     spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to errors of
-    1e-13 to 4e-11, with 1.6 times the steps (compared with closed forms, and with a tolerance of
-    1e-16).
+    1e-13 to 4e-11, with 1.6 times the steps.
     """
-    controller = dfx.ClipStepSizeController(dfx.PIDController(rtol, atol), step_ts=ts)
     sol = dfx.diffeqsolve(
         dfx.ODETerm(system.vector_field),
         solver,
@@ -207,8 +203,8 @@ def integrate(
         y0=y0,
         args=system.args,
         saveat=dfx.SaveAt(ts=ts),
-        stepsize_controller=controller,
-        max_steps=max_steps,
+        stepsize_controller=dfx.ClipStepSizeController(dfx.PIDController(*tolerances), step_ts=ts),
+        max_steps=10**7,
     )
     return sol.ys
 

@@ -132,10 +132,6 @@ class CartesianPendulum(AbstractSystem):
         signed = jnp.where(swings, modulus, jnp.copysign(modulus, half_rate))
         return swings, signed, m, incomplete_elliptic(phi, m)
 
-    @property
-    def metric(self) -> None:
-        return None
-
     def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
         return {"mass": ys[0]}
 

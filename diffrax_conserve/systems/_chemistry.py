@@ -1,7 +1,7 @@
 """Stiff chemistry: the problems of Robertson and of Verwer."""
 
 import abc
-from typing import Any, ClassVar, final
+from typing import ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,14 +11,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, integrate, real
+from ._base import AbstractIntegratedSystem, real
 from ._mechanism import Mechanism
 
 State = Float[Array, " species"]
 
 
-class AbstractChemistry(AbstractSystem):
+class AbstractChemistry(AbstractIntegratedSystem):
     """Reactions with mass-action kinetics, and a reference solution for stiff equations."""
+
+    solver: ClassVar[dfx.AbstractSolver] = dfx.Kvaerno5()
+    tolerances: ClassVar[tuple[float, float]] = (1e-8, 1e-20)
 
     @property
     @abc.abstractmethod
@@ -35,17 +38,6 @@ class AbstractChemistry(AbstractSystem):
     def sample(self, key: PRNGKeyArray) -> State:
         factors = jnp.exp(jr.uniform(key, self.y0.shape, self.y0.dtype, -1, 1) * jnp.log(2.0))
         return self.y0 * factors
-
-    def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        solver = dfx.Kvaerno5()
-        return integrate(self, ts, y0, solver=solver, rtol=1e-8, atol=1e-20, max_steps=10**6)
-
-    def period(self, y0: Any = None) -> None:
-        del y0
-
-    @property
-    def metric(self) -> None:
-        return None
 
 
 @final

@@ -27,8 +27,8 @@ def hamiltonian_vector_field(hamiltonian: ScalarFn) -> Callable[[RealScalarLike,
 
     **Returns:**
 
-    A callable `vector_field(t, y, args)`, which is a PyTree: if `hamiltonian` is an
-    [`equinox.Module`][] or a method of one, its parameters remain differentiable.
+    A callable `vector_field(t, y, args)`, a PyTree that holds `hamiltonian`: the parameters of an
+    [`equinox.Module`][] remain differentiable.
 
     **Raises:**
 
@@ -66,8 +66,7 @@ def nambu_vector_field(h: ScalarFn, l: ScalarFn) -> Callable[[RealScalarLike, An
 
     **Returns:**
 
-    A callable `vector_field(t, y, args)`, which is a PyTree: if `h` and `l` are
-    [`equinox.Module`][]s or methods of one, their parameters remain differentiable.
+    A callable `vector_field(t, y, args)`, a PyTree that holds `h` and `l`.
 
     **Raises:**
 
@@ -105,11 +104,8 @@ def _check_canonical(y: Any) -> None:
     if eqx.is_array(y):
         good = y.ndim > 0 and y.shape[0] % 2 == 0
     else:
-        good = (
-            type(y) in (tuple, list)
-            and len(y) == 2
-            and jtu.tree_structure(y[0]) == jtu.tree_structure(y[1])
-        )
+        good = type(y) in (tuple, list) and len(y) == 2
+        good = good and jtu.tree_structure(y[0]) == jtu.tree_structure(y[1])
     if not good:
         raise TypeError(
             "The state `y` of a `hamiltonian_vector_field` must be a pair `(q, p)` of PyTrees of "

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
-from ._reduced import Reduced
+from ._base import AbstractSystem, Reduced, real
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]
@@ -117,14 +116,10 @@ class Kepler(AbstractSystem):
         the orbit and the place on it: $r |p|^2 / \mu - 1 = e \cos E$ and
         $q \cdot p / \sqrt{\mu r}$, with $r = |q|$, the eccentricity $e$ and the eccentric anomaly
         $E$. The third input is $e^2$, so that a domain that is a box ends with the eccentricity.
-        The basis stretches position and velocity along each other, as Lagrange's coefficients do.
-        The clock is $\nu = \sqrt{\mu / r^3}$, the rate of a circular orbit through the same place:
-        in its time a passage of the perihelion is no faster than the rest. The singularities of the
-        solution, which are in complex time, are nowhere closer than one unit up to $e = 0.6$, and
-        0.77 up to 0.8.
-
-        Orbits that are not bound have it too. Where the orbit becomes a line ($e \to 1$) position
-        and velocity are parallel, and the basis degenerates.
+        The basis stretches position and velocity along each other, as Lagrange's coefficients do;
+        it degenerates where the orbit becomes a line ($e \to 1$). The clock is
+        $\nu = \sqrt{\mu / r^3}$, the rate of a circular orbit through the same place: in its time a
+        passage of the perihelion is no faster than the rest.
         """
         q, p = y
         mu, r = self.like(y).mu, jnp.sqrt(jnp.sum(q**2))
@@ -150,10 +145,6 @@ class Kepler(AbstractSystem):
             "negative. Integrate this orbit with `diffrax.diffeqsolve` instead.",
         )
         return -self.mu / (2 * energy)
-
-    @property
-    def metric(self) -> None:
-        return None
 
     def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
         return {"orbit": ys[0]}

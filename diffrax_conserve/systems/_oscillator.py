@@ -65,10 +65,6 @@ class HarmonicOscillator(AbstractSystem):
         del y0
         return 2 * jnp.pi / self.omega
 
-    @property
-    def metric(self) -> None:
-        return None
-
     def trajectories(self, ys: Float[Array, "times 2"]) -> dict[str, Float[Array, "times 2"]]:
         return {"mass": ys}
 

@@ -85,10 +85,6 @@ class RigidBody(AbstractSystem):
         _, _, rate, m, _ = _elliptic_form(self.inertia, self.y0 if y0 is None else y0)
         return 4 * complete_elliptic(m) / rate
 
-    @property
-    def metric(self) -> None:
-        return None
-
     def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
         # All three components, unlike in the paper: in two of them a closed orbit appears as an
         # arc, traversed back and forth.

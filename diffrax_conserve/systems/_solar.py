@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, integrate, real
+from ._base import AbstractIntegratedSystem, real
 
 Vectors = Float[Array, "bodies 3"]
 State = tuple[Vectors, Vectors]
@@ -53,7 +53,7 @@ _TIME_SCALE = 4332.6 / 6.283185307179586
 
 
 @final
-class OuterSolarSystem(AbstractSystem):
+class OuterSolarSystem(AbstractIntegratedSystem):
     r"""Newton's equations of the Sun, Jupiter, Saturn, Uranus, Neptune and Pluto.
 
     The state `y = (q, v)` consists of positions and velocities, each of shape `(6, 3)`, in
@@ -66,11 +66,10 @@ class OuterSolarSystem(AbstractSystem):
     first integral that depends on time; it is not in the manifold because every Runge-Kutta method
     conserves it.
 
-    Every Runge-Kutta method conserves the linear momentum, but a Euclidean projection on the energy
-    alone does not: the gradient of the energy is $m_i v_i$, and $\sum m_i (m_i v_i) \ne 0$. In the
-    mass metric (`metric`) the correction of $v_i$ is proportional to $v_i$, and $\sum m_i v_i = 0$
-    in the barycentric frame, so the default state is barycentric. "Choosing a projection" compares
-    both.
+    A Euclidean projection on the energy alone does not conserve the linear momentum: the gradient
+    of the energy is $m_i v_i$, and $\sum m_i (m_i v_i) \ne 0$. In the mass metric (`metric`) the
+    correction of $v_i$ is proportional to $v_i$, and $\sum m_i v_i = 0$ in the barycentric frame,
+    so the default state is barycentric.
 
     **Reference**: numerical. **Samples**: the real state, with a normal deviate of 1 % of each
     body's heliocentric distance or speed added to each component of its position or velocity, then
@@ -91,6 +90,7 @@ class OuterSolarSystem(AbstractSystem):
     t1: ClassVar[float] = 200_000.0
     dt: ClassVar[float] = 100.0
     axes: ClassVar[tuple[str, ...]] = ("x [AU]", "y [AU]", "z [AU]")
+    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-18)  # the velocities are of size 1e-3
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -159,13 +159,6 @@ class OuterSolarSystem(AbstractSystem):
         q_key, v_key = jr.split(key)
         q, v = jnp.array(_POSITIONS), jnp.array(_VELOCITIES)
         return self.barycentric((perturbed(q_key, q), perturbed(v_key, v)))
-
-    def solution(self, ts: Float[Array, " times"], y0: State) -> States:
-        # The velocities are of size 1e-3.
-        return integrate(self, ts, y0, atol=1e-18)
-
-    def period(self, y0: State | None = None) -> None:
-        del y0
 
     def trajectories(self, ys: States) -> dict[str, Float[Array, "times 3"]]:
         return {name: ys[0][:, i] for i, name in enumerate(_BODIES)}

@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, annulus, real
-from ._reduced import Reduced
+from ._base import AbstractIntegratedSystem, Reduced, annulus, real
 
 State = Float[Array, "vortices 2"]
+Pairs = Float[Array, "vortices vortices"]
 
 
 @final
@@ -113,9 +113,8 @@ class PointVortices(AbstractIntegratedSystem):
         midpoint to the third vortex, they are the ratio $d / |q|$ and the angle between $r$ and
         $q$. The inputs are the cosine and sine of twice the angle and the ratio, which do not
         depend on the order of the pair. The columns of the basis stretch and rotate $r$, and move
-        the third vortex along and across $q$ in units of $d$; the clock is $1 / d^2$.
-
-        The frame is discontinuous where another pair becomes the closest.
+        the third vortex along and across $q$ in units of $d$; the clock is $1 / d^2$. The frame is
+        discontinuous where another pair becomes the closest.
 
         **Raises:**
 
@@ -165,13 +164,7 @@ def _check_three_equal(strengths: Float[Array, " vortices"]) -> None:
         )
 
 
-def _separations(
-    y: State,
-) -> tuple[
-    Float[Array, "vortices vortices"],
-    Float[Array, "vortices vortices"],
-    Float[Array, "vortices vortices"],
-]:
+def _separations(y: State) -> tuple[Pairs, Pairs, Pairs]:
     """$x_i - x_j$, $y_i - y_j$ and $r_{ij}^2$, with ones on the diagonal of the last."""
     dx = y[:, None, 0] - y[None, :, 0]
     dy = y[:, None, 1] - y[None, :, 1]

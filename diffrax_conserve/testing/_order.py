@@ -41,8 +41,7 @@ def assert_order(
 
     - `solver`: a diffrax solver, wrapped or not, that can take fixed steps.
     - `terms`, `y0`, `t0`, `t1`, `dt0`, `args`: as for `diffrax.diffeqsolve`. Choose a smooth
-        problem, an interval of at least a few steps, and a `dt0` in the asymptotic range of the
-        method.
+        problem, and a `dt0` in the asymptotic range of the method.
     - `order`: the claimed order. Default: `solver.order(terms)`.
     - `reference`: the exact state at `t1`. Default: computed by `diffrax.Dopri8` with ten times as
         many steps, if `terms` is a `diffrax.ODETerm`; otherwise by `solver` with 48 times as many.
@@ -135,7 +134,6 @@ def _check_slope(
     if not slope >= order - margin:
         raise AssertionError(
             f"The measured order is {slope:.2f}, but {order:g} is claimed:\n{table}\n"
-            "To look at: is `dt0` small enough for the method to be asymptotic? Are the stages "
-            "evaluated at the right times? Is the state at the end of a step moved by more than "
-            "the local error?"
+            "To look at: is `dt0` small enough for the method to be asymptotic? Is the state at "
+            "the end of a step moved by more than the local error?"
         )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
-from ._numbers import rounded
+from ._states import rounded
 
 
 @final

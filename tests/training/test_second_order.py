@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._training.data import as_sampler
 from diffrax_conserve.learned._training.recipe import mean
 from diffrax_conserve.learned._training.second_order import LeastSquares
-from diffrax_conserve.learned._training.states import as_sampler
 from diffrax_conserve.learned.paper import _bounded
 
 from ..learned import EAST, LORENZ, RADIUS, oscillator

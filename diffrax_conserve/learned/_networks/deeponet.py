@@ -11,13 +11,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
-from .cores import AbstractCore, Concatenated, Sizes
-from .domain import Box, FramedBox
+from .cores import AbstractCore, Activation, Concatenated, Sizes, check_sizes, find_activation
+from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import as_states, flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, checked_args, checked_box
-from .frame import MakeFrame, check_frame, frame_at
 from .layer import ConservativeLayer
-from .mlp import Activation, check_sizes, find_activation
 from .taylor import Taylor
 from .trainable import LayerSchedule
 
@@ -28,17 +26,16 @@ class DeepONet(AbstractFlowMap):
 
     $$u(h) = u_0 + \frac{h}{\Delta} S N(u_0, h)$$
 
-    with steps $h$ up to $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. Longer times need
-    several steps. With `taylor`, which [`diffrax_conserve.fit`][] adds by default, it is $u(h) =
-    T_q(u_0, h) + (h/\Delta)^{q+1} S N$: see [`diffrax_conserve.learned.Taylor`][]. With a `layer`,
-    the output is projected to the manifold of the conserved values at $u_0$. With a `frame` it
-    commutes with the symmetries of the equations: see [`diffrax_conserve.learned.Frame`][].
+    with steps $h$ up to $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. With `taylor`, which
+    [`diffrax_conserve.fit`][] adds by default, it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$:
+    see [`diffrax_conserve.learned.Taylor`][]. With a `layer` the output is projected to the
+    manifold of the conserved values at $u_0$. With a `frame` it commutes with the symmetries of the
+    equations: see [`diffrax_conserve.learned.Frame`][].
 
     The `core` $N$ is one fully connected network of the state and the step,
     [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
     feeds the input into each of its layers; or as in the literature, and less accurate at the same
-    size, [`diffrax_conserve.learned.Product`][], $N_j = \frac{1}{\sqrt L} \sum_{l=1}^L b_{jl}(u_0)
-    \, \tau_{jl}(h)$ with a branch network $b$ and a trunk network $\tau$.
+    size, [`diffrax_conserve.learned.Product`][].
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -110,7 +107,7 @@ class DeepONet(AbstractFlowMap):
         n = seen.shape[1]
         sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core.create(n + known, m, sizes, dtype, key)
+        self.core = core(n + known, m, sizes, dtype, key)
         self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
         self.max_step, self.normalise = float(max_step), normalise
         self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
@@ -183,22 +180,22 @@ class DeepONet(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order for all values of the weights, which is that of the Taylor polynomial."""
+        """The order of the Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
 
     @property
     def precision(self) -> jnp.dtype:
-        """The dtype of the weights, in which the network is evaluated."""
+        """The dtype in which the network is evaluated."""
         return self.core.output_layer().biases[-1].dtype
 
     @property
     def state(self) -> Y:
-        """A state with the structure, shapes and dtypes that the network expects."""
+        """A state such as the network expects."""
         return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
 
     @property
     def frame(self) -> MakeFrame | None:
-        """The function that finds the frame of a state, if there is one."""
+        """The function that finds the frame of a state, or `None`."""
         return None if isinstance(self.domain, Box) else self.domain.make
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -223,19 +220,17 @@ class DeepONet(AbstractFlowMap):
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 - `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
-    They define the structure of a state; their mean and standard deviation normalise the inputs,
-    and the box around them is the `domain` of the flow map.
+    Their mean and standard deviation normalise the inputs, and the box around them is the `domain`
+    of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
 - `latent`: the number $L$ of products in each component, for a `Product`.
-- `core`: the architecture of the network: [`diffrax_conserve.learned.Concatenated`][],
-    [`diffrax_conserve.learned.Gated`][] or [`diffrax_conserve.learned.Product`][].
+- `core`: the architecture of the network, one of the three classes above.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `normalise`: whether the network gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
-    $S$ of `states`, and $h$ scaled to $[-1, 1]$. Otherwise both inputs are not
-    scaled, and $S = 1$.
+    $S$ of `states`, and $h$ scaled to $[-1, 1]$. Otherwise it gets $u_0$ and $h$, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then
     gets the inputs of the frame, to which `normalise` applies; the domain consists of all states

@@ -1,5 +1,6 @@
 """Conversion of states to vectors, the inputs and outputs of a network."""
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
@@ -20,13 +21,17 @@ def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]
     leaves = jtu.tree_leaves(y)
     if not leaves:
         raise ValueError("The state has no arrays: there is nothing to learn.")
-    for leaf in leaves:
-        if jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating):
-            raise TypeError(
-                f"The state has a leaf of dtype {jnp.result_type(leaf)}, but a network needs real "
-                "states. Split a complex leaf into its real and its imaginary part."
-            )
-    return jtu.tree_map(_floating, y)
+    if any(jnp.issubdtype(jnp.result_type(x), jnp.complexfloating) for x in leaves):
+        raise TypeError(
+            "The state has a complex leaf, but a network needs real states. Split it into its real "
+            "and its imaginary part."
+        )
+
+    def floating(leaf: ArrayLike) -> Array:
+        dtype = jnp.result_type(leaf)
+        return jnp.asarray(leaf, dtype if jnp.issubdtype(dtype, jnp.floating) else float)
+
+    return jtu.tree_map(floating, y)
 
 
 def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
@@ -43,13 +48,6 @@ def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "
     return states
 
 
-def _floating(leaf: ArrayLike) -> Array:
-    """`leaf` as an array with a floating-point dtype."""
-    dtype = jnp.result_type(leaf)
-    return jnp.asarray(leaf, dtype if jnp.issubdtype(dtype, jnp.floating) else float)
-
-
 def stacked_vectors(ys: Y) -> Float[Array, "count n"]:
     """States stacked along a leading axis, as the rows of a matrix."""
-    leaves = [x.reshape(x.shape[0], -1) for x in jtu.tree_leaves(ys)]
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=1)
+    return jax.vmap(flatten)(ys)

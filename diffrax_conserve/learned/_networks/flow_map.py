@@ -22,9 +22,8 @@ class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
     [`diffrax_conserve.DeepONet`][] is a flow map. [`diffrax_conserve.learned.FlowMap`][] makes one
-    from any function; solvers and [`diffrax_conserve.fit`][] do this automatically for a Module
-    that is called as `(y0, h) -> y` and has an attribute `max_step`, and optionally `order` and
-    `domain`.
+    from any function; solvers and [`diffrax_conserve.fit`][] do this for a Module `(y0, h) -> y`
+    with an attribute `max_step`, and optionally `order` and `domain`.
 
     **Attributes:**
 
@@ -57,8 +56,7 @@ class AbstractFlowMap(AbstractTrainable):
         return ()
 
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        """Whether the step from `y0` is within the domain. For a single network: whether it
-        starts there."""
+        """Whether the step from `y0` is within the domain. Here: whether it starts there."""
         del step
         return jnp.asarray(True if self.domain is None else self.domain.contains(y0))
 
@@ -157,9 +155,7 @@ FlowMap.__init__.__doc__ = r"""**Arguments:**
 - `args_domain`: the `args` for which it is valid, a [`diffrax_conserve.learned.Box`][]. Default:
     the function takes no `args`.
 
-**Raises:**
-
-`TypeError` if `function`, `domain` or `args_domain` is not of this kind.
+**Raises:** `TypeError` or `ValueError` if an argument is not of this kind.
 """
 
 
@@ -220,8 +216,3 @@ def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
         return flow_map.function
     is_missing = lambda x: x is None  # noqa: E731
     return eqx.tree_at(lambda m: m.domain, flow_map.function, flow_map.domain, is_leaf=is_missing)
-
-
-def has_arrays(tree: Any) -> bool:
-    """Whether `tree` has a floating-point array, which could be trained."""
-    return any(eqx.is_inexact_array(x) for x in jtu.tree_leaves(tree))

@@ -17,7 +17,7 @@ from ..._projection.equations import equations_of, relative
 from ..._projection.gram import combined, gram_matrix, gram_solve
 from ..._projection.scalars import written_out
 from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
-from .mlp import check_sizes
+from .cores import check_sizes
 
 
 @final
@@ -31,12 +31,9 @@ class ConservativeLayer(eqx.Module):
 
     This is Newton's method in $\lambda$, with rows scaled to norm one and a damping
     $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale. An iteration
-    moves a state by at most `radius`; otherwise the step would be arbitrarily long near a point
-    where $G$ vanishes.
-
-    The layer is part of the network: derivatives of the network with respect to time and weights
-    include the layer. They follow from the implicit function theorem for $g(y) = r$, where $r$ is
-    the remaining residual; no iteration is unrolled.
+    moves a state by at most the size of a state: it could be arbitrarily long near a point where
+    $G$ vanishes. Derivatives of the network include the layer, by the implicit function theorem for
+    $g(y) = r$ with the remaining residual $r$; no iteration is unrolled.
 
     For a state on the manifold to roundoff, wrap the solver in
     [`diffrax_conserve.ManifoldProjection`][].

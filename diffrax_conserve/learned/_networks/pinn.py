@@ -13,19 +13,15 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._tree import unflatten, working_dtype
+from .cores import MLP, Activation, check_sizes
 from .flat import as_state, flatten, stacked_vectors
 from .layer import ConservativeLayer
-from .mlp import MLP, Activation, check_sizes
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 
 @final
 class Window(AbstractTrainable):
-    """A network for the solution through one state, on the interval from `start` to `start +
-    length`.
-
-    A `PINN` consists of one or several consecutive windows.
-    """
+    """A network for the solution through `y0`, from `start` to `start + length`."""
 
     net: MLP
     layer: ConservativeLayer | None
@@ -93,9 +89,8 @@ class PINN(eqx.Module):
 
     A long interval is divided into `windows`, each with its own network that starts where the last
     one ends: small networks on short intervals are far easier to train than a large one on a long
-    interval. [`diffrax_conserve.fit`][] cuts windows that are too long.
-
-    Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.PINNSolver`][].
+    interval. Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step
+    it by [`diffrax_conserve.PINNSolver`][].
 
     !!! example
 
@@ -219,8 +214,8 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
-    spread over the interval. `None` for Glorot initialisation, with which all units are nearly
-    linear in time, and so nearly the same; Levenberg-Marquardt needs about 2.
+    spread over the interval. `None` for Glorot initialisation, with which all units are nearly the
+    same function of time; Levenberg-Marquardt needs about 2.
 - `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
     leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].

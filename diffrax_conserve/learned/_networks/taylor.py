@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ..._custom_types import Args, RealScalarLike, Y
-from .mlp import check_sizes
+from .cores import check_sizes
 
 
 @final
@@ -21,10 +21,9 @@ class Taylor(eqx.Module):
     u'(0) = f(u_0), \quad u''(0) = f'(u_0) f(u_0), \quad \dots$$
 
     A [`diffrax_conserve.DeepONet`][] with it learns the remainder, $u(h) = T_q(u_0, h) +
-    (h/\Delta)^{q+1} S N(u_0, h)$. With $q =
-    1$ its initial slope is exact. The network is then a method of order $q$ for all weights, so
-    that smaller steps reduce the error. Its cost doubles with each order, which pays only if the
-    polynomial itself is accurate: $h$ times the rate of change of $f$ should not be much above one.
+    (h/\Delta)^{q+1} S N(u_0, h)$. It is then a method of order $q$ for all weights, so that smaller
+    steps reduce the error. The cost doubles with each order, which pays only if the polynomial
+    itself is accurate: $h$ times the rate of change of $f$ should not be much above one.
 
     !!! example
 
@@ -69,12 +68,8 @@ class Taylor(eqx.Module):
 Taylor.__init__.__doc__ = r"""**Arguments:**
 
 - `vector_field`: $f(t, y, args)$, which must not depend on $t$.
-- `order`: the degree $q$.
+- `order`: the degree $q$, a positive integer; otherwise a `ValueError`.
 - `args`: passed to `vector_field`.
-
-**Raises:**
-
-`TypeError` or `ValueError` if `vector_field` or `order` is invalid.
 """
 
 

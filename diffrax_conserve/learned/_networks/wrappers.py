@@ -14,11 +14,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_sub, unflatten
-from .cores import AbstractCore
+from .cores import AbstractCore, check_sizes
 from .domain import Box
 from .flat import flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
-from .mlp import check_sizes
 from .trainable import LayerSchedule, Sampler
 
 _Model = TypeVar("_Model")
@@ -31,22 +30,18 @@ class AbstractWrapper(AbstractFlowMap):
 
     @property
     def max_step(self) -> RealScalarLike:
-        """The longest step."""
         return self.flow_map.max_step
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order of the inner flow map."""
         return self.flow_map.order
 
     @property
     def domain(self) -> Any:
-        """The domain of the inner flow map, or `None`."""
         return self.flow_map.domain
 
     @property
     def args_domain(self) -> Box | None:
-        """The `args_domain` of the inner flow map, or `None`."""
         return args_domain_of(self.flow_map)
 
     @property
@@ -71,9 +66,8 @@ class Repeated(AbstractWrapper):
     r"""The flow map of steps that are `count` times as long: $u(h) = \Phi_{h/k} \circ \dots \circ
     \Phi_{h/k}(u_0)$.
 
-    A flow is easier to learn over shorter steps. If the longest step is prescribed, learn a
-    fraction of it and repeat that. Train the inner flow map: the repeated one has no weights of its
-    own. It costs as much as `count` steps of the inner one.
+    A flow is easier to learn over shorter steps. Train the inner flow map: the repeated one has no
+    weights of its own. It costs as much as `count` steps of the inner one.
 
     !!! example
 
@@ -126,7 +120,6 @@ class Repeated(AbstractWrapper):
 
     @property
     def max_step(self) -> RealScalarLike:
-        """The longest step."""
         return self.count * self.flow_map.max_step
 
     def weights(self) -> tuple[()]:
@@ -137,11 +130,7 @@ Repeated.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that
     [`diffrax_conserve.DeepONetSolver`][] takes.
-- `count`: the number of inner steps in one step.
-
-**Raises:**
-
-`ValueError` or `TypeError` if an argument is not of this kind.
+- `count`: the number of inner steps in one step, a positive integer; otherwise a `ValueError`.
 """
 
 
@@ -150,8 +139,8 @@ class BoxCox(eqx.Module):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
-    of zero is finite. With an exponent of 0 it is the logarithm, for positive states. Exponents
-    such as 1/4 or 1/8 are computed by square roots, at a tenth of the cost of other powers.
+    of zero is finite. With an exponent of 0 it is the logarithm, for positive states. Powers of 1/2
+    take a tenth of the time of other exponents.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -185,11 +174,7 @@ def _root(x: Array, exponent: float) -> Array:
 
 BoxCox.__init__.__doc__ = r"""**Arguments:**
 
-- `exponent`: $\lambda$, from 0 to 1.
-
-**Raises:**
-
-`ValueError` if `exponent` is outside this range.
+- `exponent`: $\lambda$, from 0 to 1; otherwise a `ValueError`.
 """
 
 
@@ -197,9 +182,9 @@ BoxCox.__init__.__doc__ = r"""**Arguments:**
 class Transformed(AbstractWrapper):
     r"""A flow map in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
 
-    Chemical concentrations that span ten orders of magnitude are learned as powers or logarithms,
-    so that small ones count and none is negative. The initial state is exact. Both data losses and
-    defects are measured in these coordinates.
+    Concentrations that span ten orders of magnitude are learned as powers or logarithms, so that
+    small ones count and none is negative. The initial state is exact. The loss is measured in these
+    coordinates.
 
     !!! example
 
@@ -301,40 +286,25 @@ class OfPairs(AbstractWrapper):
         """`None`: `args` are part of the state."""
 
 
-@final
-class PairField(eqx.Module):
+def field_of_pairs(vector_field: Callable[..., Any], t: RealScalarLike, y: Any, args: None) -> Any:
     """The vector field of the pairs."""
-
-    vector_field: Callable[..., Any]
-
-    def __call__(self, t: RealScalarLike, y: Any, args: None) -> Any:
-        del args
-        y, args = y
-        return self.vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
+    del args
+    y, args = y
+    return vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
 
 
-@final
-class PairSampler(eqx.Module):
-    """Draws a state, and `args` from their domain."""
-
-    sample: Sampler
-    domain: Box
-
-    def __call__(self, key: PRNGKeyArray) -> tuple[Any, Any]:
-        state_key, args_key = jr.split(key)
-        return self.sample(state_key), self.domain.sample(args_key)
+def pair(sample: Sampler, domain: Box, key: PRNGKeyArray) -> tuple[Any, Any]:
+    """A random state, and random `args` from their domain."""
+    state_key, args_key = jr.split(key)
+    return sample(state_key), domain.sample(args_key)
 
 
 def single_precision(flow_map: _Model) -> _Model:
     r"""The same flow map, whose network is evaluated in float32.
 
-    A network computes in the precision of its weights. In $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S
-    G$ only $G$ is rounded to float32, about $10^{-7} S$. The state, the step, the polynomial and
-    the normalisation of the inputs stay in their own precision, and so does a projection. If the
-    network's own error is larger than this rounding, nothing is lost. On a CPU evaluation takes
-    about half as long, and a file about half the space.
-
-    Convert a network after training: its training needs the precision of the state.
+    In $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$ only $N$ is rounded to float32, about $10^{-7}
+    S$; if the network's own error is larger, nothing is lost. On a CPU evaluation takes about half
+    as long, and a file about half the space. Convert a network after its training.
 
     !!! example
 
@@ -364,8 +334,8 @@ def single_precision(flow_map: _Model) -> _Model:
 
     if not any(map(is_core, jtu.tree_leaves(flow_map, is_leaf=is_core))):
         raise TypeError(
-            f"`flow_map` is {flow_map!r}, which contains no `DeepONet`. Only the network of a "
-            "`DeepONet` can be evaluated in another precision than that of the state."
+            f"`flow_map` is {flow_map!r}, which contains no `DeepONet`, whose network alone can be "
+            "evaluated in another precision than that of the state."
         )
     rounded = lambda x: jtu.tree_map(single, x) if is_core(x) else x  # noqa: E731
     return jtu.tree_map(rounded, flow_map, is_leaf=is_core)

@@ -38,8 +38,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
-    controller (pass it `dtmax=flow_map.max_step` to avoid such attempts) and fails with fixed
-    steps; so does a solve backwards in time.
+    controller (pass it `dtmax=flow_map.max_step`) and fails with fixed steps; so does a solve
+    backwards in time.
 
     **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
     $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
@@ -47,9 +47,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     $$u \leftarrow y_n + h \int f(t, u, args) \quad \text{(Picard)}$$
 
     with the vector field of the term, at all points in parallel, or by `k` Newton iterations for
-    the fixed point, each with a dense linear system of the size of the state times `nodes`. The
-    $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$; a Newton iteration
-    squares it.
+    the fixed point. The $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$; a
+    Newton iteration squares it.
 
     **Error estimate.** Without sweeps it is the solution of the differential equation of the error,
     driven by the defect $u' - f(u)$, for 12 states of the flow map and 28 evaluations of $f$; with
@@ -57,15 +56,11 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     Smaller steps reduce the error of a solve with sweeps, or with a flow map of order 1 or more.
 
     **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
-    `outside` determines what happens to a step that starts outside `flow_map.domain`, or whose
-    estimated error has a component larger than `max_error`.
+    `outside` determines what happens to a step that starts outside `flow_map.domain` or with `args`
+    outside its `args_domain`, or whose estimated error has a component larger than `max_error`.
 
     Dense output is the polynomial through the (corrected) states at the `nodes` points, which are
-    computed only if something needs them.
-
-    Derivatives with respect to the initial state and the weights are those of the computed
-    solution. The `args` of the solve are passed to the vector field, and to a flow map with an
-    `args_domain`; outside that domain every step is outside.
+    computed only if something needs them. Derivatives are those of the computed solution.
 
     !!! example
 
@@ -217,9 +212,7 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.DeepONet`][], any other
     [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module that is called as `(y0, h) -> y` and
-    has an attribute `max_step`. Such a Module may have an integer `order` $q$ (the error of one
-    step is $O(h^{q+1})$; default 0) and a `domain` with a method `contains(y)`, such as a
-    [`diffrax_conserve.learned.Box`][].
+    has an attribute `max_step`, and optionally `order` and `domain`.
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
 - `sweep`: [`diffrax_conserve.learned.NewtonSweep`][]`()`. Default: Picard's.
@@ -238,10 +231,9 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 **Raises:**
 
 `TypeError` or `ValueError` if the flow map has another signature or returns another structure than
-that of the state, if a number is invalid, or if `outside` needs a domain that the flow map does not
-have. At run time a solve backwards in time or of an equation for which the flow map was not
-trained, a step that is too long, and a state that is not finite end with a failed
-[`result`][diffrax.RESULTS].
+that of the state, if a number is invalid, or if `outside` needs a domain that it does not have. At
+run time a solve backwards in time or of another equation, a step that is too long, and a state that
+is not finite end with a failed [`result`][diffrax.RESULTS].
 """
 
 # An alias, named after the usual flow map.

@@ -32,18 +32,14 @@ _ANOTHER_START = register(
 class PINNSolver(dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
-    The vector field of the term is not evaluated, because the network was trained for it. Steps may
-    have any length; they determine where states are saved, projected or tested for events. The
-    solve must start on the network's solution, $y(t_0) = u(t_0)$, and stay inside its interval:
-    with another initial state or a time outside it fails. There is no error estimate, so
-    use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
+    The vector field of the term is not evaluated. Steps may have any length; they determine where
+    states are saved, projected or tested for events. The solve must start on the network's
+    solution, $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. There is no error
+    estimate, so use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
-    Dense output follows the network inside the step: it is the polynomial through its states at
-    `nodes` Chebyshev points, which are computed only if dense output, saved times or an event need
-    them. The weights are not copied.
-
-    The result does not depend on `y0`, which must be the trained one: the derivative with respect
-    to `y0` is zero.
+    Dense output is the polynomial through the states of the network at `nodes` Chebyshev points of
+    the step, which are computed only if something needs them. The derivative with respect to `y0`,
+    which must be the trained one, is zero.
 
     !!! example
 
@@ -144,5 +140,5 @@ PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 `TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state. At run
 time the [`result`][diffrax.RESULTS] is a failure if a time is outside the interval, or `y0` is not
-the state of the network at the initial time, up to the square root of roundoff.
+the state of the network at the initial time, to the square root of roundoff.
 """

@@ -18,17 +18,14 @@ from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
+_WHEN = "`diffrax_conserve.learned.domain_statistics` tells at which time."
 _OUTSIDE = register(
-    "a step starts outside the domain of the flow map. "
-    "`diffrax_conserve.learned.domain_statistics` tells at which time. Train the flow map on "
-    "states from there, or let a classical solver take such steps, by "
-    "`outside=diffrax.Tsit5()`."
+    f"a step starts outside the domain of the flow map. {_WHEN} Train the flow map on states from "
+    "there, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
 )
 _INACCURATE = register(
-    "the estimated error of a step is above `max_error`. "
-    "`diffrax_conserve.learned.domain_statistics` tells at which time. Take shorter steps, correct "
-    "them by `corrections=...`, or let a classical solver take such steps, by "
-    "`outside=diffrax.Tsit5()`."
+    f"the estimated error of a step is above `max_error`. {_WHEN} Take shorter steps, correct them "
+    "by `corrections=...`, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
 )
 
 
@@ -143,7 +140,7 @@ def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
     if policy is None:
         if max_error is not None:
             raise ValueError(
-                "`max_error` says which steps count as outside, but these are ignored. Pass "
+                "`max_error` says which steps count as outside, but these are ignored: pass "
                 "`outside=diffrax_conserve.learned.Report()`, `Refuse()` or `diffrax.Tsit5()` too."
             )
         return
@@ -151,15 +148,14 @@ def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
         _check_solver(policy)
     elif not isinstance(policy, Report | Refuse):
         raise TypeError(
-            f"`outside` is {policy!r}, but it must be `None`, "
-            "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver that takes the "
-            "steps that the flow map cannot, such as `diffrax.Tsit5()`."
+            f"`outside` is {policy!r}, but it must be `diffrax_conserve.learned.Report()`, "
+            "`Refuse()`, or a diffrax solver, such as `diffrax.Tsit5()`."
         )
     if max_error is None and domain is None:
         raise ValueError(
-            f"`outside` is {policy!r}, but the flow map does not say what is outside: it has no "
-            "`domain`. Give it one, for example `diffrax_conserve.learned.Box.around(states)` with "
-            "the states that it was trained on, or pass `max_error`."
+            f"`outside` is {policy!r}, but the flow map does not know what that is: it has no "
+            "`domain`. Give it `diffrax_conserve.learned.Box.around(states)`, with the states that "
+            "it was trained on, or pass `max_error`."
         )
 
 
@@ -183,27 +179,24 @@ def _check_solver(solver: Any) -> None:
 def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
     """The number of steps of a learned solver outside its flow map's domain.
 
-    It is part of the state of a solver with a policy `outside`, so `diffeqsolve` must return that
-    state, by `SaveAt(solver_state=True)`.
-
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve` with `saveat=SaveAt(..., solver_state=True)`,
-        or a batch of them from `jax.vmap`.
+    - `sol`: the solution from `diffrax.diffeqsolve` with a solver that has a policy `outside`, and
+        with `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
 
     **Returns:**
 
     An object with the attributes
 
     - `num_steps`: the number of accepted steps;
-    - `num_outside`: the number of them that were outside: a step that starts outside the flow map's
-        `domain`, or whose estimated error is above `max_error`;
+    - `num_outside`: the number of them that started outside the flow map's `domain`, or had an
+        estimated error above `max_error`;
     - `fraction_outside`: `num_outside / num_steps`;
     - `first_outside`: the time at which the first of them started; infinity if there is none.
 
     **Raises:**
 
-    `ValueError` if `sol` holds no such state.
+    `ValueError` if `sol` holds no such statistics.
 
     !!! example
 

@@ -61,10 +61,7 @@ class NewtonSweep(eqx.Module):
 
     def __call__(self, increment: Increment, path: Path) -> Path:
         if jnp.issubdtype(path.dtype, jnp.complexfloating):
-            raise TypeError(
-                "`NewtonSweep` needs a real state, but this one is complex. Split it into its real "
-                "and its imaginary part, or leave `sweep` out."
-            )
+            raise TypeError("`NewtonSweep` needs a real state: leave `sweep` out.")
         count, n = path.shape
         residual = Picard()(increment, path) - path
         jacobians = jax.vmap(jax.jacfwd(increment, argnums=1))(_fractions(path), path)
@@ -111,10 +108,8 @@ def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
     $$d' = h \left(f(p + \rho + d) - F\right), \qquad d(0) = 0,$$
 
     which is exact. $\rho$ is the change by a Picard sweep; by itself it underestimates the error by
-    a large factor where $h \|\partial f\|$ is large. No derivative of $f$ or of the network and no
-    difference of neighbouring points is needed, so the roundoff is that of the states.
-
-    To first order that is the linearised defect equation, $e' = \partial f\, e + f(p) - p'$.
+    a large factor where $h \|\partial f\|$ is large. Nothing is differentiated, so the roundoff is
+    that of the states.
     """
     values = jax.vmap(increment)(_fractions(path), path)
     rho = path[0] + integrals(values) - path

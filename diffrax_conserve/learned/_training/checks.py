@@ -1,4 +1,4 @@
-"""The checks of the arguments of `fit`, made before compilation."""
+"""What `fit` is given, checked before compilation, as a network and a problem."""
 
 from typing import Any
 
@@ -19,17 +19,34 @@ from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
 from .._networks.flat import stacked_vectors
-from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, has_arrays
+from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
-from .._networks.wrappers import OfPairs, PairField, PairSampler
+from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
-from .data import as_data
+from .data import as_data, as_sampler
 from .objective import Problem, VectorField
 from .pool import Pool
 from .recipe import Recipe, second_order
 from .state import FitState
-from .states import as_sampler
+
+
+def check_types(
+    vector_field: Any, key: Any, recipe: Any, state: Any, progress: Any, **limits: Any
+) -> None:
+    """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
+    is_key = eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)
+    for name, value, good, wanted in (
+        ("vector_field", vector_field, callable(vector_field), "a function `(t, y, args)`"),
+        ("key", key, is_key, "a random key: `jax.random.key(0)`"),
+        ("recipe", recipe, isinstance(recipe, Recipe), "a `diffrax_conserve.learned.Recipe`"),
+        ("state", state, isinstance(state, FitState), "the `state` of a log of `fit`"),
+        ("progress", progress, isinstance(progress, bool) or callable(progress), "a function"),
+    ):
+        if not good and (value is not None or name == "key"):
+            raise TypeError(f"`{name}` is {value!r}, but it must be {wanted}.")
+    for name, value in limits.items():
+        check_number(name, value, above=0.0)
 
 
 def checked(
@@ -44,7 +61,8 @@ def checked(
 ) -> tuple[Any, Problem]:
     """The flow map, or the first window of a PINN, and the problem; raises unless the arguments
     fit."""
-    _check_types(vector_field, key, data, recipe)
+    if vector_field is None and data is None:
+        raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
     _check_manifold(model, manifold)
     recipe = second_order(model) if recipe is None else recipe
     if isinstance(model, PINN):
@@ -59,22 +77,16 @@ def checked(
     if vector_field is None:
         return network, problem
     _check_field(network, problem, jr.split(key)[0])
-    return _with_taylor(network, problem), problem
+    return _with_taylor(network, problem, vector_field), problem
 
 
 def _of_flow_map(
     model: Any, field: Any, sample: Any, data: Any, args: Args, recipe: Recipe
 ) -> tuple[AbstractFlowMap, Problem]:
-    if not (callable(model) and hasattr(model, "max_step")):
-        raise TypeError(
-            f"`fit` was given a {type(model).__name__}. It trains a `PINN`, a `DeepONet`, or a "
-            "Module `(y0, h) -> y` with an attribute `max_step`, the longest step."
-        )
     if sample is not None and field is None:
         raise TypeError("`sample` is only used with a `vector_field`: leave it out.")
-    sample = as_sampler(sample)
-    flow_map, domain = as_flow_map(model), args_domain_of(model)
-    if not has_arrays(flow_map.weights()):
+    flow_map, domain, sample = as_flow_map(model), args_domain_of(model), as_sampler(sample)
+    if not any(map(eqx.is_inexact_array, jtu.tree_leaves(flow_map.weights()))):
         raise ValueError(
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
@@ -91,8 +103,8 @@ def _of_flow_map(
     if domain is not None:
         _check_family(sample, args)
         flow_map = OfPairs(flow_map)
-        field = field if field is None else PairField(field)
-        sample = None if sample is None else PairSampler(sample, domain)
+        field = None if field is None else eqx.Partial(field_of_pairs, field)
+        sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
     if found is not None and field is not None and sample is None:
         sample = found.sample
@@ -101,20 +113,18 @@ def _of_flow_map(
     return flow_map, Problem(field, args, sample, found, recipe)
 
 
-def _with_taylor(network: Any, problem: Problem) -> Any:
+def _with_taylor(network: Any, problem: Problem, vector_field: VectorField) -> Any:
     """The network, if it is a DeepONet with the Taylor polynomial of the recipe."""
-    family, field = isinstance(network, OfPairs), problem.vector_field
-    inner: Any = network.flow_map if family else network
+    inner: Any = network.flow_map if isinstance(network, OfPairs) else network
     order = problem.recipe.taylor
     if not (order and isinstance(inner, DeepONet) and inner.taylor is None):
         return network
     # The polynomial helps only if the field changes by little in a step, at most of the states.
     if not inner.max_step * _rate_of_change(problem) <= _SLOW:
         return network
-    own: Any = field.vector_field if isinstance(field, PairField) else field
-    taylor = Taylor(own, order, args=None if family else problem.args)
-    where = (lambda m: m.flow_map.taylor) if family else (lambda m: m.taylor)
-    return eqx.tree_at(where, network, taylor, is_leaf=lambda x: x is None)
+    taylor = Taylor(vector_field, order, args=problem.args)
+    inner = eqx.tree_at(lambda m: m.taylor, inner, taylor, is_leaf=lambda x: x is None)
+    return OfPairs(inner) if isinstance(network, OfPairs) else inner
 
 
 # In units of the field itself.
@@ -134,33 +144,6 @@ def _rate_of_change(problem: Problem) -> Array:
         return after / jnp.maximum(before, 1e-30)
 
     return jnp.median(jax.vmap(at)(jr.split(jr.key(0), 64)))
-
-
-def _check_types(vector_field: Any, key: Any, data: Any, recipe: Any) -> None:
-    if vector_field is None and data is None:
-        raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
-    if vector_field is not None and not callable(vector_field):
-        raise TypeError(f"`vector_field` is {vector_field!r}, not a function `(t, y, args)`.")
-    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
-        raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
-    if recipe is not None and not isinstance(recipe, Recipe):
-        raise TypeError(
-            f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`, such as "
-            "`diffrax_conserve.learned.Recipe(optimiser=optax.adam(1e-3))` or "
-            "`diffrax_conserve.learned.second_order(model)`."
-        )
-
-
-def check_limits(state: Any, target: Any, seconds: Any, progress: Any) -> None:
-    """Raises unless the initial state, the limits and the progress of a training are valid."""
-    if state is not None and not isinstance(state, FitState):
-        raise TypeError(f"`state` is {state!r}, but it must be the `state` of a log of `fit`.")
-    for name, value in (("target", target), ("seconds", seconds)):
-        check_number(name, value, above=0.0)
-    if not (isinstance(progress, bool) or callable(progress)):
-        raise TypeError(
-            f"`progress` is {progress!r}, but it must be `True`, `False`, or a function."
-        )
 
 
 def _check_manifold(model: Any, manifold: Manifold | None) -> None:
@@ -196,9 +179,8 @@ def _check_family(sample: Any, args: Args) -> None:
         )
     if isinstance(sample, Pool):
         raise ValueError(
-            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Draw "
-            "states along solutions by `diffrax_conserve.learned.reachable_states`, and pass them "
-            "as `sample`."
+            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Pass "
+            "`sample=diffrax_conserve.learned.reachable_states(...)`."
         )
 
 

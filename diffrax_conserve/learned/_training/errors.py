@@ -4,10 +4,9 @@ The exact solution is $u + e$ with the network $u$ and
 
 $$e' = f(t, u + e) - u', \qquad e(t_0) = e_0.$$
 
-This equation is exact, so the truncation error of an RK4 solve for $e$ is relative to $e$: with the
-same steps, the estimate has two correct digits both for a solution with ten correct digits and for
-a wrong one. The steps evaluate the defect at four times as many points as the training, so a large
-defect between the collocation points is detected.
+This equation is exact, so the truncation error of an RK4 solve for $e$ is relative to $e$: the
+estimate has two correct digits both for an accurate solution and for a wrong one. The steps
+evaluate the defect at four times as many points as the training, and so between them.
 """
 
 from typing import Any, NamedTuple

@@ -14,7 +14,7 @@ from ..._custom_types import Args, Manifold
 from .._networks.flow_map import restored
 from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
-from .checks import check_limits, checked
+from .checks import check_types, checked
 from .errors import flow_map_error
 from .loop import FitLog, Loop, Progress
 from .objective import Carry, VectorField
@@ -44,9 +44,8 @@ def fit(
     r"""Trains a network from the vector field alone, or a flow map from data, or from both.
 
     Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output
-    of the network and its time derivative is computed by forward-mode automatic differentiation.
-    For a network with a conservative layer, the recipe's schedule determines the number of
-    iterations of the layer in $u$.
+    of the network, with the iterations of its conservative layer that the recipe's schedule
+    prescribes, and $u'$ is computed by forward-mode automatic differentiation.
 
     From `data` a flow map learns pairs of states along the trajectories, one step of any length
     apart. The loss is that of the differences, each component relative to the root mean square
@@ -56,15 +55,15 @@ def fit(
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
     estimates the error of its solution.
 
-    By default a `DeepONet` gets the [`diffrax_conserve.learned.Taylor`][] polynomial of first order
-    of the vector field, unless it has one or the field changes too fast: see `taylor` of
+    A `DeepONet` without a [`diffrax_conserve.learned.Taylor`][] polynomial gets that of first order
+    of the vector field, unless this changes too fast: see `taylor` of
     [`diffrax_conserve.learned.Recipe`][].
 
     A `PINN` is trained window by window; each starts at the end of the previous one, projected to
-    the manifold if one is given. Each is judged by its estimated error. A window that failed is cut
-    in halves, as often as the recipe's `retries` allow. Errors add up along the solution and may
-    grow: if it misses the `target`, the windows are trained again, to smaller errors. If the
-    solution is still wrong, a warning names the window and the error.
+    the manifold if one is given. A window whose estimated error is too large is cut in halves, as
+    often as the recipe's `retries` allow. Errors add up along the solution and may grow: if it
+    misses the `target`, the windows are trained again, to smaller errors. If the solution is still
+    wrong, a warning names the window and the error.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
     same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
@@ -80,12 +79,11 @@ def fit(
         optional.
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, initial states, stacked along a leading axis, a function from a
-        random key to one of them, or a [`diffrax_conserve.learned.Pool`][], which follows the
-        solutions from such states. Default: the states of `data`, or else all of the `domain`, if
-        that is a [`diffrax_conserve.learned.Box`][].
-    - `data`: for a flow map, trajectories `(ts, ys)`: times of shape `(n, k)`, increasing along
-        each trajectory and not necessarily equidistant, and states with leading axes `(n, k)`.
-        [`diffrax_conserve.learned.trajectories`][] computes some.
+        random key to one of them, or a [`diffrax_conserve.learned.Pool`][]. Default: the states of
+        `data`, or else all of the `domain`, if that is a [`diffrax_conserve.learned.Box`][].
+    - `data`: for a flow map, trajectories `(ts, ys)`: increasing times of shape `(n, k)`, and
+        states with leading axes `(n, k)`. [`diffrax_conserve.learned.trajectories`][] computes
+        some.
     - `args`: passed to `vector_field`. Omit them for a flow map that takes `args` itself: they are
         drawn from its `args_domain`, and the states of `data` are pairs `(y, args)`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
@@ -93,10 +91,10 @@ def fit(
     - `manifold`: for a `PINN`, the manifold to which the ends of the windows are
         projected, with the conserved values at the initial state. Default: that of its layer.
     - `state`: the `state` in the log of a training that is to be continued.
-    - `target`: for a flow map, the loss at which the training ends. For a `PINN`, the accepted
-        estimated error of its solution, relative to its largest component. Default: a flow map is
-        trained for all epochs; windows are cut until the error is about 1e-7 (1e-4 in single
-        precision), and a solution with an error above 1e-4 counts as wrong.
+    - `target`: for a flow map, the loss at which the training ends; default: none. For a `PINN`,
+        the accepted estimated error of its solution, relative to its largest component. Default:
+        windows are cut until the error is about 1e-7 (1e-4 in single precision), and a solution
+        with an error above 1e-4 counts as wrong.
     - `seconds`: ends the training after this wall time, without the compilation.
     - `checkpoint`: a file for the state of the training, which is updated regularly; if it exists,
         the training continues from it.
@@ -131,31 +129,29 @@ def fit(
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
     created = time.perf_counter()
-    check_limits(state, target, seconds, progress)
+    check_types(vector_field, key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     loop = Loop(
         problem,
         key,
-        None if target is None else float(target),
-        math.inf if seconds is None else seconds,
-        progress,
-        None if checkpoint is None else Path(checkpoint),
-        fingerprint((model, key, args, vector_field), problem.recipe),
-        created,
+        target=None if target is None else float(target),
+        seconds=math.inf if seconds is None else seconds,
+        progress=progress,
+        checkpoint=None if checkpoint is None else Path(checkpoint),
+        mark=fingerprint((model, key, args, vector_field), problem.recipe),
+        created=created,
     )
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)
     trained, log = _train_flow_map(loop, network, state)
-    trained = trained.flow_map if isinstance(trained, OfPairs) else trained
-    return restored(trained, model), log
+    return restored(trained.flow_map if isinstance(trained, OfPairs) else trained, model), log
 
 
 def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
-    problem, state = loop.problem, loop.begin((flow_map,), given)
-    objective, state = loop.start(state)
+    objective, state = loop.start(loop.begin((flow_map,), given))
 
     def error(network: Any) -> float:
-        return flow_map_error(network, problem, loop.key)
+        return flow_map_error(network, loop.problem, loop.key)
 
     def close(carry: Carry) -> bool:
         return loop.target is not None and float(carry.best) <= loop.target
@@ -163,7 +159,7 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
     carry, ended = state.carry, "epochs"
     if not state.finished:
         state, carry, ended = loop.train(objective, state, close, error)
-        finished = int(state.done >= problem.recipe.epochs)
+        finished = int(state.done >= loop.problem.recipe.epochs)
         state = dataclasses.replace(state, finished=finished)
     loop.save(state, always=True)
     trained = objective.best(carry)

@@ -28,23 +28,21 @@ class FitLog(eqx.Module):
     **Attributes:**
 
     - `error`: the estimated error of the solution, for each leaf of the state relative to its
-        largest component. For a `PINN` it is the largest error in the whole interval; for a flow
-        map the root mean square error of its longest step, over states from `sample`. The estimate
-        solves the differential equation of the error, driven by the defect. Infinity if no estimate
-        is possible or a window was not trained.
+        largest component: for a `PINN` the largest in the whole interval, for a flow map the root
+        mean square for its longest step, over states from `sample`. The estimate solves the
+        differential equation of the error, driven by the defect. Infinity if there is none, or a
+        window was not trained.
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points with all iterations of the
-        conservative layer, so that epochs with different numbers of iterations are comparable. With
-        a [`diffrax_conserve.learned.Pool`][] it is the loss on its states for the next epoch, the
-        same states for both models.
+        the compared values: the loss on the first collocation points (with a
+        [`diffrax_conserve.learned.Pool`][] on its states for the next epoch) with all iterations of
+        the conservative layer.
     - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
         those of the worst.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
-    - `ended`: the reason why the training ended: `"epochs"`, `"target"`, `"seconds"` or
-        `"interrupt"`.
+    - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
     - `seconds`, `compile_seconds`: the wall times of the training, and of all that comes before its
         first epoch, which is mostly compilation.
     - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
@@ -77,7 +75,7 @@ class Loop:
     checkpoint: Path | None
     mark: str
     created: float  # the beginning of `fit`
-    begun: float | None = None  # the end of the compilation
+    compile_seconds: float = 0.0
     compiled: Any = None
     pace: float = 0.0  # seconds for an epoch; 0 if that is not known
     first: int = 0  # the number of epochs before this call of `fit`
@@ -140,7 +138,13 @@ class Loop:
             if not state.checked.size:
                 raise
             ended = "interrupt"
-        _refuse_nothing(state)
+        skipped = int(state.carry.skipped)
+        if skipped and skipped == state.done:
+            raise FloatingPointError(
+                f"None of the {skipped} updates was finite, so nothing was learned, although the "
+                "vector field is finite at the initial states. It may not be finite where the "
+                "network leads, or the updates are too long: lower the learning rate."
+            )
         shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
         return state, shown.carry, ended
 
@@ -168,12 +172,8 @@ class Loop:
 
     @property
     def elapsed(self) -> float:
-        """The time since the end of the compilation."""
-        return 0.0 if self.begun is None else time.perf_counter() - self.begun
-
-    @property
-    def compile_seconds(self) -> float:
-        return (time.perf_counter() if self.begun is None else self.begun) - self.created
+        """The time since the end of the compilation, which takes `compile_seconds`."""
+        return time.perf_counter() - self.created - self.compile_seconds if self.compiled else 0.0
 
     def save(self, state: FitState, always: bool = False) -> None:
         """Writes a checkpoint, unless the time since the last one is short compared with its
@@ -186,12 +186,7 @@ class Loop:
         self.saving = self.saved - begun
 
     def log(
-        self,
-        state: FitState,
-        carry: Carry,
-        ended: str,
-        error: float,
-        errors: tuple[float, ...] = (),
+        self, state: FitState, carry: Carry, ended: str, error: float, errors: Any = ()
     ) -> FitLog:
         """The log of a training that ends with `state` and `carry`."""
         found = dataclasses.replace(state, carry=carry).closed()
@@ -213,7 +208,7 @@ class Loop:
     def _compile(
         self, objective: Objective, state: FitState, estimate: Callable[[Any], float]
     ) -> None:
-        if self.begun is not None:
+        if self.compiled is not None:
             return
         numbers = jnp.asarray(0), jnp.asarray(0), jnp.asarray(False)
         compilable = eqx.filter_jit(advance)
@@ -221,7 +216,7 @@ class Loop:
         self.compiled = lowered.compile()
         estimate(objective.best(state.carry))
         self.first = state.losses.size + max(state.done, 0)
-        self.begun = time.perf_counter()
+        self.compile_seconds = time.perf_counter() - self.created
 
     def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
         """Calls the function `progress`, or prints a line."""
@@ -235,8 +230,7 @@ class Loop:
         if self.progress is not True:
             self.progress(done, total, float(loss), best)
             return
-        # On a terminal one line is overwritten; in a file there is one line for each tenth of the
-        # epochs.
+        # On a terminal one line is overwritten; a file gets one for each tenth of the epochs.
         terminal = sys.stderr.isatty()
         if not (terminal or done == total or done % max(total // 10, 1) == 0):
             return
@@ -249,14 +243,3 @@ class Loop:
             parts.append(f"{min(left, self.seconds - self.elapsed):.0f} s left")
         ending = "\r" if terminal and done < total else "\n"
         print(", ".join(parts), end=ending, file=sys.stderr, flush=True)
-
-
-def _refuse_nothing(state: FitState) -> None:
-    """Raises if every update was skipped."""
-    skipped = int(state.carry.skipped)
-    if skipped and skipped == state.done:
-        raise FloatingPointError(
-            f"None of the {skipped} updates was finite, so nothing was learned, although the "
-            "vector field is finite at the initial states. It may not be finite where the network "
-            "leads, or the updates are too long: lower the learning rate."
-        )

@@ -13,15 +13,15 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike
 from ..._tree import tree_all_finite, tree_sub
+from .._networks.domain import Box, FramedBox
 from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
 from .data import Data
-from .pool import Pool, domain_of, moved
+from .pool import Pool, moved
 from .recipe import Recipe
 from .second_order import LeastSquares, SecondOrder, squared_norms
 
@@ -91,7 +91,6 @@ class Objective(eqx.Module):
 
     problem: Problem
     static: Any  # the model without its weights
-    optimiser: optax.GradientTransformation | SecondOrder
     first_points: Points
     typical: Float[Array, ""]
     linear: Bool[Array, " weights"]  # marks those of the last layer
@@ -125,8 +124,8 @@ class Objective(eqx.Module):
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
         layer, recipe = self.static.layer, self.problem.recipe
-        if layer is None or layer.steps == 0:
-            return jnp.zeros_like(epoch), jnp.ones(())
+        if layer is None:
+            return self.complete()
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
@@ -140,20 +139,18 @@ class Objective(eqx.Module):
 
 @eqx.filter_jit
 def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tuple[Objective, Carry]:
-    recipe, (points_key, key) = problem.recipe, jr.split(key)
+    points_key, key = jr.split(key)
     trained = _marked(model, "weights", eqx.is_inexact_array)
     weights, static = eqx.partition(model, trained)
     points = problem.draw(model, points_key)
-    optimiser = recipe.optimiser
-    if recipe.max_gradient_norm is not None and not isinstance(optimiser, SecondOrder):
-        optimiser = optax.chain(optax.clip_by_global_norm(recipe.max_gradient_norm), optimiser)
     last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
-    domain = domain_of(model) if isinstance(problem.sample, Pool) else None
+    domain = getattr(model, "domain", None) if isinstance(problem.sample, Pool) else None
+    domain = domain if isinstance(domain, Box | FramedBox) else None
     carry = Carry(
         weights=weights,
-        optimiser_state=optimiser.init(weights),
+        optimiser_state=problem.recipe.optimiser.init(weights),
         points=points,
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
@@ -161,12 +158,12 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
         skipped=jnp.asarray(0),
         domain=domain,
         best_domain=domain,
-        losses=jnp.full(recipe.epochs, jnp.nan, dtype),
+        losses=jnp.full(problem.recipe.epochs, jnp.nan, dtype),
     )
     # No array is weakly typed, because the compiled epochs return none that is.
     carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
     typical = problem.typical(model, points)
-    return Objective(problem, static, optimiser, points, typical, linear, key), carry
+    return Objective(problem, static, points, typical, linear, key), carry
 
 
 def _marked(model: AbstractTrainable, method: str, mark: Callable[[Any], bool]) -> Any:
@@ -216,13 +213,16 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     """One update, and the points for the next one."""
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
-    # If the update is not finite, continue from the best model: skipping the update is not enough,
-    # because the same points would give the same result in the next epoch.
-    fresh = objective.optimiser.init(carry.best_weights)
+    # If not, continue from the best model: the same weights and points would give the same result.
+    fresh, domain = objective.problem.recipe.optimiser.init(carry.best_weights), carry.domain
+    if domain is not None:
+        # Earlier, the network may have moved states where no solution goes.
+        late = 2 * epoch >= objective.problem.recipe.epochs
+        domain = _where(late, domain.extended(carry.points.y0s), domain)
     carry = carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
-        domain=_seen(objective, carry, epoch),
+        domain=domain,
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
@@ -239,7 +239,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
     """The next weights and state of the optimiser, and the loss."""
-    optimiser, schedule = objective.optimiser, objective.schedule(epoch)
+    optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
     weights, points, state = carry.weights, carry.points, carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
@@ -277,15 +277,6 @@ def fresh_points(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> P
     old, new, key = carry.points.y0s, points.y0s, jr.fold_in(key, 0)
     y0s = moved(problem.sample, model, problem.args, squares, objective.typical, old, new, key)
     return points._replace(y0s=y0s)
-
-
-def _seen(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Any:
-    """The domain, extended by the states of a pool."""
-    if carry.domain is None:
-        return None
-    # Earlier, the network may have moved states where no solution goes.
-    late = 2 * epoch >= objective.problem.recipe.epochs
-    return _where(late, carry.domain.extended(carry.points.y0s), carry.domain)
 
 
 def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:

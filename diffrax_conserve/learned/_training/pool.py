@@ -17,10 +17,10 @@ from ..._manifold import check_manifold, conserved_values
 from ..._options import check_number
 from ..._projection.project import project
 from ..._tree import tree_all_finite
-from .._networks.domain import AbstractDomain
+from .._networks.domain import FramedBox
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.trainable import Points
-from .states import as_sampler
+from .data import as_sampler
 
 # A function from steps, each given by an initial state and a length, to the squared norms of the
 # defects at their ends.
@@ -34,13 +34,12 @@ class Pool(eqx.Module):
     Pass it as `sample` to [`diffrax_conserve.fit`][]. In a solve, each step of a flow map starts at
     the end of the last one, so it must be trained on such states, and it can generate them itself.
     Whenever the recipe draws new points, the network moves each state by a step of random length,
-    and the result is projected to the manifold through the state. Every state is replaced by a new
-    one from `sample` after `mean_steps` steps on average. A step is accepted only if its defect at
-    the end is small: an inaccurate network first learns the states of `sample`.
+    if its defect at the end is small, and the result is projected to the manifold through the
+    state.
 
     Construct the network with `states` that cover about the region of the solutions: they normalise
     its inputs. The `domain` of the trained network covers them and the states of the pool in the
-    second half of the epochs. (With a frame, the largest clock is unchanged, because the network
+    second half of the epochs. (With a frame the largest clock is unchanged, because the network
     scales time by it; faster states are replaced by new ones.)
 
     !!! example
@@ -115,7 +114,6 @@ def moved(
     lengths = jr.uniform(lengths_key, (count,), maxval=float(model.max_step))
     small = squares(Points(lengths, y0s)) <= pool.max_defect**2 * typical
     goes_on = small & ~jr.bernoulli(restarts_key, 1 / pool.mean_steps, (count,))
-    domain = domain_of(model)
 
     def state(y0: Y, h: Array, fresh: Y, good: Array) -> Y:
         end = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), model(y0, h), y0)
@@ -126,14 +124,8 @@ def moved(
         good = good & tree_all_finite(end)
         if pool.keep is not None:
             good = good & pool.keep(end)
-        if domain is not None:
-            good = good & domain.can_include(end)
+        if isinstance(model.domain, FramedBox):
+            good = good & (model.domain.frame(end).clock <= model.domain.fastest)
         return jtu.tree_map(lambda a, b: jnp.where(good, a, b), end, fresh)
 
     return jax.vmap(state)(y0s, lengths, fresh, goes_on)
-
-
-def domain_of(flow_map: Any) -> AbstractDomain | None:
-    """The domain of a flow map, if `fit` can extend it, otherwise `None`."""
-    domain = flow_map.domain
-    return domain if isinstance(domain, AbstractDomain) else None

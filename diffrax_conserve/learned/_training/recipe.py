@@ -65,33 +65,26 @@ class Recipe(eqx.Module):
     epochs: int = 5000
     points: int = 2000
     optimiser: optax.GradientTransformation | SecondOrder = eqx.field(
-        default_factory=lambda: optax.adam(1e-3)
+        default_factory=lambda: optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3))
     )
     schedule: Callable[[Array, int, int], LayerSchedule] = staged
     loss: Loss = mean
     times: Times = uniform
     taylor: int = 0
     refresh: int | None = None
-    max_gradient_norm: float | None = 1.0
     check_every: int = 50
     retries: int = 0
 
     def __check_init__(self):
-        for name, least in (
-            ("epochs", 1.0),
-            ("points", 1.0),
-            ("check_every", 1.0),
-            ("retries", 0.0),
-        ):
-            check_number(name, getattr(self, name), least=least, optional=False)
-        check_number("taylor", self.taylor, least=0.0, optional=False)
+        for name in ("epochs", "points", "check_every"):
+            check_number(name, getattr(self, name), least=1.0, optional=False)
+        for name in ("retries", "taylor"):
+            check_number(name, getattr(self, name), least=0.0, optional=False)
         check_number("refresh", self.refresh, least=1.0)
-        check_number("max_gradient_norm", self.max_gradient_norm, above=0.0)
         if not isinstance(self.optimiser, optax.GradientTransformation | SecondOrder):
             raise TypeError(
-                f"`optimiser` is {self.optimiser!r}, but it must be an optimiser of optax, such as "
-                "`optax.adam(1e-3)`, or `diffrax_conserve.learned.SPRING()` or "
-                "`LevenbergMarquardt()`."
+                f"`optimiser` is {self.optimiser!r}, but it must be one of optax, or "
+                "`diffrax_conserve.learned.SPRING()` or `LevenbergMarquardt()`."
             )
         for name in ("schedule", "loss", "times"):
             if not callable(getattr(self, name)):
@@ -103,23 +96,21 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `epochs`: the number of updates; each uses all collocation points.
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
-    [`diffrax_conserve.learned.LevenbergMarquardt`][].
+    [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3, for gradients of a
+    norm of at most 1.
 - `schedule`: for a network with a conservative layer, a function of the epoch (traced), the number
     of epochs and the number of iterations in the layer, which returns $p$ and $s$. The network is
     trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations.
     Default: one more iteration in each of $P + 1$ stages, in each of which $s$ rises from 0 to 1.
-- `loss`: a function from the squared norm of the defect at each point, and the median of $|f|^2$
-    over the initial states, to the loss. Default: the mean of the squared norms. With `lambda q,
-    typical: jnp.mean(q / (1 + q / typical))` a few states that change too fast for the network do
-    not dominate.
+- `loss`: a function from the squared norm $q$ of the defect at each point, and the median of
+    $|f|^2$ over the initial states, to the loss. Default: the mean of $q$. With `lambda q, typical:
+    jnp.mean(q / (1 + q / typical))` states that change too fast for the network do not dominate.
 - `times`: a function from a key, a number of points, the first and the last time to the times of
     the points. Default: independent and uniform.
 - `taylor`: the order of the Taylor polynomial that `fit` gives to a
     [`diffrax_conserve.DeepONet`][] without one, if it is trained with a vector field that changes
     slowly enough in the longest step. Default: 0, none.
 - `refresh`: the number of epochs after which new points are drawn. Default: never.
-- `max_gradient_norm`: longer gradients are scaled to this norm; `None` for no limit. Not used by
-    second-order methods, which have a damping instead.
 - `check_every`: the number of epochs after which the model is compared with the best one so far.
 - `retries`: how often a window of a `PINN` that failed is cut in halves. With 0 windows are judged
     but not trained again.

@@ -75,10 +75,9 @@ class SPRING(eqx.Module):
     $$\delta = \zeta - J^\top (J J^\top + \lambda I)^{-1} (r + J \zeta),$$
 
     with a damping $\lambda$ proportional to the loss. The size of the matrix is the number of
-    equations, not of weights: a batch of 250 points of three equations needs one Cholesky
-    factorisation of size 750 for any size of the network. During the first two fifths of the epochs
-    updates are made in full; then their length decreases linearly to zero, so that the noise of the
-    batches averages out.
+    equations, 750 for 250 points of a system of three, for any size of the network. After the first
+    two fifths of the epochs the length of the updates decreases linearly to zero, so that the noise
+    of the batches averages out.
 
     ??? cite "Reference"
 
@@ -144,9 +143,8 @@ class LevenbergMarquardt(eqx.Module):
 
     The output of a network is linear in the weights of its last layer. Those are damped far less,
     by $10^{-12} \lambda$, so that every update solves for them almost exactly, as in variable
-    projection. With equal damping, the iteration moves slowly along a curved valley and reaches a
-    residual of $10^{-5}$ instead of $10^{-10}$. The problem is ill-conditioned, and therefore
-    solved by a QR factorisation of $J$ instead of its normal equations.
+    projection: with equal damping the residual reaches $10^{-5}$ instead of $10^{-10}$. The problem
+    is ill-conditioned, and therefore solved by a QR factorisation of $J$.
 
     ??? cite "Reference"
 
