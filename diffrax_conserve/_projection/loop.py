@@ -98,7 +98,7 @@ def _solve(
     damped: bool,
     small: bool,
 ) -> Solved:
-    def start(y: Array) -> _Kept:
+    def start(y: Any) -> _Kept:
         if directions is not None:
             return _Kept(directions / row_sizes(directions)[:, None])
         if fresh and not damped:
@@ -112,27 +112,25 @@ def _solve(
         many = len(rows) > WRITTEN_OUT_MAX
         return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
 
-    def test(kept: _Kept, y: Array, left: Array) -> tuple[Array, Array, Array]:
+    def test(kept: _Kept, y: Any, left: Array) -> tuple[Array, Array, Array]:
         return _tested(equations, max_steps, kept, y, left)
 
-    y, left = candidate, jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
+    y: Any = candidate
+    left = jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
     count = jnp.asarray(0)
-    written: tuple[Any, ...] = (None,)
     if small:
         like = jax.eval_shape(start, y)
-        written = in_scalars(start, y), in_scalars(test, like, y, left)
-    if None not in written:
-        # From here on arrays are tuples of scalars.
-        start, test = written
-        y = components(y)
-    else:
+        written: tuple[Any, ...] = in_scalars(start, y), in_scalars(test, like, y, left)
+        if None not in written:
+            # From here on arrays are tuples of scalars.
+            start, test = written
+            y = components(y)
+    in_arrays = not isinstance(y, tuple)
+    if in_arrays:
         y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
     kept = start(y)
-    if None not in written:
-        # Most steps of an integrator need two iterations, which need no loop.
-        for _ in range(2):
-            y, left, more = test(kept, y, left)
-            count = count + more
+    if not in_arrays:  # the first iteration before the loop, which saves a tenth
+        y, left, count = test(kept, y, left)
 
     def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         y, left, count = carry
