@@ -100,7 +100,7 @@ def drop_scan_kind(package):
     package.method("ManifoldProjection.scan_kind", lambda _: property(lambda self: None))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "implicit_solvers")
+@noticed_by("tests/solver/test_conformance.py", "-k", "every_solver")
 def drop_root_finder(package):
     detached = property(lambda self: diffrax.VeryChord(rtol=1e-3, atol=1e-3))
     package.method("ManifoldProjection.root_finder", lambda _: detached)
@@ -309,7 +309,7 @@ def stop_the_newton_iteration_of_random_features_at_once(package):
     package.function("_newton", lambda _: newton)
 
 
-@noticed_by("tests/solver/test_random_features_in_diffrax.py", "-k", "say_so")
+@noticed_by("tests/solver/test_random_features.py", "-k", "say_so")
 def report_unsolved_equations_as_a_success(package):
     def mutate(newton):
         def mutated(*arguments):

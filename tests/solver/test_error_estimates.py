@@ -39,33 +39,24 @@ def final(tree):
 # ---- Against the true error ----
 
 
-def ratios(name, kind, factor, count):
-    """Estimated over true error of one full step of a shipped flow map. A `factor` above one takes
-    the states out of the domain that it was trained on."""
-    system = dfc.systems.get(name)
-    network = dfc.load_pretrained(f"{name}-{kind}")
-    term = dfx.ODETerm(system.vector_field)
-    y0s = factor * states(count, system)
-    h = network.max_step
-    y1s, estimates = jax.vmap(lambda y0: step(unchecked(network), y0, h, term=term))(y0s)
-    errors = jax.vmap(lambda y0: final(exact(term, y0, h)))(y0s) - y1s
-    return jnp.linalg.norm(estimates, axis=1) / jnp.linalg.norm(errors, axis=1)
-
-
 @pytest.mark.parametrize(
     ("name", "kind", "factor"),
-    [("conservative-lorenz", "standard", 1.0)]
-    + [
-        pytest.param(name, kind, factor, marks=pytest.mark.slow)
-        for name in ("conservative-lorenz", "double-pendulum", "point-vortices")
-        for kind in ("standard", "conservative")
-        for factor in (1.0, 1.5)
+    [
+        ("conservative-lorenz", "standard", 1.0),
+        pytest.param("point-vortices", "conservative", 1.5, marks=pytest.mark.slow),
     ],
 )
 def test_the_estimate_is_the_true_error_of_the_shipped_flow_maps(name, kind, factor):
+    """Of one full step; a `factor` above one takes the states out of the domain."""
+    system = dfc.systems.get(name)
+    network = dfc.load_pretrained(f"{name}-{kind}")
+    term, h = dfx.ODETerm(system.vector_field), network.max_step
     # Among the random vortices are pairs so close that `h ‖∂f‖` is beyond the estimate.
-    count = 100 if name == "point-vortices" else 20
-    low, middle, high = np.percentile(ratios(name, kind, factor, count), [5, 50, 95])
+    y0s = factor * states(100 if name == "point-vortices" else 20, system)
+    y1s, estimates = jax.vmap(lambda y0: step(unchecked(network), y0, h, term=term))(y0s)
+    errors = jax.vmap(lambda y0: final(exact(term, y0, h)))(y0s) - y1s
+    ratios = jnp.linalg.norm(estimates, axis=1) / jnp.linalg.norm(errors, axis=1)
+    low, middle, high = np.percentile(ratios, [5, 50, 95])
     assert 0.9 < low <= high < 1.1
     np.testing.assert_allclose(middle, 1, atol=0.01)
 
@@ -142,12 +133,7 @@ def test_float32():
 
 @pytest.mark.parametrize(
     ("order", "sweep", "corrections"),
-    [
-        (2, "picard", 0),
-        (0, "newton", 2),
-        pytest.param(0, "picard", 0, marks=pytest.mark.slow),
-        pytest.param(1, "picard", 2, marks=pytest.mark.slow),
-    ],
+    [(2, "picard", 0), (0, "newton", 2)],
 )
 def test_the_estimate_falls_with_the_step_as_claimed(order, sweep, corrections):
     network, term = Wrong(order=order, size=0.5), logistic(-1.0, 0.3)
@@ -209,7 +195,6 @@ def compiled(solver, controller, y0=LORENZ.y0, t1=2.0, dt0=None, max_steps=2000,
     )
 
 
-once = eqx.filter_jit(dfx.diffeqsolve)
 SHIPPED = dfc.load_pretrained("conservative-lorenz-standard")
 
 
@@ -224,35 +209,13 @@ def test_tighter_tolerances_take_more_steps_and_err_less():
     assert errors[2] < 1e-7
 
 
-@pytest.mark.parametrize("dt0", [None, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_steps_longer_than_the_longest_are_rejected(dt0):
+def test_steps_longer_than_the_longest_are_rejected():
     """Not an error: the controller tries a smaller one."""
-    sol = solve(unchecked(SHIPPED), tol=1e-1, dt0=dt0, saveat=dfx.SaveAt(steps=True))
+    sol = solve(unchecked(SHIPPED), tol=1e-1, saveat=dfx.SaveAt(steps=True))
     assert sol.stats["num_rejected_steps"] > 0
     lengths = jnp.diff(jnp.where(jnp.isfinite(sol.ts), sol.ts, jnp.nan), prepend=0.0)
     assert jnp.nanmax(lengths) <= 0.25 + 1e-6
     assert jnp.nanmax(lengths) > 0.04
-
-
-def test_fixed_steps_that_are_too_long_fail_without_an_exception():
-    sol = once(TERM, unchecked(flow_map()), 0.0, 2.0, 0.375, LORENZ.y0, throw=False)
-    assert "a step is longer than the flow map was trained for" in dfx.RESULTS[sol.result]
-
-
-def test_a_flow_map_for_steps_of_any_length():
-    assert (
-        once(TERM, unchecked(Still(max_step=jnp.inf)), 0.0, 20.0, 10.0, LORENZ.y0).result
-        == dfx.RESULTS.successful
-    )
-
-
-def test_a_solver_adds_no_message_to_the_list_of_diffrax():
-    before = len(dfx.RESULTS._index_to_message)
-    for max_step in (0.5, 0.25, 0.125):
-        solver = unchecked(Still(max_step), outside=dfc.learned.Refuse(), max_error=1.0)
-        sol = once(TERM, solver, 0.0, 2.0, 1.0, LORENZ.y0, throw=False)
-        assert sol.result != dfx.RESULTS.successful
-    assert len(dfx.RESULTS._index_to_message) == before
 
 
 def test_a_flow_map_that_small_steps_do_not_help_says_so():
@@ -260,5 +223,3 @@ def test_a_flow_map_that_small_steps_do_not_help_says_so():
     solver = unchecked(flow_map())
     sol = solve(solver, tol=1e-6, dtmin=1e-3, force_dtmin=False, throw=False)
     assert sol.result == dfx.RESULTS.dt_min_reached
-    sol = solve(solver, tol=1e-6, max_steps=50, throw=False)
-    assert sol.result == dfx.RESULTS.max_steps_reached

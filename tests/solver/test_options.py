@@ -83,18 +83,6 @@ def test_statistics_are_those_of_the_projections():
     assert abs(int(statistics.num_iterations) - sum(int(i.num_steps) for i in infos)) <= steps
 
 
-@pytest.mark.slow
-def test_statistics_of_a_batch_and_of_a_nested_solver():
-    def lane(scale):
-        solver = dfx.HalfSolver(dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY))
-        saveat = dfx.SaveAt(t1=True, solver_state=True)
-        return solve(rigid_body, solver, scale * OMEGA0, saveat=saveat, dt0=0.5)
-
-    statistics = dfc.statistics(jax.vmap(lane)(jnp.array([0.5, 1.0])))
-    np.testing.assert_array_equal(statistics.num_projections, [4, 4])  # the two halves
-    assert statistics.correction[0] < statistics.correction[1]
-
-
 def test_statistics_need_the_solver_state():
     with pytest.raises(ValueError, match="solver_state=True"):
         dfc.statistics(solve(rigid_body, dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY), OMEGA0))

@@ -78,11 +78,6 @@ def test_every_controller_hits_its_times_on_the_manifold(controller, times):
         assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6
 
 
-def test_a_progress_meter_and_unlimited_steps(capsys):
-    sol = run(dfx.SaveAt(t1=True), progress_meter=dfx.TextProgressMeter(), max_steps=None)
-    np.testing.assert_allclose(energies(sol.ys), ENERGY, rtol=4e-16)
-
-
 def test_a_steady_state_by_the_implicit_adjoint():
     """A damped flow on a sphere ends at the point in the direction of `args`, which is
     differentiated by the implicit function theorem."""
