@@ -3,15 +3,13 @@
 import dataclasses
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, flow_map, oscillator, states
+from ..learned import EAST, LORENZ, flow_map, states
 
 KEY = jr.key(5)
 
@@ -53,17 +51,6 @@ def test_the_paper_is_one_name():
     assert paper.recipe(network).taylor == 0
     pinn = paper.pinn(EAST, 0.0, 1.0, key=KEY)
     assert (pinn.nets.weights[0].shape[-1], len(pinn.nets.weights), pinn.windows) == (40, 5, 1)
-
-
-@pytest.mark.slow
-def test_a_pinn_of_several_turns_needs_no_options():
-    pinn, log = dfc.fit(dfc.PINN(EAST, 0.0, 12.0, key=KEY), oscillator, key=jr.key(6))
-    ts = jnp.linspace(0, 12, 300)
-    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
-    error = float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
-    assert error < 1e-7
-    np.testing.assert_allclose(log.error, error, rtol=0.1)
-    assert pinn.windows > 1
 
 
 def test_a_limited_time_is_kept():
