@@ -321,7 +321,7 @@ def report_unsolved_equations_as_a_success(package):
     package.function("_newton", mutate)
 
 
-@noticed_by("tests/training/test_pool.py", "-k", "leads_nowhere")
+@noticed_by("tests/training/test_pool.py", "-k", "defect_is_large")
 def follow_the_network_wherever_it_goes(package):
     def mutate(moved):
         def mutated(pool, model, args, squares, *rest):

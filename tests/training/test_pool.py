@@ -34,17 +34,6 @@ class Turning(eqx.Module):
         return turned * (1 + self.growth * h)
 
 
-class Own(eqx.Module):
-    """Any function as a flow map."""
-
-    function: Any
-    weight: Any = eqx.field(default_factory=lambda: jnp.zeros(()))
-    max_step: float = 1.0
-
-    def __call__(self, y0, h):
-        return self.function(y0, h)
-
-
 def near_east(key):
     """A state in a small piece of the ring between the radii 1 and 2."""
     low, high = jnp.array([1.0, 0.0]), jnp.array([2.0, 0.1])
@@ -54,11 +43,6 @@ def near_east(key):
 
 def radii(ys):
     return np.linalg.norm(ys, axis=-1)
-
-
-def angles(ys):
-    """Clockwise from the east, from 0 to 2π."""
-    return np.arctan2(-ys[:, 1], ys[:, 0]) % (2 * np.pi)
 
 
 Y0S = jax.vmap(near_east)(jr.split(jr.key(1), COUNT))
@@ -73,62 +57,6 @@ def train(model=None, pool=None, key=KEY, vector_field=oscillator, epochs=40, **
     parts = dict(points=60, optimiser=optax.sgd(0.02), refresh=1, check_every=10) | changes
     recipe = dfc.learned.Recipe(epochs=epochs, **parts)
     return dfc.fit(model, vector_field, key=key, sample=pool, recipe=recipe)
-
-
-# ---- Where the states go ----
-
-
-def starts(model, vector_field=oscillator, **options):
-    """All states from which a training without updates takes steps of `model`."""
-    seen = []
-
-    def watched(y0, h):
-        jax.debug.callback(lambda y: seen.extend(np.reshape(y, (-1, 2))), y0)
-        return model(y0, h)
-
-    options = dict(mean_steps=1e9, max_defect=np.inf) | options
-    pool = dfc.learned.Pool(near_east, **options)
-    # Each call of `watched` takes a millisecond.
-    few = dict(optimiser=optax.sgd(0.0), points=20, epochs=15, check_every=15)
-    train(Own(watched), pool, vector_field=vector_field, **few)
-    jax.effects_barrier()
-    return np.stack(seen)
-
-
-GROWING = Turning(0.9, 0.1)
-
-
-def test_states_go_far_and_stay_on_the_manifold_of_their_own_start():
-    """Though the network leaves it in every step."""
-    free, kept = starts(GROWING), starts(GROWING, manifold=RADIUS)
-    assert np.max(radii(free)) > 2.5
-    assert 1 - 1e-12 <= np.min(radii(kept)) <= np.max(radii(kept)) <= 2 + 1e-12
-    assert np.all(np.histogram(angles(kept), bins=12, range=(0, 2 * np.pi))[0] > 0)
-
-
-@pytest.mark.parametrize("options", [dict(mean_steps=1), dict(max_defect=1e-3)])
-def test_states_start_again_by_chance_or_if_the_defect_is_large(options):
-    assert np.max(angles(starts(GROWING, **options))) <= 0.1 + 1e-12
-
-
-def test_a_state_whose_projection_fails_or_that_is_not_to_be_kept_starts_again():
-    """At the origin the radius has no gradient."""
-
-    def fall(y0, h):
-        return jnp.where(y0[0] < 0, 0.0, Turning()(y0, h))
-
-    assert np.min(radii(starts(fall, manifold=RADIUS))) >= 1 - 1e-12
-    assert np.min(starts(Turning(), keep=lambda y: y[1] > -0.5)[:, 1]) > -0.5
-
-
-def test_a_network_that_is_wrong_in_the_beginning_leads_nowhere():
-    """Its states would be where y' = y³ explodes: none of its steps is taken."""
-    wild = jax.tree.map(lambda x: 30 * x if eqx.is_inexact_array(x) else x, small_network().core)
-    wild = eqx.tree_at(lambda m: m.core, small_network(), wild)
-    ends = jax.jit(jax.vmap(wild, (0, None)))(Y0S, 1.0)
-    assert np.median(radii(ends)) > 10
-    limit = dict(max_defect=dfc.learned.Pool(near_east).max_defect)
-    assert np.max(radii(starts(wild, lambda t, y, args: y**3, **limit))) <= 2 + 1e-12
 
 
 # ---- Trainings ----
@@ -149,6 +77,29 @@ def test_the_domain_covers_where_the_pool_has_been():
     assert bool(jnp.all(inside(Y0S)))
     corners = jnp.stack([trained.domain.lower, trained.domain.upper])
     assert float(jnp.max(jnp.abs(corners))) <= 2 + 1e-12
+
+
+@pytest.mark.parametrize("options", [dict(mean_steps=1), dict(max_defect=1e-6)])
+def test_states_start_again_by_chance_or_if_the_defect_is_large(options):
+    trained, log = train(pool=dfc.learned.Pool(near_east, **options), epochs=60)
+    assert log.best_epoch == 60
+    assert float(trained.domain.lower[0]) > 0.9
+
+
+def test_states_stay_on_the_manifold_of_their_own_start():
+    """Though the network leaves it in every step."""
+    growing = Turning(jnp.asarray(0.9), 0.05, BOX)
+    kept, free = (
+        train(growing, dfc.learned.Pool(near_east, manifold=manifold), epochs=60)[0].domain
+        for manifold in (RADIUS, None)
+    )
+    assert float(jnp.min(kept.lower)) >= -2 - 1e-12
+    assert float(jnp.min(free.lower)) < -2.2
+
+
+def test_only_states_that_are_to_be_kept_go_on():
+    trained, _ = train(pool=dfc.learned.Pool(near_east, keep=lambda y: y[1] > -0.5), epochs=60)
+    assert -0.5 < float(trained.domain.lower[1]) < -0.4
 
 
 def test_the_domain_is_that_of_the_model_that_is_returned():
@@ -198,6 +149,18 @@ def test_it_learns_where_it_was_never_told_to_look(pool):
 MANY = dfc.FirstIntegral(lambda t, y, args: jnp.ones(3) * jnp.sum(y))
 
 
+PINN = dfc.PINN(EAST, 0.0, 1.0, key=KEY, **SMALL)
+
+
+def integers(key):
+    return jr.randint(key, (2,), 1, 5)
+
+
+class Pair(Turning):
+    def __call__(self, y0, h):
+        return y0, h
+
+
 def pool(sample=near_east, **options):
     return dfc.learned.Pool(sample, **options)
 
@@ -212,19 +175,11 @@ def pool(sample=near_east, **options):
         (lambda: pool(max_defect=0), ValueError, "`max_defect` is 0, but it must be positive"),
         (lambda: train(refresh=None), ValueError, "that is never"),
         (lambda: train(refresh=40), ValueError, "that is never"),
-        (
-            lambda: train(dfc.PINN(EAST, 0.0, 1.0, key=KEY, **SMALL)),
-            ValueError,
-            "leave `sample` out",
-        ),
+        (lambda: train(PINN), ValueError, "leave `sample` out"),
         (lambda: train(small_network(), pool(LORENZ.sample)), ValueError, "of 2 numbers, but was"),
-        (lambda: train(Own(lambda y0, h: (y0, h))), ValueError, "`model` returns the structure"),
+        (lambda: train(Pair(jnp.array(1.0))), ValueError, "`model` returns the structure"),
         (lambda: train(pool=pool(manifold=MANY)), ValueError, "3 scalar constraints, but the"),
-        (
-            lambda: train(pool=pool(lambda key: jr.randint(key, (2,), 1, 5))),
-            TypeError,
-            "a `Pool` needs real floating-point states",
-        ),
+        (lambda: train(pool=pool(integers)), TypeError, "needs real floating-point states"),
     ],
 )
 def test_mistakes_are_named(make, error, match):
