@@ -42,6 +42,7 @@ NETWORKS = {
     "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
     "transformed": dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.125)),
     "family": flow_map(args_domain=dfc.learned.Box({"a": 0.5}, {"a": jnp.array(1.5)})),
+    "single": dfc.learned.single_precision(flow_map()),
     "both": dfc.learned.Repeated(dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.0)), 2),
 }
 

@@ -48,27 +48,11 @@ def test_symmetries_leave_the_inputs_and_turn_the_basis(order):
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_its_basis_spans_what_the_vector_field_can_do():
-    y0s = states(system=VORTICES)
-    frames = FRAMES(y0s)
-    rates = jax.vmap(lambda y: VORTICES.vector_field(0.0, y, None))(y0s).reshape(len(y0s), 6)
-    coefficients = jax.vmap(dfc.learned.Frame.measure)(frames, rates)
-    again = jnp.einsum("snm,sm->sn", frames.basis, coefficients) * frames.clock[:, None]
-    np.testing.assert_allclose(again, rates, atol=1e-12)
-
-
 def test_the_closest_pair_is_first():
     y = jnp.array([[0.0, 0.0], [5.0, 0.0], [0.0, 0.5]])
     frame = FRAMES(y[None])
     np.testing.assert_allclose(frame.clock, 4.0, rtol=1e-14)
     np.testing.assert_allclose(frame.inputs[0, 2], 0.5 / np.hypot(5.0, 0.25), rtol=1e-14)
-
-
-@pytest.mark.parametrize("strengths", [(1.0, 1.0), (1.0, 1.0, 2.0), (1.0, 1.0, 1.0, 1.0)])
-def test_other_vortices_have_no_such_frame(strengths):
-    system = dfc.systems.PointVortices(strengths)
-    with pytest.raises(ValueError, match="three vortices of equal strengths"):
-        system.frame(system.y0)
 
 
 # ---- Flow maps with a frame ----
@@ -109,21 +93,6 @@ def test_its_domain_is_one_of_shapes():
     np.testing.assert_array_equal(contains(0.01 * y0s), False)
 
 
-def test_wrong_frames_are_named():
-    y0s = states(5, VORTICES)
-    options = dict(key=jr.key(0), **SMALL)
-    with pytest.raises(TypeError):
-        dfc.DeepONet(y0s, 1.0, frame=1.0, **options)
-    with pytest.raises(TypeError, match=r"must return a `diffrax_conserve\.learned\.Frame`"):
-        dfc.DeepONet(y0s, 1.0, frame=lambda y: y, **options)
-    with pytest.raises(ValueError, match=r"`\(6, m\)`"):
-        dfc.DeepONet(y0s, 1.0, frame=lambda y: dfc.learned.Frame(y[0], jnp.ones((3, 2))), **options)
-    with pytest.raises(ValueError, match="cannot have a `layer`"):
-        framed(layer=dfc.learned.ConservativeLayer(VORTICES.manifold))
-    with pytest.raises(ValueError, match="for states of 6 numbers"):
-        framed()(jnp.ones(4), 0.1)
-
-
 # ---- Repeated ----
 
 
@@ -143,22 +112,25 @@ def test_a_repeated_flow_map_is_its_steps_one_after_the_other():
     np.testing.assert_allclose(gradient, chained, rtol=1e-12)
 
 
-def test_a_flow_map_without_a_domain_repeated():
-    class Still(eqx.Module):
-        max_step: float = 1.0
+# ---- What is refused ----
 
-        def __call__(self, y0, h):
-            return y0
-
-    repeated = dfc.learned.Repeated(Still(), 2)
-    assert repeated.order == 0
-    assert repeated.domain is None
+Frame, OTHERS = dfc.learned.Frame, dfc.systems.PointVortices((1.0, 1.0))
+LAYER = dfc.learned.ConservativeLayer(VORTICES.manifold)
 
 
-def test_wrong_repetitions_are_named():
-    with pytest.raises(ValueError, match="`count` must be a positive integer"):
-        dfc.learned.Repeated(flow_map(), 0)
-    with pytest.raises(TypeError, match="which is no flow map"):
-        dfc.learned.Repeated(lambda y0, h: y0, 2)
-    with pytest.raises(ValueError, match="Train its inner"):
-        dfc.fit(dfc.learned.Repeated(flow_map(), 2), LORENZ.vector_field, key=jr.key(0))
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda: OTHERS.frame(OTHERS.y0), ValueError, "three vortices of equal strengths"),
+        (lambda: framed(frame=1.0), TypeError, None),
+        (lambda: framed(frame=lambda y: y), TypeError, r"must return a .*learned\.Frame`"),
+        (lambda: framed(frame=lambda y: Frame(y[0], jnp.ones((3, 2)))), ValueError, r"`\(6, m\)`"),
+        (lambda: framed(layer=LAYER), ValueError, "cannot have a `layer`"),
+        (lambda: framed()(jnp.ones(4), 0.1), ValueError, "for states of 6 numbers"),
+        (lambda: dfc.learned.Repeated(flow_map(), 0), ValueError, "`count` must be a positive"),
+        (lambda: dfc.learned.Repeated(lambda y0, h: y0, 2), TypeError, "which is no flow map"),
+    ],
+)
+def test_mistakes_are_named(make, error, match):
+    with pytest.raises(error, match=match):
+        make()

@@ -10,7 +10,7 @@ from jax.extend.core import jaxprs_in_params
 
 import diffrax_conserve as dfc
 
-from ..learned import CORES, LORENZ, flow_map, solution, states, unchecked
+from ..learned import CORES, LORENZ, flow_map, states, unchecked
 from ..problems import drift_of
 
 EPS32 = float(np.finfo(np.float32).eps)
@@ -52,12 +52,6 @@ def test_only_the_network_is_rounded(core):
     np.testing.assert_array_equal(single(LORENZ.y0, 0.0), LORENZ.y0)
 
 
-def test_its_derivatives(pair):
-    exact, rounded = (jax.jit(jax.jacobian(lambda y, f=f: f(y, 0.2)))(LORENZ.y0) for f in pair)
-    assert rounded.dtype == jnp.float64
-    np.testing.assert_allclose(rounded, exact, rtol=0, atol=32 * EPS32)
-
-
 def test_what_is_conserved_is_so_to_roundoff_of_the_state(pair):
     _, single = pair
     solver = dfc.ManifoldProjection(unchecked(single), LORENZ.manifold)
@@ -74,20 +68,3 @@ def test_inside_other_flow_maps_and_solvers(pair):
     for within in (lambda f: dfc.learned.Repeated(f, 2), dfc.DeepONetSolver, lambda f: (f, 1.0)):
         assert eqx.tree_equal(dfc.learned.single_precision(within(network)), within(single))
     assert eqx.tree_equal(dfc.learned.single_precision(single), single)
-
-
-def test_its_file(pair, tmp_path):
-    _, single = pair
-    single = eqx.tree_at(lambda f: f.taylor, single, dfc.learned.Taylor(LORENZ.vector_field, 1))
-    dfc.save(tmp_path / "single.network", single)
-    assert eqx.tree_equal(dfc.load(tmp_path / "single.network"), single)
-
-
-def test_what_has_no_network():
-    with pytest.raises(TypeError, match="contains no `DeepONet`"):
-        dfc.learned.single_precision(solution())
-
-
-def test_training_needs_the_precision_of_the_state(pair):
-    with pytest.raises(TypeError, match="Train it in double precision"):
-        dfc.fit(pair[1], LORENZ.vector_field, key=jax.random.key(0), sample=LORENZ.sample)

@@ -198,13 +198,9 @@ def test_states_follow_the_default_precision():
             assert {x.dtype for x in leaves} == {jnp.dtype(jnp.float32)}
 
 
-@pytest.mark.parametrize("ts", [1.0, [], [[0.0, 1.0]]])
-def test_reference_times_must_be_a_list_of_times(ts):
-    with pytest.raises(ValueError, match="`ts` must be a one-dimensional array"):
-        systems.HarmonicOscillator().reference(jnp.asarray(ts))
-
-
-@pytest.mark.parametrize("ts", [[-1.0, 0.0], [1.0, 0.5]])
-def test_reference_times_must_not_decrease(ts, errors_raise):
+def test_times_of_a_reference_are_a_list_and_do_not_decrease(errors_raise):
+    for ts in (1.0, [], [[0.0, 1.0]]):
+        with pytest.raises(ValueError, match="`ts` must be a one-dimensional array"):
+            systems.HarmonicOscillator().reference(jnp.asarray(ts))
     with pytest.raises(eqx.EquinoxRuntimeError, match="non-decreasing"):
-        systems.HarmonicOscillator().reference(jnp.asarray(ts))
+        systems.HarmonicOscillator().reference(jnp.array([1.0, 0.5]))

@@ -24,13 +24,12 @@ def test_every_exported_system_is_listed():
 
 @pytest.mark.parametrize(
     ("wrong", "right"),
-    [("keplar", "kepler"), ("Rigid_Body", "rigid-body"), ("lorenz", "conservative-lorenz")],
+    [
+        ("keplar", "Did you mean .*'kepler'"),
+        ("Rigid_Body", "Did you mean .*'rigid-body'"),
+        ("zzz", "The catalogue holds: harmonic-oscillator, rigid-body"),
+    ],
 )
 def test_an_unknown_name_is_answered_with_the_close_ones(wrong, right):
-    with pytest.raises(ValueError, match=f"Did you mean .*'{right}'"):
+    with pytest.raises(ValueError, match=right):
         systems.get(wrong)
-
-
-def test_a_name_like_no_other_is_answered_with_the_catalogue():
-    with pytest.raises(ValueError, match="The catalogue holds: harmonic-oscillator, rigid-body"):
-        systems.get("zzz")

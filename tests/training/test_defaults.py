@@ -9,7 +9,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, flow_map, states
+from ..learned import LORENZ, flow_map, states
 
 KEY = jr.key(5)
 
@@ -41,16 +41,6 @@ def test_a_flow_map_gets_the_slope_of_the_field():
 )
 def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
     assert trained(field, **options).taylor is None
-
-
-def test_the_paper_is_one_name():
-    paper = dfc.learned.paper
-    network = paper.deeponet(states(), 0.25, key=KEY)
-    assert isinstance(network.core, dfc.learned.Product)
-    assert {net.weights[0].shape[-1] for net in (network.core.branch, network.core.trunk)} == {40}
-    assert paper.recipe(network).taylor == 0
-    pinn = paper.pinn(EAST, 0.0, 1.0, key=KEY)
-    assert (pinn.nets.weights[0].shape[-1], len(pinn.nets.weights), pinn.windows) == (40, 5, 1)
 
 
 def test_a_limited_time_is_kept():

@@ -170,6 +170,7 @@ def test_the_losses():
 
 
 RECIPE, WITHOUT_WEIGHTS = dfc.learned.Recipe, dfc.learned.FlowMap(lambda y0, h: y0, 1.0)
+SINGLE = dfc.learned.single_precision(flow_map())
 NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_field)
 
 
@@ -181,6 +182,7 @@ NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_fi
         (lambda: refuse(LAYER), TypeError, "max_step"),
         (lambda: refuse(WITHOUT_WEIGHTS, sample=LORENZ.sample), ValueError, "no weights of its"),
         (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
+        (lambda: refuse(SINGLE, **TAYLOR), TypeError, "Train it in double precision"),
         (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data`"),
         (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
         (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),
