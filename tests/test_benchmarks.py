@@ -124,24 +124,6 @@ def test_the_results_are_what_the_pages_show():
         assert any(f"<!-- begin: {name} -->" in page for page in pages)
 
 
-@pytest.mark.slow
-def test_the_figures_show_every_curve(tmp_path):
-    report = benchmark("report")
-    results = report.read_results()
-    report.write_figures(results, tmp_path)
-    assert {x.name for x in tmp_path.iterdir()} == {
-        f"{name}.{suffix}" for name in ("work-precision", "scaling") for suffix in ("png", "svg")
-    }
-    figure = report.figures.work_precision(results["work_precision"])
-    (ax,) = figure.axes
-    shown = set(report.figures.SHOWN)
-    assert len(shown) <= 6
-    assert shown <= set(results["work_precision"]["parts"]["kepler"]["curves"])
-    curves = {line.get_label() for line in ax.get_lines() if not line.get_label().startswith("_")}
-    assert curves == shown
-    assert {text.get_text() for text in ax.texts} == shown
-
-
 def test_the_drift_is_flat():
     """Of the recorded run of a hundred million steps."""
     for row in json.loads(benchmark("long_run").RESULTS.read_text()):

@@ -44,7 +44,6 @@ def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
 
 
 SITE = [page for page in PAGES if page.name != "README.md"]
-GUIDES = [page for page in SITE if page.parent.name != "api"]
 
 
 def shown(file):
@@ -52,29 +51,16 @@ def shown(file):
     return CHECK.sub("", file.read_text(encoding="utf-8"))
 
 
-def test_there_are_few_pages():
+def test_pages_are_few_and_short():
+    """And tables fit on a screen; what only runs prints nothing."""
     assert len(SITE) <= 26
-
-
-@pytest.mark.parametrize("file", GUIDES, ids=lambda file: file.stem)
-def test_guides_are_short(file):
-    assert len(shown(file).split()) <= 900
-
-
-def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 90
-
-
-@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
-def test_what_only_runs_prints_nothing(page):
-    text = page.file.read_text(encoding="utf-8")
-    assert not [found for found in CHECK.findall(text) if "```text" in found]
-
-
-@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(ROOT).as_posix())
-def test_tables_fit_on_a_screen(file):
-    heads = re.findall(r"^(\|.*\|)\n\|[-|: ]+\|$", file.read_text(encoding="utf-8"), re.MULTILINE)
-    assert [head for head in heads if head.count("|") - 1 > 7] == []
+    for file in PAGES:
+        text = file.read_text(encoding="utf-8")
+        heads = re.findall(r"^(\|.*\|)\n\|[-|: ]+\|$", text, re.MULTILINE)
+        assert [head for head in heads if head.count("|") - 1 > 7] == [], file
+        assert [found for found in CHECK.findall(text) if "```text" in found] == [], file
+        assert file.parent.name == "api" or len(shown(file).split()) <= 900, file
 
 
 def names(code, context):
@@ -100,19 +86,6 @@ def test_what_is_shown_needs_nothing_that_is_not(file):
         if isinstance(node, ast.FunctionDef | ast.ClassDef)
     }
     assert not (only_there | defined) & names(visible, ast.Load)
-
-
-def test_what_only_runs_is_not_on_the_site():
-    strip = runpy.run_path(str(ROOT / "docs" / "hooks.py"))["on_page_markdown"]
-    text = "before\n\n<!-- check\n```python\nassert x\n```\n-->\n\nafter\n"
-    assert [block.code for block in blocks(text, 1, "python")] == ["assert x\n"]
-    assert strip(text) == "before\n\nafter\n"
-
-
-def test_names_in_a_figure_are_apart():
-    apart = runpy.run_path(str(ROOT / "docs" / "drawing.py"))["_apart"]
-    moved = apart([3.0, 50.0, 1.0, 2.0], 10.0)
-    assert list(moved) == [12.0, 50.0, -8.0, 2.0]
 
 
 def test_figures_are_shown():

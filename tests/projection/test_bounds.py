@@ -107,9 +107,6 @@ def test_no_amount_is_negative_and_every_balance_holds(kind, count):
     assert jnp.quantile(residual, 0.999) <= 4 * EPS
 
 
-SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-
-
 @SIMPLIFIED_BY_DEFAULT
 def test_derivatives_are_those_of_differences(kind):
     """With a component at each bound, in a metric, and through both."""
@@ -172,15 +169,3 @@ def test_a_solve_stays_within_the_bounds_between_its_steps_too():
     assert jnp.min(solve()) < -0.1
     assert jnp.min(kept) >= 0
     assert jnp.max(jnp.abs(jnp.sum(kept, 1) - 1)) < 4e-15
-
-
-def test_mistakes_are_named():
-    with pytest.raises(ValueError, match="`lower` is 1"):
-        dfc.SimplifiedNewton(lower=1.0, upper=0.0)
-    with pytest.raises(ValueError, match="`lower` has the structure"):
-        dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(lower=(0.0, 0.0)))
-    with pytest.raises(ValueError, match="`upper` has a leaf of shape"):
-        dfc.project(SPHERE, jnp.ones(3), projection=dfc.Newton(upper=jnp.ones(2)))
-    bounded = dfc.SimplifiedNewton(lower=0.0)
-    with pytest.raises(ValueError, match="`projection` has bounds"):
-        dfc.ManifoldProjection(dfx.Euler(), SPHERE, projection=bounded, every=2)
