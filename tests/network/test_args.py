@@ -75,7 +75,7 @@ def test_a_repeated_flow_map_hands_args_on():
 
 
 def test_derivatives_by_args_are_those_of_differences():
-    dct.assert_gradients(lambda a: solve(family(), a).ys[0], ARGS, rtol=1e-6, forward=False)
+    dct.assert_gradients(lambda a: solve(family(), a).ys[0], ARGS, rtol=1e-7, forward=False)
 
 
 def test_draws_are_in_the_box_and_everywhere():

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
 
 from ..problems import drift_of, evaluated
 
@@ -59,14 +58,6 @@ def test_relaxation_keeps_the_energy_at_every_saved_time():
     np.testing.assert_allclose(energies, energy(0, Y0, ONE), atol=4e-15)
 
 
-@pytest.mark.slow
-def test_the_derivative_of_relaxation_is_that_of_its_solve():
-    def run(y0, args):
-        return solve(RELAXED, y0, args).ys[-1]
-
-    dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=False)
-
-
 class Seen(dfc.AbstractProjection):
     """Moves nothing, and checks what it sees against what the solver knows."""
 
@@ -82,13 +73,11 @@ class Seen(dfc.AbstractProjection):
         return y, problem.judge(candidate, y, atol=1.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("t1", [1.0, -1.0], ids=["forwards", "backwards"])
-def test_a_projection_sees_the_step_of_every_candidate(t1):
+def test_a_projection_sees_the_step_of_every_candidate():
+    t1 = -1.0
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())
     saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 23), dense=True)
-    # Arrays: for other times nothing is compiled anew.
-    times = {"t1": jnp.array(t1), "dt0": jnp.array(0.1 * np.sign(t1)), "saveat": saveat}
+    times = {"t1": t1, "dt0": -0.1, "saveat": saveat}
     sol, plain = solve(solver, **times), solve(dfx.Bosh3(), **times)
     assert sol.result == dfx.RESULTS.successful
     np.testing.assert_allclose(sol.ys, plain.ys, atol=1e-14)
@@ -110,17 +99,13 @@ def test_what_asks_for_no_step_gets_none_and_saves_none():
     assert sol.interpolation.infos["error"] is None
 
 
-def test_outside_a_solve_there_is_no_step():
-    with pytest.raises(AttributeError, match="y0"):
-        dfc.project(ENERGY, Y0, args=ONE, value=0.0, projection=Relaxation())
-
-
 def test_what_is_no_solution_is_a_failure():
-    class Lazy(dfc.AbstractProjection):
-        metric: None = None
-
+    class Lazy(Unseeing):
         def solve(self, problem, candidate):
             return candidate, problem.judge(candidate, candidate)
 
     solver = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=Lazy())
     assert solve(solver, dt0=0.3, throw=False).result != dfx.RESULTS.successful
+    # Outside a solve there is no step.
+    with pytest.raises(AttributeError, match="y0"):
+        dfc.project(ENERGY, Y0, args=ONE, value=0.0, projection=Relaxation())
