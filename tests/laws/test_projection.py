@@ -69,17 +69,6 @@ def linear_combinations_of_the_integrals_change_nothing(system, y, displacement)
     return ok1 & ok2, got, expected
 
 
-def a_monotone_function_of_an_integral_changes_nothing(system, y, displacement):
-    candidate, expected, ok1 = plain(system, y, displacement)
-
-    def change(fn, *args):
-        value = fn(*args)
-        return value + value**3
-
-    got, ok2 = project(mapped(system.manifold, change), candidate, y)
-    return ok1 & ok2, got, expected
-
-
 def seen_through(system, y, displacement, there, back):
     """The projection in other coordinates `z = there(y)`, mapped back."""
     candidate, expected, ok1 = plain(system, y, displacement)
@@ -157,7 +146,6 @@ LAWS = [
     idempotent,
     a_state_on_the_manifold_is_untouched,
     linear_combinations_of_the_integrals_change_nothing,
-    a_monotone_function_of_an_integral_changes_nothing,
     rotations_of_the_coordinates_commute,
     the_unit_of_the_state_is_free,
     frozen_components_stay,
