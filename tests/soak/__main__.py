@@ -28,7 +28,7 @@ from .oracle import Tally
 
 ROOT = Path(__file__).parents[2]
 # How much of the count is for each attack.
-SHARES = {"far": 0.5, "ordinary": 0.2, "gradients": 0.05, "nan": 0.249, "ending": 0.001}
+SHARES = {"far": 0.5, "ordinary": 0.25, "nan": 0.249, "ending": 0.001}
 # Most of the time goes into compilation, which takes half as long with XLA's older emitters.
 OLDER_EMITTERS = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
 GRACE = 60.0  # seconds for an interpreter to start
