@@ -281,21 +281,6 @@ def hang_the_double_pendulum_in_a_gravity_of_1(package):
     package.method("DoublePendulum.__init__", mutate)
 
 
-@noticed_by("tests/systems/test_paper.py", "-k", "printed")
-def turn_the_rigid_body_by_its_angular_velocity(package):
-    def vector_field(self, t, y, args):
-        i1, i2, i3 = self.inertia
-        return jnp.stack(
-            [
-                (i2 - i3) / i1 * y[1] * y[2],
-                (i3 - i1) / i2 * y[2] * y[0],
-                (i1 - i2) / i3 * y[0] * y[1],
-            ]
-        )
-
-    package.method("RigidBody.vector_field", lambda _: vector_field)
-
-
 # ---- Learned solvers ----
 
 

@@ -117,37 +117,27 @@ def test_derivatives_are_those_of_differences():
     dct.assert_gradients(end, Y0, ARGS, rtol=1e-6, forward=False)
 
 
-COUPLING = 0.7
-
-
-def coupled(t, y, args):
-    """Two oscillators, of which the second one is damped."""
-    q, v, *_ = y
-    force = COUPLING * (q[1] - q[0])
-    return v, jnp.stack([-q[0] + force, -4 * q[1] - force - 0.2 * v[1]])
-
-
-def energies(t, y, args):
-    q, v, *_ = y
-    return v**2 / 2 + jnp.array([1.0, 4.0]) * q**2 / 2
-
-
-def powers(t, y, args):
-    q, v, *_ = y
-    force = COUPLING * (q[1] - q[0])
-    return jnp.stack([force * v[0], -force * v[1] - 0.2 * v[1] ** 2])
-
-
 def test_a_manifold_of_balances_and_integrals():
-    """Several balances in an array, next to an integral without a rate."""
+    """Two oscillators that exchange energy, of which the second one is damped; next to an integral
+    without a rate."""
+
+    def field(t, y, args):
+        q, v, constant = y
+        force = 0.7 * (q[1] - q[0])
+        return v, jnp.stack([-q[0] + force, -4 * q[1] - force - 0.2 * v[1]]), 0 * constant
+
+    def energies(t, y, args):
+        return y[1] ** 2 / 2 + jnp.array([1.0, 4.0]) * y[0] ** 2 / 2
+
+    def powers(t, y, args):
+        q, v, _ = y
+        force = 0.7 * (q[1] - q[0])
+        return jnp.stack([force * v[0], -force * v[1] - 0.2 * v[1] ** 2])
+
     manifold = {
         "energies": dfc.FirstIntegral(energies, rate=powers),
         "constant": dfc.FirstIntegral(lambda t, y, args: y[2]),
     }
-
-    def field(t, y, args):
-        return *coupled(t, y, args), jnp.zeros(())
-
     y0 = (jnp.array([1.0, 0.2]), jnp.array([0.1, 0.5]), jnp.array(3.0))
     solution = solve(y0, None, field=field, manifold=manifold)
     assert worst(solution, manifold, None) <= 16 * EPS

@@ -141,19 +141,3 @@ def test_every_solver_stays_on_the_manifold(name):
     assert largest(drift_of(sol, manifold)) <= 4e-15
     moved = jax.tree.map(lambda y, start: jnp.abs(y[-1] - start), sol.ys, y0)
     assert largest(moved) > 1e-2
-
-
-@pytest.mark.slow
-def test_ito_and_stratonovich_paths_agree():
-    """Projection leaves the interpretation of the noise alone: on one Brownian path, projected
-    Euler-Maruyama with the Itô drift and projected Heun without it end at the same place."""
-
-    def final(solver, drift):
-        solver = dfc.ManifoldProjection(solver, SPHERE)
-        terms, y0 = sde(drift, shake), AXIS[::-1]
-        return diffeqsolve(terms, solver, 0.0, 1.0, 2.0**-10, y0).ys[-1]
-
-    ito, stratonovich = final(dfx.Euler(), spin_ito), final(dfx.Heun(), spin)
-    uncorrected = final(dfx.Heun(), spin_ito)
-    assert jnp.max(jnp.abs(ito - stratonovich)) < 5e-3
-    assert jnp.max(jnp.abs(uncorrected - stratonovich)) > 1e-2

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, oscillator, states, unchecked
+from ..learned import DRIVEN0, EAST, Still, Within, oscillator, states, unchecked
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
@@ -83,20 +83,6 @@ def test_the_report_counts_steps_and_knows_the_first_time():
     assert (
         dfc.learned.domain_statistics(solve(solver, t1=1.0, saveat=STATE)).first_outside == jnp.inf
     )
-
-
-def test_the_report_is_seen_through_projection_and_in_a_batch():
-    solver = dfc.ManifoldProjection(unchecked(KNOWS, outside=dfc.learned.Report()), RADIUS)
-
-    def lane(y0):
-        return solve(solver, y0, saveat=STATE)
-
-    sols = jax.vmap(lane)(jnp.stack([EAST, -EAST, 3 * EAST]))
-    found, domain = dfc.statistics(sols), dfc.learned.domain_statistics(sols)
-    np.testing.assert_array_equal(found.num_projections, [10, 10, 10])
-    np.testing.assert_array_equal(domain.first_outside, [2.0, 0.0, 0.0])
-    assert domain.num_outside[0] < domain.num_outside[2]
-    assert jnp.all(found.residual_after < 4e-15)
 
 
 def limited(max_error, error=1e-3):

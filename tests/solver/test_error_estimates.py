@@ -123,14 +123,6 @@ def test_the_estimate_is_never_small_where_something_is_not_finite():
     assert jnp.all(jnp.isnan(estimate))
 
 
-def test_float32():
-    network, y0 = jax.tree.map(lambda x: x.astype(jnp.float32), (flow_map(), LORENZ.y0))
-    _, single = step(unchecked(network), y0, jnp.float32(0.25), t0=jnp.float32(0))
-    assert single.dtype == jnp.float32
-    _, double = step(unchecked(flow_map()), LORENZ.y0, 0.25)
-    np.testing.assert_allclose(single, double, rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("order", "sweep", "corrections"),
     [(2, "picard", 0), (0, "newton", 2)],
@@ -216,10 +208,3 @@ def test_steps_longer_than_the_longest_are_rejected():
     lengths = jnp.diff(jnp.where(jnp.isfinite(sol.ts), sol.ts, jnp.nan), prepend=0.0)
     assert jnp.nanmax(lengths) <= 0.25 + 1e-6
     assert jnp.nanmax(lengths) > 0.04
-
-
-def test_a_flow_map_that_small_steps_do_not_help_says_so():
-    """An untrained network: its error is in proportion to the step, however small that is."""
-    solver = unchecked(flow_map())
-    sol = solve(solver, tol=1e-6, dtmin=1e-3, force_dtmin=False, throw=False)
-    assert sol.result == dfx.RESULTS.dt_min_reached
