@@ -1,5 +1,6 @@
-"""Moving frames: a flow map commutes with the symmetries of its equations, whatever its weights."""
+"""Frames: a flow map commutes with the symmetries of its equations, whatever its weights."""
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -134,3 +135,150 @@ LAYER = dfc.learned.ConservativeLayer(VORTICES.manifold)
 def test_mistakes_are_named(make, error, match):
     with pytest.raises(error, match=match):
         make()
+
+
+# ---- The frame of Kepler's problem, and the flow map of the zoo that has it ----
+
+
+KEPLER = dfc.systems.Kepler(mu=1.7)
+Y0S = states(system=KEPLER)
+
+
+def reflected(y, angle=0.7, scale=1.3, mirror=-1.0):
+    """The same orbit turned, seen in a mirror, and larger."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    matrix = jnp.array([[c, -s], [s, c]]) @ jnp.diag(jnp.array([mirror, 1.0]))
+    q, p = y
+    return scale * q @ matrix.T, p @ matrix.T / jnp.sqrt(scale)
+
+
+MOVED = reflected(Y0S)
+
+
+def ellipses(a, e, anomaly, angle=0.0, sense=1.0):
+    """States from the elements of their orbits, by textbook formulas and nothing of the package."""
+    c, s = np.cos(anomaly), np.sin(anomaly)
+    b = a * np.sqrt(1 - e**2) * sense
+    q = np.stack([a * (c - e), b * s], axis=-1)
+    p = np.stack([-a * s, b * c], axis=-1) / (a**1.5 * (1 - e * c))[..., None]
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return tuple(np.einsum("ij...,...j->...i", turn, x) for x in (q, p))
+
+
+def arrays(y):
+    return jax.tree.map(jnp.asarray, y)
+
+
+def anomaly_after(t, a, e, anomaly):
+    """Kepler's equation, by bisection: slow, but it cannot fail."""
+    mean = anomaly - e * np.sin(anomaly) + t / a**1.5
+    lower, upper = mean - 1, mean + 1
+    for _ in range(60):
+        middle = (lower + upper) / 2
+        early = middle - e * np.sin(middle) < mean
+        lower, upper = np.where(early, middle, lower), np.where(early, upper, middle)
+    return (lower + upper) / 2
+
+
+def random_orbits(count, seed=0):
+    """Those that the network of the zoo is for."""
+    rng = np.random.default_rng(seed)
+    elements = {
+        "a": rng.uniform(0.8, 1.2, count),
+        "e": rng.uniform(0.0, 0.6, count),
+        "anomaly": rng.uniform(0, 2 * np.pi, count),
+    }
+    place = {"angle": rng.uniform(0, 2 * np.pi, count), "sense": rng.choice([-1, 1], count)}
+    return elements, place
+
+
+def distances(ys, others):
+    differences = [np.asarray(a) - b for a, b in zip(ys, others, strict=True)]
+    return np.linalg.norm(np.concatenate(differences, axis=-1), axis=-1)
+
+
+# ---- The frame ----
+
+
+def test_its_inputs_are_the_shape_and_the_anomaly():
+    rng = np.random.default_rng(1)
+    e, anomaly = rng.uniform(0, 0.9, 30), rng.uniform(0, 2 * np.pi, 30)
+    y = ellipses(rng.uniform(0.5, 2, 30), e, anomaly)
+    inputs = jax.vmap(dfc.systems.Kepler().frame)(arrays(y)).inputs
+    c = e * np.cos(anomaly)
+    expected = [c, e * np.sin(anomaly) / np.sqrt(1 - c), e**2]
+    np.testing.assert_allclose(inputs, np.stack(expected, axis=1), atol=1e-13)
+
+
+# ---- Flow maps with it ----
+
+
+@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+def test_untrained_it_commutes_with_those_of_kepler(core, order):
+    taylor = dfc.learned.Taylor(KEPLER.vector_field, order) if order else None
+    network = dfc.DeepONet(
+        Y0S, 0.1, taylor=taylor, core=CORES[core], frame=KEPLER.frame, key=jr.key(0), **SMALL
+    )
+    step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
+    found, expected = step(MOVED, 0.1 * 1.3**1.5), reflected(step(Y0S, 0.1))
+    scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in expected)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * scale)
+
+
+def test_its_domain_ends_with_the_eccentricity_and_with_the_distance():
+    network = dfc.load_pretrained("kepler")
+    contains = jax.jit(jax.vmap(lambda y: network.domain.contains(y)))
+    inside = [(1.0, 0.55), (0.35, 0.0), (30.0, 0.5)]
+    for a, e in [*inside, (1.0, 0.65), (0.29, 0.0)]:
+        orbits = ellipses(np.full(50, a), np.full(50, e), np.linspace(0, 6, 50))
+        np.testing.assert_array_equal(contains(arrays(orbits)), (a, e) in inside)
+
+
+# ---- The network of the zoo ----
+
+
+def test_its_step_against_keplers_equation():
+    elements, place = random_orbits(500, seed=1)
+    y0s = arrays(ellipses(**elements, **place))
+    after = elements | {"anomaly": anomaly_after(0.5, **elements)}
+    network = dfc.load_pretrained("kepler")
+    y1s = eqx.filter_jit(jax.vmap(lambda y: network(y, 0.5)))(y0s)
+    error = distances(y1s, ellipses(**after, **place))
+    assert 0 < np.sqrt(np.mean(error**2)) < 1e-6
+    assert np.max(error) < 2e-5
+
+
+def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
+    """Small orbits can start inside and be too fast a quarter later."""
+    rng = np.random.default_rng(3)
+    elements = {
+        "a": np.exp(rng.uniform(np.log(0.05), np.log(20), 4000)),
+        "e": rng.uniform(0, 0.65, 4000),
+        "anomaly": rng.uniform(0, 2 * np.pi, 4000),
+    }
+    y0s = arrays(ellipses(**elements))
+    after = elements | {"anomaly": anomaly_after(0.5, **elements)}
+    network = dfc.load_pretrained("kepler")
+
+    @jax.jit
+    @jax.vmap
+    def step(y):
+        return network(y, 0.5), network.domain.contains(y), network.inside(y, 0.5)
+
+    y1s, starts, stays = step(y0s)
+    error = distances(y1s, ellipses(**after)) / np.maximum(elements["a"], 1)
+    left = np.asarray(starts & ~stays)
+    assert left.sum() > 100
+    assert np.max(error[left]) > 1  # and without that it would be wrong
+    assert np.max(error[np.asarray(stays)]) < 1e-4
+
+    y0 = jax.tree.map(lambda x: x[np.argmax(np.where(left, error, 0))], y0s)
+    system = dfc.systems.Kepler()
+    solver = dfc.DeepONetSolver(network, outside=dfc.learned.Refuse())
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(system.vector_field), solver, 0.0, 0.5, 0.5, y0,
+        saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False,
+    )  # fmt: skip
+    assert sol.result != dfx.RESULTS.successful
+    assert dfc.learned.domain_statistics(sol).num_outside == 1

@@ -1,11 +1,16 @@
-"""Many constraints: the matrix is factored once, and nothing else changes."""
+"""Many constraints, formulas of the user, and half precision."""
 
+import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+
+from ..problems import solve
+from ..thinned import some_of
 
 EPS = float(np.finfo(float).eps)
 BONDS = 150
@@ -85,3 +90,85 @@ def test_the_scale_of_terms_that_do_not_cancel():
     _, info = project(1.001 * y, matrix @ y)
     # The residual is a thousandth of the sum of the moduli.
     np.testing.assert_allclose(info.residual_before, 1e-3, rtol=0.01)
+
+
+# ---- A projection that the user writes down is used as it is, and checked ----
+
+
+SPHERE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+
+
+def rescale(t, y, args, values):
+    return y * jnp.sqrt(values["square"] / jnp.sum(y**2))
+
+
+def rotation(t, y, args):
+    return args * jnp.stack([y[1], -y[0]])
+
+
+def run(projection, y0, args, **kwargs):
+    solver = dfc.ManifoldProjection(dfc.RK4(), SPHERE, projection=projection)
+    return solve(rotation, solver, y0, args=args, **kwargs)
+
+
+def test_it_agrees_with_newton_and_so_do_its_derivatives():
+    def total(y, value, projection):
+        found, _ = dfc.project(SPHERE, y, value={"square": value}, projection=projection)
+        return jnp.sum(found**3)
+
+    gradient = jax.jit(jax.value_and_grad(total, (0, 1)), static_argnums=2)
+    y, value = jnp.array([3.0, 4.1]), jnp.array(25.0)
+    closed, newton = (gradient(y, value, p) for p in (dfc.ClosedForm(rescale), dfc.Newton()))
+    for a, b in zip(jax.tree.leaves(closed), jax.tree.leaves(newton), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_a_wrong_formula_fails(errors_raise):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="was not reached"):
+        run(dfc.ClosedForm(lambda t, y, args, values: 1.01 * y), jnp.array([3.0, 4.0]), 1.0)
+
+
+def test_wrong_input_is_explained():
+    for fn in (lambda t, y, args, values: (y,), lambda t, y, args, values: y[:1]):
+        with pytest.raises(ValueError, match="`fn` of a `ClosedForm` returned"):
+            run(dfc.ClosedForm(fn), jnp.array([3.0, 4.0]), 1.0)
+
+
+# ---- States of half precision work with every projection, or are refused with a remedy ----
+
+
+SQUARE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+WORK = {
+    "simplified": dfc.SimplifiedNewton(),
+    "bounded": dfc.SimplifiedNewton(lower=-2.0),
+    "formula": dfc.ClosedForm(lambda t, y, args, v: y * jnp.sqrt(v["square"] / jnp.sum(y**2))),
+    "directional": dfc.Directional(),
+    "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
+}
+
+
+@eqx.filter_jit
+def in_half_precision(projection, dtype):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])),
+        dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection),
+        *jnp.array([0, 1, 0.125], dtype),
+        jnp.array([1.0, 0.5], dtype),
+        saveat=dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype)),
+    )
+
+
+@some_of("name", WORK, ids=WORK, period=3)
+def test_it_works_in_half_precision(name):
+    for dtype in (jnp.float16, jnp.bfloat16):
+        ys = in_half_precision(WORK[name], dtype).ys
+        assert ys.dtype == dtype
+        squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
+        # The tolerance, of a scale of three times the square, and what rounding the state costs.
+        limit = (16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
+        np.testing.assert_allclose(squares, 1.25, atol=limit)
+
+
+def test_it_is_refused_before_compilation():
+    with pytest.raises(TypeError, match="Convert the state to float32"):
+        in_half_precision(dfc.Newton(), jnp.float16)
