@@ -5,8 +5,6 @@ import functools
 import hashlib
 import json
 import random
-import subprocess
-import sys
 
 import jax.random as jr
 import pytest
@@ -123,63 +121,3 @@ def test_headers_that_are_none(tmp_path):
         for function in (dfc.learned.read_info, dfc.load):
             with pytest.raises(ValueError, match=r"malformed, though its checksum is right"):
                 function(path)
-
-
-def greedy(path):
-    """Files of about 1 MB that ask for as much memory as they can."""
-    header, body = parts(path, NETWORKS["deeponet"])
-    fields = header["network"]["DeepONet"]
-    nan = float("nan")
-
-    def network(**changed):
-        return header | {"network": {"DeepONet": fields | changed}}
-
-    def arrays(count, *shape):
-        return {"list": [{"array": ["float64", *shape]}] * count}
-
-    return {
-        "a large array": (network(scale={"array": ["float64", 2**40]}), bytes(2**20)),
-        "many large arrays": (network(scale=arrays(9, 2**17 - 1)), bytes(2**20)),
-        "many small arrays": (network(scale=arrays(30_000, 1)), bytes(2**20)),
-        "many empty arrays": (network(scale=arrays(30_000, 0)), b""),
-        "nothing of everything": (network(scale=arrays(900, 0, 2**16)), bytes(2**20)),
-        "a list": (network(scale={"list": [0] * 300_000}), body),
-        "lists": (network(scale={"list": [{"list": []}] * 80_000}), body),
-        "a long series": (
-            network(taylor={"Taylor": fields["taylor"]["Taylor"] | {"order": 9999}}),
-            body,
-        ),
-        "info of dictionaries": (header | {"info": {"a": [{}] * 250_000}}, body),
-        "info of numbers": (header | {"info": {"a": [nan] * 200_000}}, body),
-        "info of keys": (header | {"info": {f"{i}": [] for i in range(80_000)}}, body),
-    }
-
-
-PROBE = """
-import resource, sys
-import diffrax_conserve as dfc
-dfc.load(sys.argv[1])
-start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for path in sys.argv[2:]:
-    for function in (dfc.learned.read_info, dfc.load):
-        try:
-            function(path)
-        except ValueError:
-            pass
-    print(path, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start)
-"""
-
-
-@pytest.mark.slow
-def test_memory(tmp_path):
-    """The peak of a process that reads all of them, over that of one that has read a good file."""
-    good, paths = tmp_path / "good.network", []
-    for name, (header, body) in greedy(good).items():
-        paths.append(tmp_path / f"{name}.network")
-        paths[-1].write_bytes(forged(header, body))
-        assert paths[-1].stat().st_size < 3e6
-    dfc.save(good, NETWORKS["deeponet"])
-    command = [sys.executable, "-c", PROBE, str(good), *map(str, paths)]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    largest = int(out.split()[-1]) * 1024
-    assert largest < 100e6, out

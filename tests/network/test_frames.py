@@ -49,13 +49,6 @@ def test_symmetries_leave_the_inputs_and_turn_the_basis(order):
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_the_closest_pair_is_first():
-    y = jnp.array([[0.0, 0.0], [5.0, 0.0], [0.0, 0.5]])
-    frame = FRAMES(y[None])
-    np.testing.assert_allclose(frame.clock, 4.0, rtol=1e-14)
-    np.testing.assert_allclose(frame.inputs[0, 2], 0.5 / np.hypot(5.0, 0.25), rtol=1e-14)
-
-
 # ---- Flow maps with a frame ----
 
 

@@ -74,12 +74,6 @@ def test_the_ansatz_of_the_deeponet():
     np.testing.assert_allclose(net(y0, h), expected, rtol=1e-14)
 
 
-def test_the_activation_by_name_and_as_a_function():
-    by_name, by_function = solution(activation="sin"), solution(activation=jnp.sin)
-    assert bool(jnp.all(by_name(1.5) == by_function(1.5)))
-    assert not bool(jnp.all(by_name(1.5) == solution()(1.5)))
-
-
 @pytest.mark.parametrize(
     ("make", "error", "match"),
     [
@@ -125,14 +119,6 @@ def test_the_polynomial_of_a_linear_system(order):
     np.testing.assert_allclose(taylor(y0, h), expected, rtol=1e-14)
 
 
-def test_the_polynomial_of_any_state():
-    y0 = {"a": jnp.array(1.0), "b": (jnp.ones(2, jnp.float32),)}
-    taylor = dfc.learned.Taylor(lambda t, y, args: jax.tree.map(lambda x: -x, y), 3)
-    y = taylor(y0, 0.1)
-    assert y["b"][0].dtype == jnp.float32
-    np.testing.assert_allclose(y["a"], 1 - 0.1 + 0.1**2 / 2 - 0.1**3 / 6, rtol=1e-15)
-
-
 @some_of("order", [0, 1, 2, 3], ids="0123", period=2)
 @KINDS
 def test_untrained_it_has_the_order_of_its_polynomial(core, order):
@@ -147,17 +133,6 @@ def test_untrained_it_has_the_order_of_its_polynomial(core, order):
 
 
 # ---- The networks ----
-
-
-def test_concatenated_inputs():
-    network = flow_map(core=dfc.learned.Concatenated)
-    h = 0.2
-    x = jnp.append((LORENZ.y0 - network.shift) / network.scale, 2 * h / 0.25 - 1)
-    first, second, last = network.core.net.weights
-    z = jnp.tanh(jnp.tanh(x @ first) @ second) @ last
-    np.testing.assert_allclose(
-        network(LORENZ.y0, h), LORENZ.y0 + 0.8 * network.scale * z, rtol=1e-14
-    )
 
 
 def test_gated_inputs():

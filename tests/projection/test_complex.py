@@ -49,17 +49,6 @@ def real_field(t, y, args):
 REAL_QUANTA = dfc.FirstIntegral(lambda t, y, args: quanta(t, join(y), args))
 
 
-def test_the_invariance_is_proved():
-    def states(key):
-        parts = jax.random.normal(key, (2, 3))
-        z = parts[0] + 1j * parts[1]
-        return {"z": z[:2], "x": z[2:]}
-
-    assert dfc.check_invariance(field, QUANTA, states, args=ARGS, num_states=5).ok
-    wrong = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y["z"].real ** 2))
-    assert not dfc.check_invariance(field, wrong, states, args=ARGS, num_states=5).ok
-
-
 @eqx.filter_jit
 def solve(projection, y0, vf, manifold):
     # The simplest of all solvers, as what is compared is the projection.

@@ -43,18 +43,6 @@ def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
     assert trained(field, **options).taylor is None
 
 
-def test_a_limited_time_is_kept():
-    """Though a comparison is due only every 1,000 epochs."""
-    network = flow_map()
-    chosen = recipe(network, epochs=3000, check_every=1000)
-    options = dict(key=KEY, sample=LORENZ.sample, recipe=chosen)
-    _, log = dfc.fit(network, LORENZ.vector_field, **options, seconds=0.2)
-    assert log.ended == "seconds"
-    assert log.seconds < 2  # generous, because tests share their processor
-    assert np.any(np.isfinite(log.losses))
-    assert log.best < log.criteria[0]
-
-
 def test_it_goes_on_bit_for_bit_from_between_two_comparisons():
     network = flow_map()
     chosen = recipe(network, epochs=400, check_every=100)

@@ -165,17 +165,3 @@ def test_a_killed_training_goes_on(tmp_path):
     network, options = small_pinn()
     expected, _ = dfc.fit(network, **options)
     assert eqx.tree_equal(dfc.load(result), expected)
-
-
-# ---- What it shows ----
-
-
-def test_progress_has_no_nan(capsys):
-    network, options = small_pinn()
-    dfc.fit(network, **options, progress=True)
-    text = capsys.readouterr().err
-    assert "nan" not in text
-    assert "estimated error" in text
-    assert "s left" in text
-    first = text.splitlines()[0]
-    assert first.startswith("epoch  0 of 40: loss ")
