@@ -10,14 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 
-from .common import (
-    PARALLEL,
-    SYSTEMS,
-    check,
-    every_law_on_every_system,
-    inputs,
-    project,
-)
+from .common import PARALLEL, SYSTEMS, check, every_law_on_every_system, inputs, project
 
 
 def direction(flat, phase):

@@ -2,40 +2,28 @@
 
 import diffrax as dfx
 import equinox as eqx
-import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..problems import drift_of, evaluated, largest
 
-MASSES = jnp.array([1.0, 2.0, 0.7])
-
-
-def chain(t, y, args):
-    """Three masses on nonlinear springs between them: total momentum is kept."""
-    q, v = y
-    s = args * (jnp.diff(q) + jnp.diff(q) ** 3)
-    return v, jnp.array([s[0], s[1] - s[0], -s[1]]) / MASSES
-
-
-def energy(t, y, args):
-    q, v = y
-    x = jnp.diff(q)
-    return jnp.sum(MASSES * v**2) / 2 + args * jnp.sum(x**2 / 2 + x**4 / 4)
+TODA = dfc.systems.get("toda-lattice")
 
 
 def momentum(y):
-    return jnp.sum(MASSES * y[1], axis=-1)
+    return jnp.sum(y[1], axis=-1)
 
 
-ENERGY, TERM = dfc.FirstIntegral(energy), dfx.ODETerm(chain)
-Y0 = jnp.array([0.0, 0.5, -0.3]), jnp.array([0.4, -0.1, 0.9])
+def energy(t, y, args):
+    return args * TODA.energy(t, y, None)
+
+
+ENERGY, TERM, Y0 = dfc.FirstIntegral(energy), dfx.ODETerm(TODA.vector_field), TODA.y0
 ONE = jnp.array(1.0)
 
 
@@ -52,10 +40,10 @@ def test_energy_and_momentum_are_kept_at_every_saved_time():
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True)
     sol = solve(dfx.Bosh3(), saveat=saveat, stepsize_controller=ADAPTIVE)
     assert largest(drift_of(sol, ENERGY, ONE)) < 4e-15
-    np.testing.assert_allclose(momentum(sol.ys), momentum(Y0), rtol=1e-13)
+    np.testing.assert_allclose(momentum(sol.ys), momentum(Y0), atol=1e-13)
     between = evaluated(sol, jnp.linspace(0.0, 3.0, 77))
     energies = jax.vmap(energy, (None, 0, None))(0.0, between, ONE)
-    np.testing.assert_allclose(momentum(between), momentum(Y0), rtol=1e-13)
+    np.testing.assert_allclose(momentum(between), momentum(Y0), atol=1e-13)
     np.testing.assert_allclose(energies, energy(0.0, Y0, ONE), rtol=4e-15)
 
 
@@ -81,25 +69,6 @@ def test_derivatives_agree_with_finite_differences():
         return solve(dfx.Bosh3(), y0, args, t1=0.6, dt0=0.2).ys
 
     dct.assert_gradients(run, Y0, ONE, rtol=1e-6, forward=False)
-
-
-@settings(max_examples=5)
-@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6))
-def test_a_lane_of_a_batch_is_that_lane_alone_and_success_means_kept(numbers):
-    numbers = jnp.array(numbers)
-    y0 = Y0[0] + 0.3 * numbers[:3], Y0[1] + 0.3 * numbers[3:]
-    alone = solve(dfx.Bosh3(), y0, t1=0.5, throw=False)
-    batch = lanes(jax.tree.map(lambda a, b: jnp.stack([a, b, a]), Y0, y0))
-    np.testing.assert_allclose(batch[0][1], alone.ys[0], rtol=1e-8)
-    if alone.result == dfx.RESULTS.successful:
-        end = jax.tree.map(lambda x: x[-1], alone.ys)
-        np.testing.assert_allclose(energy(0, end, ONE), energy(0, y0, ONE), rtol=1e-13)
-        np.testing.assert_allclose(momentum(end), momentum(y0), atol=1e-14)
-
-
-@eqx.filter_jit
-def lanes(y0):
-    return jax.vmap(lambda y: solve(dfx.Bosh3(), y, t1=0.5, throw=False).ys)(y0)
 
 
 def test_a_tangent_direction_is_a_failure():

@@ -29,10 +29,7 @@ SYSTEMS = {
     "populations": FAMILIES["populations"],
     "exponentials": Family(lambda xp, y, a: [xp.exp(y[0]) + a[0] * xp.exp(y[1])], 2),
     "henon-heiles": Family(
-        lambda xp, y, a: [
-            0.5 * sum(x * x for x in y) + y[0] ** 2 * y[1] - y[1] ** 3 / 3,
-        ],
-        4,
+        lambda xp, y, a: [0.5 * sum(x * x for x in y) + y[0] ** 2 * y[1] - y[1] ** 3 / 3], 4
     ),
     "well": Family(lambda xp, y, a: [0.5 * y[1] ** 2 + a[0] / y[0] ** 2], 2, _positive),
     "quartic": Family(lambda xp, y, a: [y[0] ** 4 + a[0] * y[1] ** 2], 2, _normal),

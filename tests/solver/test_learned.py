@@ -117,10 +117,7 @@ def test_random_networks_are_on_the_manifold_or_fail(errors_raise):
         # From nearly nothing to wild.
         factor = 10.0 ** (seed / 3 - 1.5)
         key = jr.key(seed)
-        noisy = jax.tree.map(
-            lambda x, k=key, f=factor: x + f * jr.normal(k, x.shape),
-            network.core,
-        )
+        noisy = jax.tree.map(lambda x, k=key, f=factor: x + f * jr.normal(k, x.shape), network.core)
         ok, drift = run(eqx.tree_at(lambda n: n.core, network, noisy))
         outcomes.append(bool(ok))
         assert not ok or drift <= 1e-14

@@ -8,15 +8,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import (
-    OMEGA0,
-    RIGID_BODY,
-    drift_of,
-    largest,
-    rigid_body,
-    rotational_energy,
-    solve,
-)
+from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body, rotational_energy, solve
 
 STEPS = dfx.SaveAt(t0=True, steps=True, solver_state=True, dense=True)
 

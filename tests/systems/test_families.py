@@ -112,13 +112,7 @@ def test_an_unknown_name_is_answered_with_the_close_ones(wrong, right):
 # ---- Vector fields from what they conserve ----
 
 
-CANONICAL = (
-    "harmonic-oscillator",
-    "double-pendulum",
-    "kepler",
-    "henon-heiles",
-    "toda-lattice",
-)
+CANONICAL = ("harmonic-oscillator", "double-pendulum", "kepler", "henon-heiles", "toda-lattice")
 
 
 @pytest.mark.parametrize("name", CANONICAL)
