@@ -5,9 +5,6 @@ import json
 import sys
 from pathlib import Path
 
-import jax
-import jax.flatten_util as jfu
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,28 +21,6 @@ def benchmark(name):
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
-
-
-# ---- Error against time, and the others ----
-
-
-@pytest.fixture(scope="module")
-def precision():
-    return benchmark("work_precision")
-
-
-@pytest.mark.parametrize("name", ["rigid-body", "kepler"])
-def test_the_others_solve_our_equations(precision, name):
-    system, equations = precision.SYSTEMS[name], precision.peers.EQUATIONS[name]
-    state = np.random.default_rng(0).uniform(0.5, 1.5, equations.size)
-    y = jfu.ravel_pytree(system.y0)[1](jnp.asarray(state))
-    ours, _ = jfu.ravel_pytree(system.vector_field(0.0, y, None))
-    np.testing.assert_allclose(equations.vector_field(0.0, state), ours, rtol=1e-14)
-    entries = zip(system.manifold.values(), equations.integrals, equations.gradients, strict=True)
-    for entry, integral, gradient in entries:
-        np.testing.assert_allclose(integral(*state), entry.fn(0.0, y, None), rtol=1e-14)
-        ours, _ = jfu.ravel_pytree(jax.grad(lambda y, fn=entry.fn: fn(0.0, y, None))(y))
-        np.testing.assert_allclose(gradient(*state), ours, rtol=1e-14)
 
 
 # ---- What the pages show is what was measured ----

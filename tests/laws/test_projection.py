@@ -111,19 +111,6 @@ def frozen_components_stay(system, y, displacement):
     return ok, ravel_pytree(got)[0][:1], ravel_pytree(candidate)[0][:1]
 
 
-@within(1e-13)
-def newton_leads_no_further_than_to_the_state_that_was_displaced(system, y, displacement):
-    """That one is on the manifold too, so the nearest point is at most as far."""
-    candidate = displaced(y, displacement)
-    got, ok = project(system.manifold, candidate, y, dfc.Newton())
-
-    def distance(z):
-        return jnp.linalg.norm(ravel_pytree(z)[0] - ravel_pytree(candidate)[0])
-
-    size = jnp.linalg.norm(ravel_pytree(y)[0])
-    return ok, 1 + jnp.maximum(distance(got) - distance(y), 0) / size, jnp.ones(())
-
-
 def the_correction_is_orthogonal_to_the_flow(system, y, displacement):
     """Since `∇I · f = 0`, and the correction is a combination of gradients at the candidate."""
     candidate, got, ok = plain(system, y, displacement)
@@ -149,7 +136,6 @@ LAWS = [
     rotations_of_the_coordinates_commute,
     the_unit_of_the_state_is_free,
     frozen_components_stay,
-    newton_leads_no_further_than_to_the_state_that_was_displaced,
     the_correction_is_orthogonal_to_the_flow,
     single_precision_agrees_with_double,
 ]

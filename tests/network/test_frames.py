@@ -190,19 +190,6 @@ def distances(ys, others):
     return np.linalg.norm(np.concatenate(differences, axis=-1), axis=-1)
 
 
-# ---- The frame ----
-
-
-def test_its_inputs_are_the_shape_and_the_anomaly():
-    rng = np.random.default_rng(1)
-    e, anomaly = rng.uniform(0, 0.9, 30), rng.uniform(0, 2 * np.pi, 30)
-    y = ellipses(rng.uniform(0.5, 2, 30), e, anomaly)
-    inputs = jax.vmap(dfc.systems.Kepler().frame)(arrays(y)).inputs
-    c = e * np.cos(anomaly)
-    expected = [c, e * np.sin(anomaly) / np.sqrt(1 - c), e**2]
-    np.testing.assert_allclose(inputs, np.stack(expected, axis=1), atol=1e-13)
-
-
 # ---- Flow maps with it ----
 
 
@@ -217,15 +204,6 @@ def test_untrained_it_commutes_with_those_of_kepler(core, order):
     scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in expected)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * scale)
-
-
-def test_its_domain_ends_with_the_eccentricity_and_with_the_distance():
-    network = dfc.load_pretrained("kepler")
-    contains = jax.jit(jax.vmap(lambda y: network.domain.contains(y)))
-    inside = [(1.0, 0.55), (0.35, 0.0), (30.0, 0.5)]
-    for a, e in [*inside, (1.0, 0.65), (0.29, 0.0)]:
-        orbits = ellipses(np.full(50, a), np.full(50, e), np.linspace(0, 6, 50))
-        np.testing.assert_array_equal(contains(arrays(orbits)), (a, e) in inside)
 
 
 # ---- The network of the zoo ----

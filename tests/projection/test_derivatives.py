@@ -121,33 +121,21 @@ def test_a_lane_that_failed_spoils_no_other(projection):
 def test_derivatives_are_linear_or_nan():
     """Linear in the tangent, also in a very small one; where the constraint has an infinite
     derivative, NaN in both modes."""
-    n = 20
-    axes = jnp.linspace(1.0, 2.0, n)
+    axes = jnp.linspace(1.0, 2.0, 20)
     manifold = dfc.Constraint(lambda t, y, args: jnp.sqrt(y[0]) + jnp.sum(axes * y[1:] ** 2) - 1)
 
     @jax.jit
-    def project(y):
-        return dfc.project(manifold, y, projection=dfc.Newton())[0]
-
-    @jax.jit
-    def both_modes(y, v, w):
-        along = jax.jvp(project, (y,), (v,))[1]
-        (gradient,) = jax.vjp(project, y)[1](w)
-        return along, gradient
+    def both_modes(y, v):
+        project = lambda y: dfc.project(manifold, y, projection=dfc.Newton())[0]  # noqa: E731
+        return jax.jvp(project, (y,), (v,))[1], jax.vjp(project, y)[1](v)[0]
 
     rng = np.random.default_rng(0)
-    y, v, w = (rng.normal(size=n + 1) for _ in range(3))
+    y, v = rng.normal(size=(2, 21))
     y = 0.14 * y
     y[0] = 0.3
-    along, gradient = both_modes(y, v, w)
-    h = 1e-6
-    expected = (project(y + h * v) - project(y - h * v)) / (2 * h)
-    np.testing.assert_allclose(along, expected, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(gradient @ v, w @ along, rtol=1e-11)
-    tiny_along, tiny_gradient = both_modes(y, 1e-14 * v, 1e-14 * w)
-    np.testing.assert_allclose(1e14 * tiny_along, along, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(1e14 * tiny_gradient, gradient, rtol=0, atol=1e-11)
-
-    on_it = np.zeros(n + 1)
+    for found, tiny in zip(both_modes(y, v), both_modes(y, 1e-14 * v), strict=True):
+        assert np.all(np.isfinite(found))
+        np.testing.assert_allclose(1e14 * tiny, found, rtol=0, atol=1e-11)
+    on_it = np.zeros(21)
     on_it[1] = 1
-    assert all(np.all(np.isnan(x)) for x in both_modes(on_it, v, w))
+    assert all(np.all(np.isnan(x)) for x in both_modes(on_it, v))

@@ -13,26 +13,6 @@ from ..problems import solve
 from ..thinned import some_of
 
 EPS = float(np.finfo(float).eps)
-BONDS = 150
-
-
-def bonds(t, q, args):
-    return jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args
-
-
-CHAIN = dfc.Constraint(bonds)
-
-
-def chain(count=BONDS, noise=1e-4):
-    rng = np.random.default_rng(0)
-    d = rng.normal(size=(count, 3))
-    q = np.concatenate([np.zeros((1, 3)), np.cumsum(d / np.linalg.norm(d, axis=1)[:, None], 0)])
-    return jnp.asarray(q + noise * rng.normal(size=q.shape))
-
-
-@jax.jit
-def projected(q, length=1.0):
-    return dfc.project(CHAIN, q, args=length, projection=dfc.SimplifiedNewton())
 
 
 def test_dependent_linear_constraints_against_their_pseudoinverse():
@@ -56,40 +36,6 @@ def test_dependent_linear_constraints_against_their_pseudoinverse():
     np.testing.assert_allclose(found, exact, atol=100 * EPS)
     cosines = np.cos(exact)
     np.testing.assert_allclose(gradients, cosines - cosines @ inverse @ rows, atol=200 * EPS)
-
-
-@pytest.mark.parametrize("near", [1e-6, 1e-8, 1e-10])
-def test_the_derivative_with_nearly_dependent_constraints_is_right_or_nan(near):
-    rng, n, m = np.random.default_rng(0), 200, 132
-    rows, y, v = rng.normal(size=(m, n)), rng.normal(size=n), rng.normal(size=n)
-    rows[-40:] = rows[:40] + near * rng.normal(size=(40, n))
-    _, slope = _slope(rows, y, rows @ y, v)
-    _, _, basis = np.linalg.svd(rows, full_matrices=False)
-    error = np.abs(slope - (v - basis.T @ (basis @ v)))
-    assert np.all(np.isnan(error)) or np.max(error) < 1e-3
-
-
-@jax.jit
-def _slope(rows, y, values, v):
-    def project(y):
-        integrals = dfc.FirstIntegral(lambda t, y, rows: rows @ y)
-        simplified = dfc.SimplifiedNewton()
-        return dfc.project(integrals, y, args=rows, value=values, projection=simplified)[0]
-
-    return jax.jvp(project, (y,), (v,))
-
-
-def test_the_scale_of_terms_that_do_not_cancel():
-    """Their sum is as large as that of their moduli, and so is the roundoff."""
-    rng = np.random.default_rng(1)
-    matrix, y = rng.uniform(0.5, 1.5, (130, 2000)), rng.uniform(0.5, 1.5, 2000)
-    kept = dfc.Constraint(lambda t, y, b: jnp.asarray(matrix) @ y - b)
-    project = jax.jit(lambda y, b: dfc.project(kept, y, args=b, projection=dfc.SimplifiedNewton()))
-    _, info = project(y * (1 + 1e-6 * rng.normal(size=2000)), matrix @ y)
-    assert info.ok
-    _, info = project(1.001 * y, matrix @ y)
-    # The residual is a thousandth of the sum of the moduli.
-    np.testing.assert_allclose(info.residual_before, 1e-3, rtol=0.01)
 
 
 # ---- A projection that the user writes down is used as it is, and checked ----

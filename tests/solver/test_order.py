@@ -4,7 +4,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from ..problems import (
     EXPONENTIAL0,
     KEPLER,
     KEPLER0,
-    drift_of,
     exponential,
     exponential_solution,
     kepler,
@@ -132,14 +130,6 @@ def test_same_steps_and_dense_output(solver):
     assert ours.stats["num_steps"] == theirs.stats["num_steps"]
     for x, y in zip(jtu.tree_leaves(ours.ys), jtu.tree_leaves(theirs.ys), strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
-
-
-def test_projected_and_batched():
-    solver = dfc.ManifoldProjection(dfc.Unrolled(dfx.Bosh3()), KEPLER)
-    y0s = jtu.tree_map(lambda x: x * (1 + 0.02 * jr.normal(jr.key(0), (5, 2))), KEPLER0)
-    sol = jax.jit(jax.vmap(lambda y0: solve(solver, y0)))(y0s)
-    drift = jax.vmap(lambda sol: drift_of(sol, KEPLER))(sol)
-    assert max(float(jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(drift)) < 4e-15
 
 
 @pytest.mark.parametrize("solver", [dfx.Euler(), dfx.Kvaerno5(), "Tsit5", dfc.RK4()])

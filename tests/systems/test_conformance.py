@@ -110,20 +110,6 @@ def test_everything_keeps_the_precision_of_the_state_without_implicit_promotion(
     assert {x.dtype for x in jtu.tree_leaves((out, kept))} == {jnp.dtype(dtype)}
 
 
-@some_systems
-def test_parameters_can_be_differentiated(system):
-    @eqx.filter_jit
-    @eqx.filter_grad
-    def gradient(system):
-        f = system.vector_field(0.0, system.y0, system.args)
-        kept = values(system.manifold, system.y0)
-        return sum(jnp.sum(jnp.sin(x)) for x in jtu.tree_leaves((f, kept)))
-
-    for x in jtu.tree_leaves(gradient(system)):
-        assert np.isfinite(x).all()
-        assert np.all(x != 0)
-
-
 @every_system
 def test_the_parameters_inside_the_manifold_can_be_differentiated(system):
     parameters = jtu.tree_leaves(eqx.filter(system, eqx.is_inexact_array))

@@ -38,13 +38,6 @@ def test_toda_traces_begin_with_henons_integral():
     np.testing.assert_allclose(traces[0], henon)
 
 
-def test_predators_and_prey_rest_at_their_equilibrium():
-    system = systems.LotkaVolterra(alpha=2.0, beta=3.0, gamma=4.0, delta=5.0)
-    rest = jnp.array([4 / 5, 2 / 3])
-    np.testing.assert_allclose(system.vector_field(0.0, rest, None), 0.0, atol=1e-15)
-    np.testing.assert_allclose(jax.grad(system.first_integral, 1)(0.0, rest, None), 0.0, atol=1e-15)
-
-
 def test_pendulum_energy_is_conserved_only_on_the_constraints():
     system = systems.CartesianPendulum()
     y = (jnp.array([1.0, 0.5]), jnp.array([0.3, 0.2]))  # q · v is not zero

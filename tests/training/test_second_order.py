@@ -1,7 +1,5 @@
 """Second-order training, windows, and states along solutions."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -81,17 +79,6 @@ def flow_map(core=dfc.learned.Concatenated, order=1):
     states = jax.vmap(LORENZ.sample)(jr.split(jr.key(7), 200))
     taylor = dfc.learned.Taylor(LORENZ.vector_field, order)
     return states, dfc.DeepONet(states, 0.25, width=12, depth=1, core=core, taylor=taylor, key=KEY)
-
-
-def test_spring_trains_a_flow_map():
-    states, network = flow_map()
-    recipe = dfc.learned.second_order(network, epochs=60)
-    recipe = dataclasses.replace(recipe, points=60)
-    options = dict(key=KEY, sample=states, recipe=recipe)
-    trained, log = dfc.fit(network, LORENZ.vector_field, **options)
-    assert log.best < 1e-4 * log.criteria[0]
-    again, _ = dfc.fit(network, LORENZ.vector_field, **options)
-    assert eqx.tree_equal(trained, again)
 
 
 # ---- Recipes ----
