@@ -15,6 +15,8 @@ from hypothesis import given
 
 import diffrax_conserve as dfc
 
+from ..problems import KEPLER, kepler
+
 # ---- Success ----
 
 PROJECTIONS = {
@@ -116,15 +118,6 @@ def test_what_underflows_is_no_success(dtype, share, angle, off):
 # ---- Derivatives ----
 
 
-def kepler(t, y, args):
-    q, p = y
-    return p, -q / jnp.sum(q**2) ** 1.5
-
-
-ENERGY = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y[1] ** 2) / 2 - jnp.sum(y[0] ** 2) ** -0.5)
-MOMENTUM = dfc.FirstIntegral(lambda t, y, args: y[0][0] * y[1][1] - y[0][1] * y[1][0])
-
-
 def orbit(solver, e, direction):
     """The end of an arc, and its derivative along a change of the initial state."""
     y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
@@ -140,7 +133,7 @@ def orbit(solver, e, direction):
 @eqx.filter_jit
 @eqx.filter_vmap(in_axes=(None, 0, 0))
 def tangents(projection, e, direction):
-    solver = dfc.ManifoldProjection(dfc.RK4(), (ENERGY, MOMENTUM), projection=projection)
+    solver = dfc.ManifoldProjection(dfc.RK4(), KEPLER, projection=projection)
     exact = orbit(dfx.Dopri8(), e, direction)
     return orbit(solver, e, direction), exact
 
@@ -168,7 +161,7 @@ def long_steps(e, dt):
     y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
     solution = dfx.diffeqsolve(
         dfx.ODETerm(kepler),
-        dfc.ManifoldProjection(dfc.RK4(), (ENERGY, MOMENTUM)),
+        dfc.ManifoldProjection(dfc.RK4(), KEPLER),
         0.0,
         6.0,
         dt,
