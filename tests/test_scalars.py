@@ -3,7 +3,6 @@
 import pydoc
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -11,6 +10,7 @@ import numpy as np
 
 import diffrax_conserve as dfc
 
+from .problems import solve
 from .thinned import some_of
 
 MATRIX = np.arange(6.0).reshape(2, 3) / 7
@@ -104,15 +104,10 @@ def test_a_batch_is_printed_by_its_ranges():
 
 
 def test_statistics_print_numbers():
-    sol = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]])),
-        dfc.ManifoldProjection(dfc.RK4(), SPHERE),
-        t0=0.0,
-        t1=1.0,
-        dt0=0.125,
-        y0=jnp.array([1.0, 0.0]),
-        saveat=dfx.SaveAt(t1=True, solver_state=True),
-    )
+    rotation = lambda t, y, args: jnp.array([-y[1], y[0]])  # noqa: E731
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    solver = dfc.ManifoldProjection(dfc.RK4(), SPHERE)
+    sol = solve(rotation, solver, jnp.array([1.0, 0.0]), dt0=0.125, saveat=saveat)
     text = str(dfc.statistics(sol))
     assert text.splitlines()[1] == "  num_projections  8"
     assert "worst" not in text

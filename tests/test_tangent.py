@@ -1,7 +1,6 @@
 """Tangent fields: mechanisms from masses, forces and position constraints alone."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,7 +9,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from .problems import largest
+from .problems import largest, solve
 
 EPS = np.finfo(np.float64).eps
 KEYS = jr.split(jr.key(0), 20)
@@ -69,16 +68,9 @@ ANGLES = jnp.array([1.2, -0.4]), jnp.array([0.3, 1.0])
 T1 = 2.0
 
 
-@eqx.filter_jit
-def compiled(field, solver, y0, dt0):
-    term = dfx.ODETerm(field)
-    ys = dfx.diffeqsolve(term, solver, 0.0, T1, dt0, y0, max_steps=None).ys
-    return jax.tree.map(lambda y: y[-1], ys)
-
-
 def final(field, solver, y0, steps=2000):
-    """Compiled once for all numbers of steps."""
-    return compiled(field, solver, y0, jnp.asarray(T1 / steps))
+    ys = solve(field, solver, y0, t1=T1, dt0=T1 / steps, max_steps=None).ys
+    return jax.tree.map(lambda y: y[-1], ys)
 
 
 def distance(a, b):

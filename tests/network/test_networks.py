@@ -14,7 +14,7 @@ from jax.extend.core import jaxprs_in_params
 import diffrax_conserve as dfc
 
 from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, oscillator, solution, states, unchecked
-from ..problems import drift_of
+from ..problems import drift_of, solve
 from ..thinned import some_of
 
 KEY = jr.key(0)
@@ -169,10 +169,8 @@ def test_a_solve_across_windows():
     end = pinn.window(0)(2.0)
     pinn = eqx.tree_at(lambda p: p.y0s, pinn, jnp.stack([EAST, end]))
     ts = jnp.linspace(0, 4, 9)
-    ys = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(oscillator), dfc.PINNSolver(pinn), 0.0, 4.0, 0.4, EAST,
-        saveat=dfx.SaveAt(ts=ts),
-    ).ys  # fmt: skip
+    options = dict(t1=4.0, dt0=0.4, saveat=dfx.SaveAt(ts=ts))
+    ys = solve(oscillator, dfc.PINNSolver(pinn), EAST, **options).ys
     np.testing.assert_allclose(ys, jax.jit(jax.vmap(pinn))(ts), atol=1e-8)
 
 
@@ -234,10 +232,8 @@ def test_only_the_network_is_rounded(core):
 def test_what_is_conserved_is_so_to_roundoff_of_the_state(pair):
     _, single = pair
     solver = dfc.ManifoldProjection(unchecked(single), LORENZ.manifold)
-    sol = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(LORENZ.vector_field), solver, 0.0, 0.5, 0.05, LORENZ.y0,
-        saveat=dfx.SaveAt(t0=True, steps=True),
-    )  # fmt: skip
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    sol = solve(LORENZ.vector_field, solver, LORENZ.y0, t1=0.5, dt0=0.05, saveat=saveat)
     for drift in jax.tree.leaves(drift_of(sol, LORENZ.manifold)):
         assert np.nanmax(np.abs(drift)) < 4e-15
 

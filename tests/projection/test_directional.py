@@ -1,7 +1,6 @@
 """Projection along the error estimate."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..problems import drift_of, evaluated, largest
 
 TODA = dfc.systems.get("toda-lattice")
@@ -27,10 +27,10 @@ ENERGY, TERM, Y0 = dfc.FirstIntegral(energy), dfx.ODETerm(TODA.vector_field), TO
 ONE = jnp.array(1.0)
 
 
-@eqx.filter_jit
 def solve(inner, y0=Y0, args=ONE, t1=3.0, dt0=0.05, **options):
     solver = dfc.ManifoldProjection(inner, ENERGY, projection=dfc.Directional())
-    return dfx.diffeqsolve(TERM, solver, 0.0, t1, dt0, y0, args, **options)
+    options = dict(t1=t1, dt0=dt0, args=args) | options
+    return problems.solve(TODA.vector_field, solver, y0, **options)
 
 
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)

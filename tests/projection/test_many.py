@@ -93,15 +93,11 @@ WORK = {
 }
 
 
-@eqx.filter_jit
 def in_half_precision(projection, dtype):
-    return dfx.diffeqsolve(
-        dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])),
-        dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection),
-        *jnp.array([0, 1, 0.125], dtype),
-        jnp.array([1.0, 0.5], dtype),
-        saveat=dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype)),
-    )
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection)
+    saveat = dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype))
+    y0 = jnp.array([1.0, 0.5], dtype)
+    return solve(rotation, solver, y0, args=jnp.ones((), dtype), dt0=0.125, saveat=saveat)
 
 
 @some_of("name", WORK, ids=WORK, period=3)

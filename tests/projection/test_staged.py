@@ -11,7 +11,7 @@ from hypothesis import given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import evaluated
+from ..problems import evaluated, solve
 
 GRAVITY = 13.7503716373294544  # that of cvPendulum: the period is 2
 INF = jnp.inf
@@ -32,16 +32,7 @@ FIRST, SECOND = (
     dfc.SimplifiedNewton(metric=(INF, 1.0), atol=1e-15),
 )
 STAGED = dfc.Staged(("circle", FIRST), ("tangent", SECOND))
-Y0, TERM = (jnp.array([1.0, 0.0]), jnp.zeros(2)), dfx.ODETerm(pendulum)
-
-
-@eqx.filter_jit
-def solve(projection, y0=Y0, args=GRAVITY, t1=30.0, tol=1e-7, inner=None, **options):
-    inner = dfx.Tsit5() if inner is None else inner
-    solver = dfc.ManifoldProjection(inner, MANIFOLD, projection=projection)
-    controller = dfx.PIDController(rtol=tol, atol=tol)
-    options = {"dt0": None, "stepsize_controller": controller, "max_steps": 4096} | options
-    return dfx.diffeqsolve(TERM, solver, 0.0, t1, y0=y0, args=jnp.asarray(args), **options)
+Y0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
 
 
 @eqx.filter_jit
@@ -77,9 +68,9 @@ def test_what_an_earlier_stage_reached_is_held():
 
 def test_saved_times_and_dense_output_are_on_both():
     # The simplest of all solvers, as it is the projection that is in question.
-    fixed = {"inner": dfx.Euler(), "dt0": 0.02, "stepsize_controller": dfx.ConstantStepSize()}
+    solver = dfc.ManifoldProjection(dfx.Euler(), MANIFOLD, projection=STAGED)
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 41), dense=True)
-    sol = solve(STAGED, t1=2.0, saveat=saveat, **fixed)
+    sol = solve(pendulum, solver, Y0, args=GRAVITY, t1=2.0, dt0=0.02, saveat=saveat)
     between = evaluated(sol, jnp.linspace(0, 2, 33))
     for q, v in (sol.ys, between):
         np.testing.assert_allclose(jnp.sum(q**2, axis=1), 1, atol=4e-15)

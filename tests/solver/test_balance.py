@@ -10,6 +10,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..problems import drift_of, evaluated, largest
 
 EPS = np.finfo(np.float64).eps
@@ -35,41 +36,11 @@ BALANCE = dfc.FirstIntegral(energy, rate=power)
 Y0, ARGS = (jnp.array(1.2), jnp.array(0.3)), (jnp.array(0.1), jnp.array(0.4))
 
 
-def solve(y0=Y0, args=ARGS, *, t0=0.0, t1=2.0, dt0=0.1, **options):
-    """Compiled once for all times."""
-    return compiled(y0, args, *(jnp.asarray(t) for t in (t0, t1, dt0)), **options)
-
-
-@eqx.filter_jit
-def compiled(
-    y0,
-    args,
-    t0,
-    t1,
-    dt0,
-    *,
-    solver=None,
-    field=pendulum,
-    manifold=BALANCE,
-    saveat=None,
-    max_steps=256,
-    **options,
-):
+def solve(y0=Y0, args=ARGS, *, t1=2.0, solver=None, field=pendulum, manifold=BALANCE, **options):
     solver = dfx.Tsit5() if solver is None else solver
     solver = solver if manifold is None else dfc.ManifoldProjection(solver, manifold)
-    saveat = dfx.SaveAt(t0=True, steps=True, dense=True) if saveat is None else saveat
-    return dfx.diffeqsolve(
-        dfx.ODETerm(field),
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        saveat=saveat,
-        max_steps=max_steps,
-        **options,
-    )
+    options = dict(saveat=dfx.SaveAt(t0=True, steps=True, dense=True), max_steps=256) | options
+    return problems.solve(field, solver, y0, t1=t1, args=args, **options)
 
 
 def worst(solution, manifold=BALANCE, args=ARGS):
@@ -93,15 +64,9 @@ def test_the_balance_is_kept_to_roundoff():
     times = jnp.linspace(0.0, 2.0, 201)
     dense = eqx.tree_at(lambda s: (s.ts, s.ys), kept, (times, evaluated(kept, times)))
     assert worst(dense) <= 16 * EPS
-    exact = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))),
-        dfx.Dopri8(),
-        0.0,
-        2.0,
-        0.01,
-        (Y0, jnp.array(0.0)),
-        ARGS,
-    )
+    both = lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))  # noqa: E731
+    start = (Y0, jnp.array(0.0))
+    exact = problems.solve(both, dfx.Dopri8(), start, t1=2.0, dt0=0.01, args=ARGS)
     state, work = jax.tree.map(lambda y: y[-1], exact.ys)
     gained = energy(2.0, last_of(kept), ARGS) - energy(0.0, Y0, ARGS)
     assert abs(gained - work) < 1e-8
@@ -146,18 +111,9 @@ def test_a_manifold_of_balances_and_integrals():
 
 def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     """A friction that takes less than a unit of roundoff of the energy in each step."""
-    args = jax.tree.map(jnp.float32, (1e-6, 0.0))
-    y0 = jax.tree.map(jnp.float32, Y0)
-    times = jnp.array([0.0, 200.0, 0.01], jnp.float32)
-    solution = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(pendulum),
-        dfc.ManifoldProjection(dfx.Tsit5(), BALANCE),
-        *times,
-        y0,
-        args,
-        saveat=dfx.SaveAt(t1=True, solver_state=True),
-        max_steps=None,
-    )
+    y0, args = jax.tree.map(jnp.float32, (Y0, (1e-6, 0.0)))
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    solution = solve(y0, args, t1=200.0, dt0=0.01, saveat=saveat, max_steps=None)
     gained = float(solution.solver_state.gained[0])
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, manifold=None, **PRECISE)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..learned import DRIVEN0, EAST, Still, Within, oscillator, states, unchecked
 
 TERM = dfx.ODETerm(oscillator)
@@ -35,14 +36,8 @@ BARE = Rotation(jnp.array(1e-3))
 KNOWS = Within(BARE, EASTERN)
 
 
-def solve(solver, y0=EAST, *, t0=0.0, t1=5.0, dt0=0.5, **options):
-    # Arrays: for other numbers nothing is compiled anew.
-    return compiled(solver, y0, *map(jnp.asarray, (t0, t1, dt0)), **options)
-
-
-@eqx.filter_jit
-def compiled(solver, y0, t0, t1, dt0, max_steps=200, **options):
-    return dfx.diffeqsolve(TERM, solver, t0, t1, dt0, y0, max_steps=max_steps, **options)
+def solve(solver, y0=EAST, *, t1=5.0, dt0=0.5, **options):
+    return problems.solve(oscillator, solver, y0, t1=t1, dt0=dt0, max_steps=200, **options)
 
 
 def message(sol):

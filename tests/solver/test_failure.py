@@ -111,14 +111,14 @@ def test_an_adaptive_solve_without_hope_ends(after):
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
     jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
-    start, end = (jnp.asarray(late + x, dtype) for x in (-20, 20))
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(lambda t, y, args: rotation(t, y, args) * jnp.asarray(0.3, dtype)),
-        dfc.ManifoldProjection(dfx.Tsit5(), jump),
-        start,
-        end,
-        None,
+    sol = run(
+        jump,
+        dfx.Tsit5(),
         Y0.astype(dtype),
+        lambda t, y, args: 0.3 * rotation(t, y, args),
+        t0=late - 20,
+        t1=late + 20,
+        dt0=None,
         stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
         max_steps=None,
         throw=False,

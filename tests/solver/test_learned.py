@@ -11,6 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from .. import problems
 from ..learned import LORENZ, flow_map, solution, unchecked
 
 DEEPONET, PINN = flow_map(), solution()
@@ -18,16 +19,8 @@ FLOW, FOLLOW = unchecked(DEEPONET), dfc.PINNSolver(PINN)
 SOLVERS = pytest.mark.parametrize("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"])
 
 
-def solve(solver, y0=LORENZ.y0, *, t0=0.0, t1=1.0, dt0=0.25, **kwargs):
-    """Compiled once for all times."""
-    times = map(jnp.asarray, (t0, t1, dt0))
-    return compiled(solver, y0, *times, **kwargs)
-
-
-@eqx.filter_jit
-def compiled(solver, y0, t0, t1, dt0, *, args=None, **kwargs):
-    term = dfx.ODETerm(LORENZ.vector_field)
-    return dfx.diffeqsolve(term, solver, t0, t1, dt0, y0, args, **kwargs)
+def solve(solver, y0=LORENZ.y0, *, dt0=0.25, **kwargs):
+    return problems.solve(LORENZ.vector_field, solver, y0, dt0=dt0, **kwargs)
 
 
 def path(solver, t):

@@ -1,7 +1,6 @@
 """Projection keeps the order of the solver, as published; `Unrolled` is the same method."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -20,17 +19,13 @@ from ..problems import (
     exponential_solution,
     kepler,
 )
+from ..problems import solve as one_solve
 from ..thinned import some_of
 
 
 def final(vector_field, solver, y0, t1, num_steps):
-    """The state at `t1`, with a leading axis. Compiled once for all numbers of steps."""
-    return _final(vector_field, solver, y0, jnp.asarray(t1), jnp.asarray(t1 / num_steps))
-
-
-@eqx.filter_jit
-def _final(vector_field, solver, y0, t1, step):
-    return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, 0.0, t1, step, y0, max_steps=None).ys
+    """The state at `t1`, with a leading axis."""
+    return one_solve(vector_field, solver, y0, t1=t1, dt0=t1 / num_steps, max_steps=None).ys
 
 
 def exponential_error(solver, t1, num_steps):
@@ -90,18 +85,12 @@ def test_rk4_is_the_classical_method():
 
 
 def test_dense_output_of_rk4_is_of_fourth_order():
-    @jax.jit
     def error(num_steps):
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(exponential),
-            dfc.RK4(),
-            0.0,
-            1.0,
-            1.0 / num_steps,
-            EXPONENTIAL0,
-            saveat=dfx.SaveAt(ts=jnp.linspace(0, 1, 37)),
-        )
-        return jnp.max(jnp.abs(sol.ys - jax.vmap(exponential_solution)(sol.ts)))
+        ts = jnp.linspace(0, 1, 37)
+        ys = one_solve(
+            exponential, dfc.RK4(), EXPONENTIAL0, dt0=1 / num_steps, saveat=dfx.SaveAt(ts=ts)
+        ).ys
+        return jnp.max(jnp.abs(ys - jax.vmap(exponential_solution)(ts)))
 
     assert np.log2(error(20) / error(40)) == pytest.approx(4, abs=0.4)
 
@@ -112,16 +101,10 @@ def test_dense_output_of_rk4_is_of_fourth_order():
 SOLVERS = [dfx.Tsit5(), dfx.Dopri5(), dfx.Dopri8(), dfx.Bosh3(), dfx.Heun(), dfx.Ralston()]
 
 
-def solve(solver, y0=KEPLER0, t1=1.5, **kwargs):
-    options = dict(
-        dt0=None,
-        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
-        saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 7), t1=True),
-    )
-    return compiled(dfx.ODETerm(kepler), solver, 0.0, jnp.asarray(t1), y0=y0, **(options | kwargs))
-
-
-compiled = eqx.filter_jit(dfx.diffeqsolve)
+def solve(solver):
+    controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    options = dict(stepsize_controller=controller, saveat=dfx.SaveAt(ts=jnp.linspace(0, 1.5, 7)))
+    return one_solve(kepler, solver, KEPLER0, t1=1.5, dt0=None, **options)
 
 
 @some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=6)

@@ -10,6 +10,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from .. import problems
 from ..learned import oscillator
 from ..problems import EXPONENTIAL0, KEPLER, KEPLER0, drift_of, exponential, kepler, largest
 
@@ -17,18 +18,12 @@ EIGHT = dfc.RandomFeatureSolver(8)
 NORTH = jnp.array([1.0, 0.3])
 
 
-def solve(vector_field, y0, t1, *, t0=0.0, dt0=None, tol=None, **kwargs):
-    """Compiled once for all times and tolerances."""
-    numbers = [None if x is None else jnp.asarray(x) for x in (t1, t0, dt0, tol)]
-    return compiled(vector_field, y0, *numbers, **kwargs)
-
-
-@eqx.filter_jit
-def compiled(vector_field, y0, t1, t0, dt0, tol, *, solver=EIGHT, args=None, **kwargs):
+def solve(vector_field, y0, t1, *, solver=EIGHT, dt0=None, tol=None, **kwargs):
     if tol is not None:
+        tol = jnp.asarray(tol)  # another one compiles nothing anew
         kwargs["stepsize_controller"] = dfx.PIDController(rtol=tol, atol=tol)
     kwargs.setdefault("max_steps", 512)
-    return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs)
+    return problems.solve(vector_field, solver, y0, t1=t1, dt0=dt0, **kwargs)
 
 
 def oscillation(t):

@@ -14,6 +14,8 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve.systems import Mechanism
 
+from ..problems import solve
+
 STIFF = {name: dfc.systems.get(name) for name in dfc.systems.names(stiff=True)}
 both = pytest.mark.parametrize("system", STIFF.values(), ids=STIFF)
 
@@ -170,11 +172,9 @@ def test_its_derivatives_are_those_of_what_it_computes():
 def test_a_stiff_solve_keeps_signs_and_balances():
     system = STIFF["pollu"]
     solver = dfc.ManifoldProjection(dfx.Kvaerno3(), system.manifold, projection=PROJECTION)
-    sol = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(system.vector_field), solver, 0.0, 10.0, None, system.y0,
-        stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-8),
-        saveat=dfx.SaveAt(steps=True), max_steps=512,
-    )  # fmt: skip
+    controller = dfx.PIDController(rtol=1e-4, atol=1e-8)
+    options = dict(saveat=dfx.SaveAt(steps=True), max_steps=512, stepsize_controller=controller)
+    sol = solve(system.vector_field, solver, system.y0, t1=10.0, dt0=None, **options)
     ys = sol.ys[: int(sol.stats["num_accepted_steps"])]
     assert float(jnp.min(ys)) >= 0
     weights = np.array([b.weights for b in system.mechanism.balances.values()])

@@ -13,6 +13,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..problems import OMEGA0, RIGID_BODY, rigid_body
 
 TERM = dfx.ODETerm(rigid_body)
@@ -21,14 +22,11 @@ STEPS = dfx.SaveAt(t0=True, steps=True)
 DENSE = dfx.SaveAt(t0=True, t1=True, dense=True)
 
 
-@eqx.filter_jit
-def solve(solver, saveat, y0=OMEGA0, t1=2.0, max_steps=32):
-    return dfx.diffeqsolve(
-        TERM, solver, 0.0, t1, 0.1, y0, saveat=saveat, max_steps=max_steps, throw=False
-    )
+def solve(solver, saveat, y0=OMEGA0, **options):
+    options = dict(t1=2.0, max_steps=32, saveat=saveat, throw=False) | options
+    return problems.solve(rigid_body, solver, y0, **options)
 
 
-@eqx.filter_jit
 def solve_batch(solver, y0s):
     return jax.vmap(lambda y0: solve(solver, STEPS, y0))(y0s)
 
