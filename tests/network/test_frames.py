@@ -13,8 +13,6 @@ import diffrax_conserve as dfc
 from ..learned import CORES, LORENZ, SMALL, flow_map, states
 
 VORTICES = dfc.systems.PointVortices()
-# One compilation each, not one for each operation.
-FRAMES = jax.jit(jax.vmap(VORTICES.frame))
 STEP = 0.125
 
 
@@ -29,24 +27,6 @@ def transformed(y, order=(1, 2, 0), angle=0.7, scale=1.3, shift=(0.3, -2.0)):
     """The same vortices under other names, turned, shifted and scaled."""
     turn = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
     return scale * (y[jnp.array(order)] @ turn.T + jnp.array(shift))
-
-
-# ---- The frame of three vortices ----
-
-
-@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (1, 0, 2), (2, 1, 0)])
-def test_symmetries_leave_the_inputs_and_turn_the_basis(order):
-    y0s = states(system=VORTICES)
-    moved = jax.vmap(lambda y: transformed(y, order))(y0s)
-    frames, others = FRAMES(y0s), FRAMES(moved)
-    np.testing.assert_allclose(others.inputs, frames.inputs, atol=1e-12)
-    np.testing.assert_allclose(others.clock, frames.clock / 1.3**2, rtol=1e-12)
-    coefficients = jnp.array([0.3, -1.0, 0.5, 2.0])
-    change = (frames.basis @ coefficients).reshape(y0s.shape)
-    # A change of the state is turned and scaled, but not shifted.
-    expected = jax.vmap(lambda dy: transformed(dy, order, shift=(0.0, 0.0)))(change)
-    found = (others.basis @ coefficients).reshape(y0s.shape)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 # ---- Flow maps with a frame ----

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution
+from ..learned import EAST, LORENZ, RADIUS, flow_map, solution
 from ..problems import OMEGA0, RIGID_BODY
 
 ONE = jnp.ones(())
@@ -141,13 +141,6 @@ def test_a_conservative_network_is_its_candidate_moved():
     pinn = eqx.filter_jit(solution(layer=layer))
     assert residual(layer, pinn(1.5), values) < 1e-14
     np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
-
-
-def test_args_are_passed_to_the_manifold():
-    weighted = dfc.FirstIntegral(lambda t, y, args: jnp.sum(args * y**2))
-    layer = dfc.learned.ConservativeLayer(weighted, steps=12, args=jnp.array([1.0, 3.0]))
-    pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
-    assert abs(float(weighted.fn(0, pinn(0.7), layer.args)) - 1) < 1e-14
 
 
 def test_what_is_refused():

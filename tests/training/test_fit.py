@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -75,25 +74,6 @@ def test_a_pinn_learns_a_solution():
     assert defect(after) < defect(before) / 100
     assert error(after) < 0.05 < error(before)
     assert log.best < log.criteria[0] / 100
-
-
-def test_any_flow_map_of_the_user_learns():
-    class Linear(eqx.Module):
-        rate: jax.Array
-        max_step: float = eqx.field(static=True, default=0.5)
-
-        def __call__(self, y0, h):
-            return y0 * jnp.exp(self.rate * h)
-
-    fitted, _ = train(
-        Linear(jnp.array(0.0)),
-        lambda t, y, args: args * y,
-        args=-1.5,
-        sample=lambda key: jr.uniform(key, minval=1.0, maxval=2.0),
-        epochs=200,
-        optimiser=optax.adam(0.05),
-    )
-    assert abs(float(fitted.rate) + 1.5) < 1e-3
 
 
 # ---- What it records and returns ----

@@ -1,4 +1,6 @@
-"""Second-order training, windows, and states along solutions."""
+"""Second-order training and its recipes; without options `fit` does what the guide advises."""
+
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -9,7 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, oscillator
+from ..learned import EAST, LORENZ, flow_map, oscillator, states
 
 KEY = jr.key(5)
 
@@ -75,12 +77,6 @@ def test_a_window_is_learned_to_ten_digits():
     assert log.skipped == 0
 
 
-def flow_map(core=dfc.learned.Concatenated, order=1):
-    states = jax.vmap(LORENZ.sample)(jr.split(jr.key(7), 200))
-    taylor = dfc.learned.Taylor(LORENZ.vector_field, order)
-    return states, dfc.DeepONet(states, 0.25, width=12, depth=1, core=core, taylor=taylor, key=KEY)
-
-
 # ---- Recipes ----
 
 
@@ -90,7 +86,7 @@ def test_the_recipe_goes_by_size():
     large = dfc.learned.second_order(turns(3.0, width=40, depth=4))
     assert isinstance(large.optimiser, dfc.learned.SPRING)
     assert large.refresh == 1
-    assert isinstance(dfc.learned.second_order(flow_map()[1]).optimiser, dfc.learned.SPRING)
+    assert isinstance(dfc.learned.second_order(flow_map()).optimiser, dfc.learned.SPRING)
 
 
 # ---- States along solutions ----
@@ -105,3 +101,53 @@ def test_reachable_states_are_on_the_solutions():
     assert float(jnp.max(jnp.abs(states - y0s))) > 1
     kept = dfc.learned.reachable_states(oscillator, y0s, 10.0, key=KEY, keep=lambda y: y[0] > 0)
     np.testing.assert_array_equal(kept, states[states[:, 0] > 0])
+
+
+# ---- Without options `fit` does what the guide advises ----
+
+
+def stiff(t, y, args):
+    return -1e4 * y
+
+
+def few(network, **options):
+    found = dfc.learned.second_order(network, epochs=8)
+    return dataclasses.replace(found, **(dict(points=10, check_every=4) | options))
+
+
+def trained(field=LORENZ.vector_field, **options):
+    network = flow_map()
+    return dfc.fit(network, field, key=KEY, recipe=few(network, **options))[0]
+
+
+def test_a_flow_map_gets_the_slope_of_the_field():
+    network = trained()
+    assert isinstance(network.core, dfc.learned.Concatenated)
+    y = states(1)[0]
+    slope = LORENZ.vector_field(0.0, y, None)
+    np.testing.assert_allclose(network.slope(y), slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("field", "options"), [(stiff, dict()), (LORENZ.vector_field, dict(taylor=0))]
+)
+def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
+    assert trained(field, **options).taylor is None
+
+
+def test_it_goes_on_bit_for_bit_from_between_two_comparisons():
+    network = flow_map()
+    chosen = few(network, epochs=400, check_every=100)
+    options = dict(key=KEY, sample=LORENZ.sample, recipe=chosen)
+    whole, log = dfc.fit(network, LORENZ.vector_field, **options)
+    state, seconds = None, 0.02
+    for _ in range(100):
+        model, stopped = dfc.fit(
+            network, LORENZ.vector_field, **options, state=state, seconds=seconds
+        )
+        if stopped.ended != "seconds":
+            break
+        state, seconds = stopped.state, 2 * seconds
+    assert eqx.tree_equal(model, whole)
+    np.testing.assert_array_equal(stopped.losses, log.losses)
+    np.testing.assert_array_equal(stopped.criteria, log.criteria)
