@@ -92,16 +92,6 @@ def rotations_of_the_coordinates_commute(system, y, displacement):
     )
 
 
-def the_unit_of_the_state_is_free(system, y, displacement):
-    return seen_through(
-        system,
-        y,
-        displacement,
-        lambda y: jax.tree.map(lambda x: x * 1e4, y),
-        lambda z: jax.tree.map(lambda x: x / 1e4, z),
-    )
-
-
 @within(0.0)
 def frozen_components_stay(system, y, displacement):
     candidate = displaced(y, displacement)
@@ -134,7 +124,6 @@ LAWS = [
     a_state_on_the_manifold_is_untouched,
     linear_combinations_of_the_integrals_change_nothing,
     rotations_of_the_coordinates_commute,
-    the_unit_of_the_state_is_free,
     frozen_components_stay,
     the_correction_is_orthogonal_to_the_flow,
     single_precision_agrees_with_double,

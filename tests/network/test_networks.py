@@ -135,33 +135,12 @@ def test_untrained_it_has_the_order_of_its_polynomial(core, order):
 # ---- The networks ----
 
 
-def test_gated_inputs():
-    network = flow_map(core=dfc.learned.Gated, depth=3)
-    core = network.core
-    assert len(core.hidden) == 3
-    x = jnp.append(jnp.array([0.3, -0.2, 0.5]), 0.1)
-    a, b = (jnp.tanh(x @ encoder.weights[0]) for encoder in core.encoders)
-    z = x
-    for layer in core.hidden:
-        gate = jnp.tanh(z @ layer.weights[0])
-        z = gate * a + (1 - gate) * b
-    expected = z @ core.last.weights[0]
-    np.testing.assert_allclose(core(x[:3], x[3]), expected, rtol=1e-14)
-
-
 @KINDS
 def test_every_kind_starts_at_its_state(core):
     network = flow_map(core=core, taylor=dfc.learned.Taylor(LORENZ.vector_field))
     np.testing.assert_array_equal(network(LORENZ.y0, 0.0), LORENZ.y0)
     slope = jax.jacfwd(lambda h: network(LORENZ.y0, h))(0.0)
     np.testing.assert_allclose(slope, LORENZ.vector_field(0.0, LORENZ.y0, None), rtol=1e-14)
-
-
-def test_its_domain_is_the_box_round_its_states():
-    states = jnp.array([[0.0, 1.0], [2.0, -1.0]])
-    domain = dfc.DeepONet(states, 1.0, width=4, depth=1, key=jr.key(0)).domain
-    assert domain.contains(jnp.array([1.0, 0.0]))
-    assert not domain.contains(jnp.array([1.0, 1.5]))
 
 
 def test_a_solve_across_windows():

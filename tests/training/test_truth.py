@@ -1,12 +1,7 @@
 """A training tells the truth; it stops and goes on, bit for bit as if it had not stopped."""
 
 import dataclasses
-import os
-import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -264,41 +259,3 @@ def test_a_checkpoint_is_the_state(make, tmp_path):
     with pytest.raises(ValueError, match="holds no checkpoint"):
         dfc.fit(network, **options, checkpoint=path)
     assert list(tmp_path.iterdir()) == [path]
-
-
-SCRIPT = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", sys.argv[2])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-from tests.training.test_truth import small_pinn
-import diffrax_conserve as dfc
-network, options = small_pinn()
-model, log = dfc.fit(network, **options, checkpoint=sys.argv[1])
-dfc.save(sys.argv[3], model)
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_training_goes_on(tmp_path):
-    """Killed at 20 random times, in whatever it is doing."""
-    checkpoint, cache, result = (str(tmp_path / name) for name in ("state", "cache", "network"))
-    command = [sys.executable, "-W", "ignore", "-c", SCRIPT, checkpoint, cache, result]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    root = Path(__file__).parents[2]
-    rng, killed, longest = np.random.default_rng(0), 0, 0.3
-    while not Path(result).exists():
-        process = subprocess.Popen(command, cwd=root, env=environment)
-        try:
-            # Longer each time, or it would never come to its first checkpoint.
-            process.wait(timeout=None if killed == 20 else longest * rng.uniform(0.5, 1.0))
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            killed += 1
-            longest *= 1.25
-    assert killed > 3
-    network, options = small_pinn()
-    expected, _ = dfc.fit(network, **options)
-    assert eqx.tree_equal(dfc.load(result), expected)
