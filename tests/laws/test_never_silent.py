@@ -15,7 +15,7 @@ from hypothesis import given
 
 import diffrax_conserve as dfc
 
-from ..problems import KEPLER, kepler
+from ..problems import KEPLER, kepler, solve
 
 # ---- Success ----
 
@@ -159,17 +159,10 @@ def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
 @eqx.filter_vmap(in_axes=(0, 0))
 def long_steps(e, dt):
     y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
-    solution = dfx.diffeqsolve(
-        dfx.ODETerm(kepler),
-        dfc.ManifoldProjection(dfc.RK4(), KEPLER),
-        0.0,
-        6.0,
-        dt,
-        y0,
-        saveat=dfx.SaveAt(ts=jnp.linspace(0.1, 5.9, 41)),
-        throw=False,
-        max_steps=256,
-    )
+    saveat = dfx.SaveAt(ts=jnp.linspace(0.1, 5.9, 41))
+    solver = dfc.ManifoldProjection(dfc.RK4(), KEPLER)
+    options = dict(saveat=saveat, throw=False, max_steps=256)
+    solution = solve(kepler, solver, y0, t1=6.0, dt0=dt, **options)
     return solution.ys, dfx.is_okay(solution.result)
 
 

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..thinned import some_of
 from .common import PARALLEL, SYSTEMS, check, every_law_on_every_system, inputs, project, within
 
@@ -21,16 +22,9 @@ def solve(system, y0, *, solver=None, field=None, t0=0.0, t1=None):
     """Eight fixed steps of projected RK4, each an eighth of the system's own."""
     step = system.dt / 8
     t1 = t0 + STEPS * step if t1 is None else t1
-    return dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field if field is None else field),
-        dfc.ManifoldProjection(dfc.RK4() if solver is None else solver, system.manifold),
-        t0,
-        t1,
-        jnp.sign(t1 - t0) * step,
-        y0,
-        throw=False,
-        max_steps=STEPS + 2,
-    )
+    solver = dfc.ManifoldProjection(dfc.RK4() if solver is None else solver, system.manifold)
+    options = dict(t0=t0, t1=t1, dt0=jnp.sign(t1 - t0) * step, max_steps=STEPS + 2, throw=False)
+    return problems.solve(system.vector_field if field is None else field, solver, y0, **options)
 
 
 def okay(*solutions):
@@ -75,17 +69,10 @@ def test_law(law, name, data):
 @eqx.filter_jit
 def saved(system, y0, step, fractions):
     t1 = STEPS * step
-    return dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field),
-        dfc.ManifoldProjection(dfx.Tsit5(), system.manifold),
-        0.0,
-        t1,
-        step,
-        y0,
-        saveat=dfx.SaveAt(ts=fractions * t1, t1=True, dense=True),
-        max_steps=STEPS + 2,
-        throw=False,
-    )
+    saveat = dfx.SaveAt(ts=fractions * t1, t1=True, dense=True)
+    options = dict(t1=t1, dt0=step, saveat=saveat, max_steps=STEPS + 2, throw=False)
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), system.manifold)
+    return problems.solve(system.vector_field, solver, y0, **options)
 
 
 @some_of("name", SYSTEMS, ids=SYSTEMS, period=14)

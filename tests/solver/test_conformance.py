@@ -12,19 +12,8 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body
-from .conformance_table import (
-    ADDITIVE,
-    EXPLICIT,
-    IMEX,
-    IMPLICIT,
-    ITO,
-    LANGEVIN,
-    MULTISTEP,
-    SPLIT,
-    STRATONOVICH,
-    TABLE,
-    WRAPPER,
-)
+from . import conformance_table as kinds
+from .conformance_table import TABLE
 
 
 def public_solvers():
@@ -71,27 +60,27 @@ def spin_ito(t, y, args):
 
 def problem(kind):
     """Terms, initial state and manifold."""
-    if kind in (EXPLICIT, IMPLICIT, MULTISTEP, WRAPPER):
+    if kind in (kinds.EXPLICIT, kinds.IMPLICIT, kinds.MULTISTEP, kinds.WRAPPER):
         return dfx.ODETerm(rigid_body), OMEGA0, RIGID_BODY
-    if kind == IMEX:
+    if kind == kinds.IMEX:
         half = dfx.ODETerm(lambda t, y, args: rigid_body(t, y, args) / 2)
         return dfx.MultiTerm(half, half), OMEGA0, RIGID_BODY
-    if kind == SPLIT:
+    if kind == kinds.SPLIT:
         terms = (dfx.ODETerm(lambda t, p, args: p), dfx.ODETerm(lambda t, q, args: -jnp.sin(q)))
         energy = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
         return terms, (jnp.array(1.0), jnp.array(0.5)), energy
-    if kind == ITO:
+    if kind == kinds.ITO:
         return sde(spin_ito, shake), AXIS[::-1], SPHERE
-    if kind == STRATONOVICH:
+    if kind == kinds.STRATONOVICH:
         return sde(spin, shake), AXIS[::-1], SPHERE
-    if kind == ADDITIVE:
+    if kind == kinds.ADDITIVE:
         # Equal noise in both components.
         terms = sde(
             lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
         )
         difference = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
         return terms, jnp.array([0.5, 1.0]), difference
-    if kind == LANGEVIN:
+    if kind == kinds.LANGEVIN:
         # A thermal bead on a circle: the position is constrained.
         y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
         gamma, u = jnp.ones(2), jnp.ones(2)
@@ -107,7 +96,7 @@ def problem(kind):
 FIRST_OF_ITS_KIND = {
     name
     for kind, name in {kind: name for name, kind in reversed(TABLE.items())}.items()
-    if kind not in (LANGEVIN, ADDITIVE)
+    if kind not in (kinds.LANGEVIN, kinds.ADDITIVE)
 }
 every_solver = pytest.mark.parametrize(
     "name",
@@ -122,8 +111,8 @@ every_solver = pytest.mark.parametrize(
 def test_every_solver_stays_on_the_manifold(name):
     kind = TABLE[name]
     terms, y0, manifold = problem(kind)
-    inner = dfx.HalfSolver(dfx.Heun()) if kind == WRAPPER else public_solvers()[name]()
-    if kind in (IMPLICIT, IMEX):
+    inner = dfx.HalfSolver(dfx.Heun()) if kind == kinds.WRAPPER else public_solvers()[name]()
+    if kind in (kinds.IMPLICIT, kinds.IMEX):
         controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
     else:
         controller = dfx.ConstantStepSize()
