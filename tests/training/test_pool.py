@@ -117,14 +117,6 @@ def test_two_models_are_compared_on_the_same_states():
     assert len(np.unique(log.criteria)) == len(log.criteria)
 
 
-def test_the_same_key_gives_the_same_result():
-    a, log_a = train(epochs=60)
-    b, log_b = trained_clock()
-    assert eqx.tree_equal(a, b)
-    np.testing.assert_array_equal(log_a.losses, log_b.losses)
-    assert not eqx.tree_equal(a, train(epochs=60, key=jr.key(6))[0])
-
-
 def small_network(**options):
     # Normalised by states from all round the circle, as far as it will go.
     ring = jnp.concatenate([Y0S, -Y0S, Y0S @ QUARTER, -Y0S @ QUARTER])
