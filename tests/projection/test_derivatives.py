@@ -44,14 +44,8 @@ def projected(inputs, projection):
     projection = eqx.tree_at(
         lambda p: p.metric, projection, inputs["metric"], is_leaf=lambda x: x is None
     )
-    return dfc.project(
-        manifold,
-        inputs["y"],
-        t=inputs["t"],
-        args=inputs["args"],
-        value=inputs["values"],
-        projection=projection,
-    )[0]
+    options = dict(t=inputs["t"], args=inputs["args"], value=inputs["values"])
+    return dfc.project(manifold, inputs["y"], projection=projection, **options)[0]
 
 
 def loss(inputs, projection):

@@ -84,10 +84,6 @@ def test_event_lands_on_the_manifold_at_the_right_time_with_a_right_gradient():
         np.testing.assert_allclose(gradient, [0.0, 1.0], atol=1e-6)
 
 
-def cosine(t, y, args):
-    return jnp.cos(t)
-
-
 TIMED = dfc.FirstIntegral(lambda t, y, args: y - jnp.sin(t))
 
 
@@ -95,15 +91,10 @@ TIMED = dfc.FirstIntegral(lambda t, y, args: y - jnp.sin(t))
 def test_time_dependent_integral_in_either_direction(t1):
     """diffrax shows a solver negated times when it solves backwards."""
     ts = jnp.linspace(0, t1, 7)
-    sol = solve(
-        cosine,
-        # Where the field vanishes, a step of Euler's method does not move, but the solution does.
-        dfc.ManifoldProjection(dfx.Euler(), TIMED, max_correction=None),
-        jnp.array(1.0),
-        t1=t1,
-        dt0=0.1 * np.sign(t1),
-        saveat=dfx.SaveAt(ts=ts),
-    )
+    # Where the field vanishes, a step of Euler's method does not move, but the solution does.
+    solver = dfc.ManifoldProjection(dfx.Euler(), TIMED, max_correction=None)
+    options = dict(t1=t1, dt0=0.1 * np.sign(t1), saveat=dfx.SaveAt(ts=ts))
+    sol = solve(lambda t, y, args: jnp.cos(t), solver, jnp.array(1.0), **options)
     np.testing.assert_allclose(sol.ys, 1 + jnp.sin(ts), rtol=0, atol=1e-15)
 
 
@@ -111,15 +102,9 @@ def test_a_continued_solve_keeps_the_first_conserved_value():
     shift = 1e-3  # pushed off the manifold in between
 
     def run(y0, t0, t1, state=None):
-        return solve(
-            rotation,
-            dfc.ManifoldProjection(dfx.Tsit5(), CIRCLE),
-            y0,
-            t0=t0,
-            t1=t1,
-            solver_state=state,
-            saveat=dfx.SaveAt(t1=True, solver_state=True),
-        )
+        saveat = dfx.SaveAt(t1=True, solver_state=True)
+        options = dict(t0=t0, t1=t1, solver_state=state, saveat=saveat)
+        return solve(rotation, dfc.ManifoldProjection(dfx.Tsit5(), CIRCLE), y0, **options)
 
     first = run(jnp.array([1.0, 0.0]), 0.0, 1.0)
     second = run(first.ys[-1] + shift, 1.0, 2.0, first.solver_state)
@@ -128,17 +113,12 @@ def test_a_continued_solve_keeps_the_first_conserved_value():
 
 def test_failure_with_adaptive_steps_is_retried_with_smaller_ones():
     """Two iterations are too few for a long step with the first-order method."""
-    sol = solve(
-        rigid_body,
-        dfc.ManifoldProjection(
-            dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=dfc.SimplifiedNewton(max_steps=2)
-        ),
-        OMEGA0,
-        t1=0.2,
-        dt0=0.2,
-        stepsize_controller=dfx.PIDController(rtol=1e9, atol=1e9),  # accepts any error estimate
-        saveat=dfx.SaveAt(t0=True, t1=True),
+    solver = dfc.ManifoldProjection(
+        dfx.HalfSolver(dfx.Euler()), RIGID_BODY, projection=dfc.SimplifiedNewton(max_steps=2)
     )
+    careless = dfx.PIDController(rtol=1e9, atol=1e9)  # accepts any error estimate
+    options = dict(stepsize_controller=careless, saveat=dfx.SaveAt(t0=True, t1=True))
+    sol = solve(rigid_body, solver, OMEGA0, t1=0.2, dt0=0.2, **options)
     assert sol.stats["num_rejected_steps"] > 0
     assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
 

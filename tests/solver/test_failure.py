@@ -111,18 +111,9 @@ def test_an_adaptive_solve_without_hope_ends(after):
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
     jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
-    sol = run(
-        jump,
-        dfx.Tsit5(),
-        Y0.astype(dtype),
-        lambda t, y, args: 0.3 * rotation(t, y, args),
-        t0=late - 20,
-        t1=late + 20,
-        dt0=None,
-        stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
-        max_steps=None,
-        throw=False,
-    )
+    slow, span = lambda *args: 0.3 * rotation(*args), dict(t0=late - 20, t1=late + 20, dt0=None)
+    options = span | dict(stepsize_controller=dfx.PIDController(1e-4, 1e-4), max_steps=None)
+    sol = run(jump, dfx.Tsit5(), Y0.astype(dtype), slow, throw=False, **options)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
     assert sol.stats["num_steps"] <= 60
 
@@ -142,20 +133,11 @@ RIGHT = jnp.array([1.38, 0.0])  # the energy is negative: the two wells are not 
 @eqx.filter_jit
 def in_the_well(solver, controller, max_correction):
     """The solve, and whether all of it is in the right well."""
-    sol = run(
-        WELL,
-        solver,
-        RIGHT,
-        double_well,
-        projection=dfc.Newton(),
-        max_correction=max_correction,
-        t1=42.0,
-        dt0=1.4,
-        throw=False,
-        saveat=dfx.SaveAt(steps=True),
-        max_steps=300,
-        stepsize_controller=controller,
+    solver = dfc.ManifoldProjection(
+        solver, WELL, projection=dfc.Newton(), max_correction=max_correction
     )
+    options = dict(saveat=dfx.SaveAt(steps=True), max_steps=300, stepsize_controller=controller)
+    sol = solve(double_well, solver, RIGHT, t1=42.0, dt0=1.4, throw=False, **options)
     return sol, jnp.all(jnp.where(jnp.isfinite(sol.ts), sol.ys[:, 0], 1) > 0)
 
 

@@ -105,14 +105,9 @@ def energies(ys):
 
 def test_subs_and_functions_of_the_state():
     ts = jnp.linspace(0, 1, 6)
-    saveat = dfx.SaveAt(
-        subs={
-            "end": dfx.SubSaveAt(t0=True, t1=True),
-            "energy": dfx.SubSaveAt(ts=ts, fn=rotational_energy),
-            "steps": dfx.SubSaveAt(steps=2),
-        }
-    )
-    sol = saved(saveat, max_steps=16)
+    ends, steps = dfx.SubSaveAt(t0=True, t1=True), dfx.SubSaveAt(steps=2)
+    subs = {"end": ends, "energy": dfx.SubSaveAt(ts=ts, fn=rotational_energy), "steps": steps}
+    sol = saved(dfx.SaveAt(subs=subs), max_steps=16)
     np.testing.assert_allclose(sol.ys["energy"], ENERGY, rtol=4e-16)
     np.testing.assert_allclose(energies(sol.ys["end"]), ENERGY, rtol=4e-16)
     finite = jnp.isfinite(sol.ts["steps"])
@@ -126,25 +121,14 @@ ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
     ("controller", "times"),
     [
         (dfx.StepTo(ts=jnp.array([0.0, 0.13, 0.5, 1.0])), [0.13, 0.5]),
-        (
-            dfx.ClipStepSizeController(
-                ADAPTIVE,
-                step_ts=jnp.array([0.3]),
-                jump_ts=jnp.array([0.51]),
-                store_rejected_steps=5,
-            ),
-            [0.3, 0.51],
-        ),
+        (dfx.ClipStepSizeController(ADAPTIVE, [0.3], [0.51], store_rejected_steps=5), [0.3, 0.51]),
     ],
     ids=["step-to", "clip"],
 )
 def test_every_controller_hits_its_times_on_the_manifold(controller, times):
-    sol = saved(
-        dfx.SaveAt(t0=True, steps=True),
-        stepsize_controller=controller,
-        dt0=None if isinstance(controller, dfx.StepTo) else 0.1,
-        max_steps=64,
-    )
+    dt0 = None if isinstance(controller, dfx.StepTo) else 0.1
+    options = dict(stepsize_controller=controller, dt0=dt0, max_steps=64)
+    sol = saved(dfx.SaveAt(t0=True, steps=True), **options)
     assert largest(drift_of(sol, RIGID_BODY)) <= 4e-16
     for t in times:
         assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6
@@ -160,20 +144,15 @@ def test_a_steady_state_by_the_implicit_adjoint():
     sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
     def end(args):
-        sol = solve(
-            towards,
-            dfc.ManifoldProjection(dfx.Tsit5(), sphere),
-            jnp.array([1.0, 0.0, 0.0]),
-            args=args,
-            t1=jnp.inf,
-            dt0=0.1,
+        options = dict(
             adjoint=dfx.ImplicitAdjoint(),
             event=dfx.Event(dfx.steady_state_event(rtol=1e-9, atol=1e-9)),
             # At the limit of stability the steps keep an error of some ten tolerances.
             stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-11),
             max_steps=4096,
         )
-        return sol.ys[-1]
+        solver = dfc.ManifoldProjection(dfx.Tsit5(), sphere)
+        return solve(towards, solver, jnp.eye(3)[0], args=args, t1=jnp.inf, **options).ys[-1]
 
     args = jnp.array([1.0, 2.0, 2.0])
     np.testing.assert_allclose(end(args), args / 3, rtol=0, atol=1e-8)
