@@ -23,9 +23,6 @@ def benchmark(name):
     return module
 
 
-# ---- What the pages show is what was measured ----
-
-
 def lines_of(name, results, table="table"):
     """The lines that the benchmark makes of its results."""
     run = benchmark(name)
@@ -83,8 +80,6 @@ def test_the_drift_is_flat():
         else:
             assert row["drift"]["1e+03"] > 20 * eps
 
-
-# ---- What `make bench-smoke` does not run ----
 
 SMOKE = {
     "zoo": lambda pinn, flow_map: (

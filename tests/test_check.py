@@ -75,16 +75,6 @@ def test_constraints_are_checked_where_they_hold():
     }
 
 
-def test_the_report_reads_as_a_table():
-    system = systems.RigidBody()
-    text = str(check_invariance(system.vector_field, system.manifold, system.sample))
-    header, _, *rows = text.splitlines()
-    assert header.startswith("conserved: derivatives along the flow at 100 states")
-    assert [row.split("  ")[1] for row in rows] == ["energy", "squared angular momentum"]
-    assert all(row.endswith("conserved") for row in rows)
-    assert len({row.index("first integral") for row in rows}) == 1
-
-
 def test_forces_that_cancel_up_to_roundoff_conserve():
     """Their sum is all roundoff, which is of its own size."""
 

@@ -38,9 +38,6 @@ def reproduce(tmp_path, *arguments, out="out"):
     return status, json.loads((folder / "metrics.json").read_text())
 
 
-# ---- What it writes and prints ----
-
-
 KEPLER = ("kepler", "--t1", "3", "--dt", "0.2")
 
 
@@ -131,9 +128,6 @@ def test_every_system(name, tmp_path):
         assert max(metrics["solvers"][solver]["drift"].values()) < 1e-14
 
 
-# ---- What it refuses ----
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -173,9 +167,6 @@ def test_without_matplotlib(tmp_path, monkeypatch, capsys, only_rk4):
     assert "rk4" in printed
     assert "pip install 'diffrax-conserve[plots]'" in printed
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["metrics.json"]
-
-
-# ---- What it says about a solver that fails ----
 
 
 def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys):

@@ -141,9 +141,6 @@ def test_a_file_keeps_its_mode_and_a_link_stays_one(path):
     assert eqx.tree_equal(dfc.load(path), NETWORKS["deeponet"])
 
 
-# ---- What is refused ----
-
-
 class State(eqx.Module):
     x: jax.Array
 
@@ -201,8 +198,6 @@ def test_what_is_no_file(path, error, match):
         with pytest.raises(error, match=match):
             function(path)
 
-
-# ---- The networks of the package ----
 
 NAMES = [
     name + kind for name in dfc.systems.names()[:5] for kind in ("", "-standard", "-conservative")

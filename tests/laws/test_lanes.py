@@ -14,7 +14,7 @@ import diffrax_conserve as dfc
 from ..problems import RIGID_BODY, rigid_body, solve
 
 EPS = float(np.finfo(float).eps)
-# Implicit methods keep their last stage, so that lanes depend on each other within the tolerance.
+# Of implicit methods, which keep their last stage, lanes depend on each other within the tolerance.
 # The first one keeps its last stage.
 ADAPTIVE = [dfx.Tsit5(), dfx.Heun()]
 GOOD, NAN, FAILED, REJECTED = range(4)

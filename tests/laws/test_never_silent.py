@@ -17,8 +17,6 @@ import diffrax_conserve as dfc
 
 from ..problems import KEPLER, kepler, solve
 
-# ---- Success ----
-
 PROJECTIONS = {
     "simplified": dfc.SimplifiedNewton(),
     "newton": dfc.Newton(),
@@ -115,9 +113,6 @@ def test_what_underflows_is_no_success(dtype, share, angle, off):
     assert ok or value <= numbers.tiny / numbers.eps
 
 
-# ---- Derivatives ----
-
-
 def orbit(solver, e, direction):
     """The end of an arc, and its derivative along a change of the initial state."""
     y0 = jnp.stack([1 - e, 0.0 * e]), jnp.stack([0.0 * e, jnp.sqrt((1 + e) / (1 - e))])
@@ -150,9 +145,6 @@ def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
     error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
     assert not np.any(error > 1e-3)  # NaN is right
     assert np.all(error[e > 1e-2] <= 1e-3)
-
-
-# ---- NaN ----
 
 
 @eqx.filter_jit

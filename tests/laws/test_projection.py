@@ -69,27 +69,22 @@ def linear_combinations_of_the_integrals_change_nothing(system, y, displacement)
     return ok1 & ok2, got, expected
 
 
-def seen_through(system, y, displacement, there, back):
-    """The projection in other coordinates `z = there(y)`, mapped back."""
+def rotations_of_the_coordinates_commute(system, y, displacement):
+    """The Euclidean projection is geometric."""
     candidate, expected, ok1 = plain(system, y, displacement)
+    flat, unravel = ravel_pytree(y)
+    shape = flat.size, flat.size
+    rotation = jnp.asarray(np.linalg.qr(np.random.default_rng(1).normal(size=shape))[0])
+
+    def there(y):
+        return rotation @ ravel_pytree(y)[0]
+
+    def back(z):
+        return unravel(rotation.T @ z)
+
     manifold = mapped(system.manifold, lambda fn, t, z, args: fn(t, back(z), args))
     got, ok2 = project(manifold, there(candidate), there(y))
     return ok1 & ok2, back(got), expected
-
-
-def flat_coordinates(y):
-    _, unravel = ravel_pytree(y)
-    return lambda y: ravel_pytree(y)[0], unravel
-
-
-def rotations_of_the_coordinates_commute(system, y, displacement):
-    """The Euclidean projection is geometric."""
-    flat, unravel = flat_coordinates(y)
-    size = flat(y).size
-    rotation = jnp.asarray(np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0])
-    return seen_through(
-        system, y, displacement, lambda y: rotation @ flat(y), lambda z: unravel(rotation.T @ z)
-    )
 
 
 @within(0.0)

@@ -91,9 +91,6 @@ def test_a_solution_that_succeeds_is_conserved(name, data):
         assert step > system.dt / 20
 
 
-# ---- Laws of the derivative of a projection ----
-
-
 def direction(flat, phase):
     return jnp.sin(1 + phase + jnp.arange(flat.size))
 

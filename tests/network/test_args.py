@@ -46,9 +46,6 @@ def solve(flow_map, args, check_field=False, **options):
     return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8, throw=False)
 
 
-# ---- The network ----
-
-
 @pytest.mark.parametrize("order", [0, 1])
 @pytest.mark.parametrize("core", [dfc.learned.Product, dfc.learned.Concatenated, dfc.learned.Gated])
 def test_it_starts_at_its_state_and_sees_all_args(core, order):
@@ -87,9 +84,6 @@ def test_draws_are_in_the_box_and_everywhere():
         np.testing.assert_allclose(jnp.mean(leaf, axis=0), 0, atol=0.1)
 
 
-# ---- The solver ----
-
-
 def test_args_outside_their_domain_are_steps_outside():
     statistics = dfx.SaveAt(t1=True, solver_state=True)
 
@@ -116,8 +110,6 @@ def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
     with pytest.raises(Exception, match="not trained for this vector field"):
         jax.block_until_ready(dfx.diffeqsolve(other, solver, 0.0, 1.0, 0.5, Y0, ARGS).ys)
 
-
-# ---- What is refused ----
 
 LAYER = dfc.learned.ConservativeLayer(dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)))
 OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)

@@ -72,8 +72,6 @@ def test_many_constraints_use_the_dense_solve():
     np.testing.assert_allclose(y, y0, rtol=1e-14)
 
 
-# ---- The schedule ----
-
 CANDIDATE = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
 
 
@@ -93,9 +91,6 @@ def test_a_schedule_blends_successive_iterates():
         np.testing.assert_allclose(scheduled(p, 1.0), expected, rtol=1e-15)
         blend = 0.75 * scheduled(p - 1, 1.0) + 0.25 * scheduled(p, 1.0)
         np.testing.assert_allclose(scheduled(p, 0.25), blend, rtol=1e-14)
-
-
-# ---- Derivatives ----
 
 
 def test_derivatives_with_respect_to_the_manifold_and_the_values():
@@ -124,9 +119,6 @@ def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifol
     velocity, changes = rates(jnp.array(0.2))
     assert float(jnp.linalg.norm(velocity)) > 1e-2
     assert all(abs(float(change)) < 1e-12 for change in changes.values())
-
-
-# ---- As a part of a network ----
 
 
 def test_a_conservative_network_is_its_candidate_moved():

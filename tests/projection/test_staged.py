@@ -102,9 +102,6 @@ def test_mistakes_are_named():
         dfc.Staged(("circle", dfc.Directional()))
 
 
-# ---- Projection along the error estimate ----
-
-
 TODA = dfc.systems.get("toda-lattice")
 
 

@@ -48,9 +48,6 @@ def message(sol):
     return dfx.RESULTS[sol.result]
 
 
-# ---- The box ----
-
-
 @given(st.integers(0, 10**6))
 def test_a_box_contains_what_it_was_built_around_and_nothing_beyond(seed):
     rng = np.random.default_rng(seed)
@@ -63,9 +60,6 @@ def test_a_box_contains_what_it_was_built_around_and_nothing_beyond(seed):
     q = highest["q"].at[seed % 2].add(1e-9)
     assert not box.contains({**highest, "q": q})
     assert not box.contains({**highest, "p": (jnp.array(jnp.nan),)})
-
-
-# ---- Ignore and report ----
 
 
 def test_the_report_counts_steps_and_knows_the_first_time():
@@ -84,34 +78,12 @@ def test_the_report_counts_steps_and_knows_the_first_time():
     )
 
 
-def limited(max_error, error=1e-3):
-    network = Rotation(jnp.array(error))
-    return unchecked(network, outside=dfc.learned.Report(), max_error=jnp.array(max_error))
-
-
-def test_a_large_error_counts_as_outside():
-    """The error of a step is 1e-3 √2 h up to higher orders."""
-
-    def outside(max_error, h):
-        return dfc.learned.domain_statistics(
-            solve(limited(max_error), dt0=h, saveat=STATE)
-        ).num_outside
-
-    assert outside(6e-4, 0.5) == 0
-    assert outside(3e-4, 0.5) == 10
-    assert outside(3e-4, 0.25) == 0
-    assert outside(1.0, 0.5) == 0
-
-
 def test_rejected_steps_do_not_count():
     solver = unchecked(KNOWS, outside=dfc.learned.Report(), corrections=1)
     controller = dfx.PIDController(rtol=1e-4, atol=1e-4)
     sol = solve(solver, stepsize_controller=controller, saveat=STATE)
     assert sol.stats["num_rejected_steps"] > 0
     assert dfc.learned.domain_statistics(sol).num_steps == sol.stats["num_accepted_steps"]
-
-
-# ---- Fail ----
 
 
 def test_leaving_the_domain_fails_at_a_time(errors_raise):
@@ -127,6 +99,10 @@ def test_leaving_the_domain_fails_at_a_time(errors_raise):
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
     solver = unchecked(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
+    report = unchecked(BARE, outside=dfc.learned.Report(), max_error=3e-4)
+    for length, outside in ((0.5, 10), (0.25, 0)):  # errors of 1e-3 √2 times it
+        sol = solve(report, dt0=length, saveat=STATE)
+        assert dfc.learned.domain_statistics(sol).num_outside == outside
     loose = dfx.PIDController(rtol=1.0, atol=1.0)
     sol = solve(solver, stepsize_controller=loose, saveat=STATE)
     assert sol.result == dfx.RESULTS.successful
@@ -134,9 +110,6 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
     assert sol.stats["num_accepted_steps"] > 14  # each at most 0.3 long
     found = dfc.learned.domain_statistics(sol)
     assert found.num_outside == 0
-
-
-# ---- Another solver ----
 
 
 def test_another_solver_takes_all_steps_outside_and_none_inside():
@@ -173,8 +146,6 @@ def test_derivatives():
 
     dct.assert_gradients(f, jnp.array(0.1), jnp.array([0.9, 0.2]), rtol=1e-6, forward=False)
 
-
-# ---- What is refused ----
 
 Box, REPORT = dfc.learned.Box, dfc.learned.Report()
 NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"

@@ -68,9 +68,6 @@ def test_the_list_of_messages_is_the_same_whatever_was_solved():
     assert fresh.interpreter()["messages"] == len(dfx.RESULTS._index_to_message)
 
 
-# ---- The start ----
-
-
 @pytest.mark.parametrize(
     ("manifold", "message"),
     [
@@ -116,9 +113,6 @@ def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     sol = run(jump, dfx.Tsit5(), Y0.astype(dtype), slow, throw=False, **options)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
     assert sol.stats["num_steps"] <= 60
-
-
-# ---- max_correction ----
 
 
 def double_well(t, y, args):

@@ -33,9 +33,6 @@ def path(solver, t):
     return DEEPONET(y, t % 0.25)
 
 
-# ---- What diffrax offers ----
-
-
 @SOLVERS
 def test_steps_saved_times_and_dense_output_follow_the_network(solver):
     ts = jnp.array([0.1, 0.25, 0.6, 0.97])
@@ -46,13 +43,6 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(sol.evaluate(t), y, rtol=0, atol=1e-14)
     for t, y in zip(np.arange(5) / 4, sol.ys["b"], strict=False):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
-
-
-@SOLVERS
-def test_the_chebyshev_series_does_not_hold_the_weights(solver):
-    sol = solve(solver, saveat=dfx.SaveAt(dense=True), max_steps=4)
-    numbers = sum(x.size for x in jax.tree.leaves(sol.interpolation))
-    assert numbers < 4 * 12 * 3 + 50
 
 
 @SOLVERS
@@ -78,16 +68,10 @@ def test_a_pinn_may_start_later_and_go_back():
     np.testing.assert_allclose(later.ys, jax.vmap(PINN)(jnp.array([0.33, 0.1])), atol=1e-10)
 
 
-# ---- Derivatives ----
-
-
 @SOLVERS
 def test_backsolve_adjoint_explains(solver):
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=diffrax.Tsit5\(\)\)"):
         jax.grad(lambda y0: solve(solver, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0])(LORENZ.y0)
-
-
-# ---- On the manifold ----
 
 
 def test_random_networks_are_on_the_manifold_or_fail(errors_raise):
@@ -115,9 +99,6 @@ def test_random_networks_are_on_the_manifold_or_fail(errors_raise):
         outcomes.append(bool(ok))
         assert not ok or drift <= 1e-14
     assert sum(outcomes) >= 3
-
-
-# ---- What is refused ----
 
 
 def test_a_largest_step_that_is_an_array(errors_raise):

@@ -52,9 +52,6 @@ def test_options_can_be_traced_and_batched():
     np.testing.assert_allclose(batch[1], batch[0], rtol=1e-3)
 
 
-# ---- statistics ----
-
-
 def test_statistics_are_those_of_the_projections():
     sol = run()
     statistics = dfc.statistics(sol)

@@ -41,9 +41,6 @@ def driven(t, y, args):
     return jax.tree.map(lambda x: args * jnp.cos(t) * x, y)
 
 
-# ---- Accuracy ----
-
-
 def relative_error(ys, expected):
     return np.linalg.norm(ys - expected) / np.linalg.norm(expected)
 
@@ -62,9 +59,6 @@ def test_target_of_the_rigid_body():
     options = dict(solver=dfc.RandomFeatureSolver(), dt0=0.25, saveat=dfx.SaveAt(ts=ts))
     sol = solve(system.vector_field, system.y0, 1.75, **options)
     assert relative_error(sol.ys, system.solution(ts, system.y0)) <= 1e-12
-
-
-# ---- The error estimate ----
 
 
 def step(vector_field, solver, y0, h):
@@ -138,9 +132,6 @@ def test_a_stiff_problem():
     np.testing.assert_allclose(sol.ys[-1], expected, rtol=1e-8)
 
 
-# ---- Structure ----
-
-
 def test_a_step_decays_where_the_solution_does():
     """On `z' = λ z`, for λ in the left half plane and on its boundary."""
 
@@ -160,9 +151,6 @@ def test_a_step_decays_where_the_solution_does():
     assert np.all(found)
     assert np.max(moduli) <= 1 + 1e-8
     np.testing.assert_allclose(moduli[:40], 1, atol=1e-7)  # purely imaginary
-
-
-# ---- What diffrax offers ----
 
 
 def test_dense_output_and_saved_times_are_as_accurate_as_the_steps():
@@ -222,9 +210,6 @@ def test_on_a_manifold():
     assert largest(drift_of(run(solver), KEPLER)) > 1e-10
 
 
-# ---- Derivatives ----
-
-
 def test_second_derivatives_of_a_step():
     def final(h):
         term = dfx.ODETerm(lambda t, y, args: args * exponential(t, y, None))
@@ -234,9 +219,6 @@ def test_second_derivatives_of_a_step():
     slope = jax.jit(jax.grad(final))
     expected = (slope(1e-5) - slope(-1e-5)) / 2e-5
     np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(final)))(0.0), expected, rtol=1e-6)
-
-
-# ---- Failure ----
 
 
 def explode(t, y, args):

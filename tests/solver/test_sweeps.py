@@ -35,9 +35,6 @@ def exact(term, y0, h=0.25, t0=0.0, args=None):
     return jax.tree.map(lambda x: x[-1], ys)
 
 
-# ---- Sweeps ----
-
-
 def errors(**options):
     """The median of those of one step."""
     y0s = states(20)
@@ -129,9 +126,6 @@ def test_a_complex_state():
     newton = unchecked(Still(), corrections=1, sweep=NEWTON)
     with pytest.raises(TypeError, match="`NewtonSweep` needs a real state"):
         step(newton, y0, 0.5, term=term)
-
-
-# ---- The error estimate ----
 
 
 @pytest.mark.parametrize("sweep", SWEEPS)
@@ -245,9 +239,6 @@ def test_fixed_steps_do_not_compute_it():
     assert flops(solver) < 1e-3 * one
     assert flops(dfc.ManifoldProjection(solver, LORENZ.manifold)) < 1e-3 * one
     assert flops(solver, stepsize_controller=dfx.PIDController(rtol=1e-3, atol=1e-3)) > one
-
-
-# ---- Adaptive steps ----
 
 
 @eqx.filter_jit

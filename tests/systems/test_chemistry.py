@@ -55,9 +55,6 @@ def test_the_balances_are_conserved(system):
         np.testing.assert_allclose(kept, kept[0], rtol=1e-9)
 
 
-# ---- Any mechanism ----
-
-
 def test_the_balances_of_pollu_are_its_elements():
     assert list(STIFF["pollu"].manifold) == [
         "HCHO + CO + 2 ALD + MEO2 + 2 C2O3 + CO2 + 2 PAN + CH3O",

@@ -38,14 +38,6 @@ def test_toda_traces_begin_with_henons_integral():
     np.testing.assert_allclose(traces[0], henon)
 
 
-def test_pendulum_energy_is_conserved_only_on_the_constraints():
-    system = systems.CartesianPendulum()
-    y = (jnp.array([1.0, 0.5]), jnp.array([0.3, 0.2]))  # q · v is not zero
-    f = system.vector_field(0.0, y, None)
-    _, rate = jax.jvp(lambda y: system.energy(0.0, y, None), (y,), (f,))
-    assert abs(rate) > 1e-2
-
-
 def test_the_body_axis_turns_by_the_angular_velocity():
     system = systems.RigidBodyAttitude(inertia=(1.0, 1.0, 1.0))
     y0 = (jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 0.0]))
@@ -67,9 +59,6 @@ def test_what_is_too_small_is_refused():
         systems.TodaLattice(particles=2)
     with pytest.raises(ValueError, match="at least 4 points"):
         systems.KortewegDeVries(points=3)
-
-
-# ---- The catalogue by name ----
 
 
 def test_every_system_is_found_by_its_own_name():
@@ -100,9 +89,6 @@ def test_every_exported_system_is_listed():
 def test_an_unknown_name_is_answered_with_the_close_ones(wrong, right):
     with pytest.raises(ValueError, match=right):
         systems.get(wrong)
-
-
-# ---- Vector fields from what they conserve ----
 
 
 CANONICAL = ("harmonic-oscillator", "double-pendulum", "kepler", "henon-heiles", "toda-lattice")

@@ -27,9 +27,6 @@ COUNT = 100
 RELATIVE = 1e-13
 
 
-# ---- The formulas, as printed ----
-
-
 def oscillator_energy(y, m, k):
     q, p = y
     return p**2 / (2 * m) + k * q**2 / 2
@@ -108,9 +105,6 @@ def vortex_field(y, gamma):
 def vortex_energy(y, gamma):
     terms = [gamma[i] * gamma[j] * jnp.log(distance(y, i, j)) for i, j in PAIRS if i < j]
     return -sum(terms) / (4 * jnp.pi)
-
-
-# ---- Against the catalogue ----
 
 
 # By system: from parameters to a system of the catalogue, the paper's field, and by our names its
@@ -195,8 +189,6 @@ def test_equations_and_integrals_are_those_printed(name):
     for pair in values.values():
         assert largest_relative(*pair) <= RELATIVE
 
-
-# ---- The numbers that it states ----
 
 DEFAULTS = {
     "harmonic-oscillator": (1.0, 1.0),  # m, k

@@ -65,18 +65,12 @@ def error(pinn):
     return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
 
 
-# ---- It learns ----
-
-
 def test_a_pinn_learns_a_solution():
     before = circle(LAYER)
     after, log = train(before, epochs=300, optimiser=optax.adam(5e-3))
     assert defect(after) < defect(before) / 100
     assert error(after) < 0.05 < error(before)
     assert log.best < log.criteria[0] / 100
-
-
-# ---- What it records and returns ----
 
 
 def test_the_first_loss_is_that_of_the_formula():

@@ -59,9 +59,6 @@ def train(model=None, pool=None, key=KEY, vector_field=oscillator, epochs=40, **
     return dfc.fit(model, vector_field, key=key, sample=pool, recipe=recipe)
 
 
-# ---- Trainings ----
-
-
 @functools.cache
 def trained_clock():
     return train(epochs=60)
@@ -135,8 +132,6 @@ def test_it_learns_where_it_was_never_told_to_look(pool):
     inside = jnp.mean(jax.vmap(network.domain.contains)(-Y0S))
     assert (error < 0.02 and inside > 0.9) if pool else (error > 0.2 and inside == 0)
 
-
-# ---- What is refused ----
 
 MANY = dfc.FirstIntegral(lambda t, y, args: jnp.ones(3) * jnp.sum(y))
 

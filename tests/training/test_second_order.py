@@ -67,17 +67,11 @@ def test_an_update_solves_the_damped_problem(method, damping):
     np.testing.assert_allclose(trained.weights - model.weights, update, rtol=1e-8)
 
 
-# ---- Trainings ----
-
-
 def test_a_window_is_learned_to_ten_digits():
     pinn, log = dfc.fit(turns(3.0), oscillator, key=KEY)
     assert error(pinn) < 1e-8
     assert log.best < 1e-15
     assert log.skipped == 0
-
-
-# ---- Recipes ----
 
 
 def test_the_recipe_goes_by_size():
@@ -87,9 +81,6 @@ def test_the_recipe_goes_by_size():
     assert isinstance(large.optimiser, dfc.learned.SPRING)
     assert large.refresh == 1
     assert isinstance(dfc.learned.second_order(flow_map()).optimiser, dfc.learned.SPRING)
-
-
-# ---- States along solutions ----
 
 
 def test_reachable_states_are_on_the_solutions():

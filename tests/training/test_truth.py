@@ -41,9 +41,6 @@ def true_error(network):
     return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network))(ts) - exact)))
 
 
-# ---- The estimate is the error ----
-
-
 @pytest.mark.parametrize(("windows", "epochs"), [(1, 3), ([0.3, 2.0], 12)])
 def test_the_estimate_is_the_error(windows, epochs):
     """From hopeless trainings to good ones, with jumps of the state between windows."""
@@ -87,9 +84,6 @@ def test_the_estimate_of_a_flow_map_is_its_error():
     np.testing.assert_allclose(log.error, expected, rtol=0.3)
 
 
-# ---- Windows that fail ----
-
-
 def test_a_window_that_failed_is_trained_until_it_is_right():
     """Three turns in one window are too many for so few units."""
     network = pinn(t1=18.0, width=20)
@@ -115,9 +109,6 @@ def test_a_warning_names_the_window_and_the_error():
     with pytest.warns(UserWarning, match=rf"{WRONG}: .* Window 1 of 3, from 1 to 2") as caught:
         _, log = dfc.fit(network, kick, key=KEY, recipe=recipe(network, 20, retries=0))
     assert f"{log.error:.2g}" in str(caught[0].message)
-
-
-# ---- What is refused ----
 
 
 def nan_somewhere(t, y, args):
