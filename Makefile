@@ -72,7 +72,7 @@ slow: $(TEST) ## run the slow tests
 	$(BIN)/python -m pytest $(SHARED) -m slow
 
 # Some projections, solves, systems and networks.
-CHECKED := tests/laws/test_projection.py tests/solver/test_saving.py tests/systems/test_paper.py \
+CHECKED := tests/laws/test_projection.py tests/solver/test_options.py tests/systems/test_paper.py \
   tests/network/test_layer.py
 
 # Without a summary line of its own: see `examples`.

@@ -100,7 +100,7 @@ def drop_scan_kind(package):
     package.method("ManifoldProjection.scan_kind", lambda _: property(lambda self: None))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "implicit_solvers")
+@noticed_by("tests/solver/test_conformance.py", "-k", "every_solver")
 def drop_root_finder(package):
     detached = property(lambda self: diffrax.VeryChord(rtol=1e-3, atol=1e-3))
     package.method("ManifoldProjection.root_finder", lambda _: detached)
@@ -281,21 +281,6 @@ def hang_the_double_pendulum_in_a_gravity_of_1(package):
     package.method("DoublePendulum.__init__", mutate)
 
 
-@noticed_by("tests/systems/test_paper.py", "-k", "printed")
-def turn_the_rigid_body_by_its_angular_velocity(package):
-    def vector_field(self, t, y, args):
-        i1, i2, i3 = self.inertia
-        return jnp.stack(
-            [
-                (i2 - i3) / i1 * y[1] * y[2],
-                (i3 - i1) / i2 * y[2] * y[0],
-                (i1 - i2) / i3 * y[0] * y[1],
-            ]
-        )
-
-    package.method("RigidBody.vector_field", lambda _: vector_field)
-
-
 # ---- Learned solvers ----
 
 
@@ -309,7 +294,7 @@ def stop_the_newton_iteration_of_random_features_at_once(package):
     package.function("_newton", lambda _: newton)
 
 
-@noticed_by("tests/solver/test_random_features_in_diffrax.py", "-k", "say_so")
+@noticed_by("tests/solver/test_random_features.py", "-k", "say_so")
 def report_unsolved_equations_as_a_success(package):
     def mutate(newton):
         def mutated(*arguments):
@@ -321,7 +306,7 @@ def report_unsolved_equations_as_a_success(package):
     package.function("_newton", mutate)
 
 
-@noticed_by("tests/training/test_pool.py", "-k", "leads_nowhere")
+@noticed_by("tests/training/test_pool.py", "-k", "defect_is_large")
 def follow_the_network_wherever_it_goes(package):
     def mutate(moved):
         def mutated(pool, model, args, squares, *rest):

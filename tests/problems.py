@@ -89,7 +89,9 @@ def exponential_solution(t):
 
 
 def solve(vector_field, solver, y0, *, t0=0.0, t1=1.0, dt0=0.1, args=None, **kwargs):
-    times = [None if t is None else jnp.asarray(t, jnp.result_type(float)) for t in (t0, t1, dt0)]
+    """Compiled once for all times, which have the precision of the state."""
+    dtype = jnp.finfo(jnp.result_type(*jax.tree.leaves(y0))).dtype
+    times = [None if t is None else jnp.asarray(t, dtype) for t in (t0, t1, dt0)]
     return _solve(vector_field, solver, *times, y0, args, kwargs)
 
 

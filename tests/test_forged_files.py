@@ -1,11 +1,10 @@
 """Files with the right checksum and malformed contents: one clear `ValueError`, little memory."""
 
 import copy
+import functools
 import hashlib
 import json
 import random
-import subprocess
-import sys
 
 import jax.random as jr
 import pytest
@@ -42,38 +41,26 @@ def parts(path, network):
     return json.loads(header), body
 
 
+VALUES = [
+    None, True, 0, -1, 3, 10**30, 0.5, 1e308, float("nan"), "", "tanh", "Gated", "kepler",
+    "object", "../x", "\x00", [], {}, [[]], [-1], [2**31] * 8, {"array": ["float64", 10**9]},
+    {"array": ["float64", 3]}, {"array": []}, {"array": [["float64"], 1]}, {"given": []},
+    {"dict": {}}, {"list": []}, {"tuple": [None]}, {"tuple": 3}, {"activation": "eval"},
+    {"method": ["vector_field", {"Kepler": {"mu": 1.0}}]}, {"method": ["__reduce__", {"MLP": {}}]},
+    {"method": ["__class__", {"Kepler": {"mu": 1.0}}]}, {"BoxCox": {"exponent": 7.0}},
+    {"Box": {"lower": None, "upper": None}}, {"DeepONet": {}}, {"Path": {}},
+    {"Taylor": {"vector_field": 3, "order": 1, "args": None}},
+    {"MLP": {"weights": {"tuple": []}, "biases": {"tuple": []}, "activation": None}},
+    functools.reduce(lambda tree, _: [tree], range(100), []), ["float32"] * 500,
+]  # fmt: skip
+
+
 def places(tree, place=()):
     """The paths of all entries of a JSON tree."""
     yield place
-    if not isinstance(tree, dict | list):
-        return
-    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
-        yield from places(value, (*place, key))
-
-
-def nested(depth):
-    tree = []
-    for _ in range(depth):
-        tree = [tree]
-    return tree
-
-
-VALUES = [
-    None, True, False, 0, -1, 1, 2, 3, 7, 150, 10**9, 10**30, -(10**30), 0.5, 1e308, 1e-320,
-    float("nan"), float("inf"), "", "x", "tanh", "Gated", "PINN", "kepler", "float64",
-    "float16", "int8", "object", "../x", "\x00", [], {}, [[]], [1], [10**9], [-1], [0], [2**31] * 8,
-    [1] * 100, {"array": ["float64", 10**9]}, {"array": ["float64", 3]}, {"array": []},
-    {"array": ["float64", 0, 10**12]}, {"array": [["float64"], 1]}, {"array": ["bool", -1, -1]},
-    {"dict": {}}, {"list": []}, {"tuple": [None]}, {"dict": []}, {"tuple": 3}, {"activation": []},
-    {"activation": "tanh"}, {"activation": "eval"}, {"given": ["layer", 3]}, {"given": []},
-    {"method": ["vector_field", {"Kepler": {"mu": 1.0}}]}, {"method": ["__init__", None]},
-    {"method": ["__class__", {"Kepler": {"mu": 1.0}}]}, {"method": ["__reduce__", {"MLP": {}}]},
-    {"Kepler": {"mu": 1.0}}, {"BoxCox": {"exponent": 0.5}}, {"BoxCox": {"exponent": 7.0}},
-    {"Box": {"lower": 0.0, "upper": 1.0}}, {"Box": {"lower": None, "upper": None}},
-    {"Taylor": {"vector_field": 3, "order": 1, "args": None}}, {"DeepONet": {}}, {"Path": {}},
-    {"MLP": {"weights": {"tuple": []}, "biases": {"tuple": []}, "activation": None}},
-    nested(5), nested(100), ["float64"] * 5, ["float32"] * 500,
-]  # fmt: skip
+    if isinstance(tree, dict | list):
+        for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            yield from places(value, (*place, key))
 
 
 def mutated(header, rng):
@@ -81,9 +68,7 @@ def mutated(header, rng):
     header = copy.deepcopy(header)
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
         place = rng.choice([p for p in places(header) if p])
-        parent = header
-        for key in place[:-1]:
-            parent = parent[key]
+        parent = functools.reduce(lambda tree, key: tree[key], place[:-1], header)
         kind, value = rng.randrange(5), copy.deepcopy(rng.choice(VALUES))
         if kind == 0:
             del parent[place[-1]]
@@ -96,28 +81,23 @@ def mutated(header, rng):
     return header
 
 
-def outcome(path, content):
-    """Both functions may return something, or raise a `ValueError` with a message; nothing else."""
-    path.write_bytes(content)
-    for function in (dfc.learned.read_info, dfc.load):
-        try:
-            function(path)
-        except ValueError as error:
-            message = str(error)
-        else:
-            continue
-        assert 40 < len(message) < 1000
-
-
 # In the default run few; the count of the law is in the slow one.
 @pytest.mark.parametrize("count", [150, pytest.param(4000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
 def test_mutated_headers(network, count, tmp_path):
-    rng = random.Random(count)
-    path = tmp_path / "a.network"
+    """Both functions may return something, or raise a `ValueError` with a message; nothing else."""
+    rng, path = random.Random(count), tmp_path / "a.network"
     header, body = parts(path, network)
     for _ in range(count):
-        outcome(path, forged(mutated(header, rng), body))
+        path.write_bytes(forged(mutated(header, rng), body))
+        for function in (dfc.learned.read_info, dfc.load):
+            try:
+                function(path)
+            except ValueError as error:
+                message = str(error)
+            else:
+                continue
+            assert 40 < len(message) < 1000
 
 
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS)
@@ -130,85 +110,14 @@ def test_arrays_that_are_too_short_or_too_long(network, tmp_path):
             dfc.load(path)
 
 
-HEADERS = {
-    "nothing": b"",
-    "no json": b"{",
-    "no utf-8": b"\xff\xfe{}",
-    "a number": b"1",
-    "a long number": b"9" * 100_000,
-    "nested lists": b"[" * 100_000,
-    "nested dictionaries": b'{"a":' * 100_000,
-    "nested and closed": b"[" * 900 + b"]" * 900,
-    "a list": b"[]",
-    "a dictionary": b"{}",
-    "not finite": b'{"kind": NaN}',
-}
+HEADERS = [b"", b"{", b"\xff\xfe{}", b"1", b"9" * 100_000, b"[" * 100_000, b'{"a":' * 100_000]
+HEADERS += [b"[" * 900 + b"]" * 900, b"[]", b"{}", b'{"kind": NaN}']
 
 
-@pytest.mark.parametrize("raw", HEADERS.values(), ids=HEADERS)
-def test_headers_that_are_none(raw, tmp_path):
+def test_headers_that_are_none(tmp_path):
     path = tmp_path / "a.network"
-    path.write_bytes(forged(None, b"", raw))
-    for function in (dfc.learned.read_info, dfc.load):
-        with pytest.raises(ValueError, match=r"malformed, though its checksum is right"):
-            function(path)
-
-
-def greedy(path):
-    """Files of about 1 MB that ask for as much memory as they can."""
-    header, body = parts(path, NETWORKS["deeponet"])
-    fields = header["network"]["DeepONet"]
-    nan = float("nan")
-
-    def network(**changed):
-        return header | {"network": {"DeepONet": fields | changed}}
-
-    def arrays(count, *shape):
-        return {"list": [{"array": ["float64", *shape]}] * count}
-
-    return {
-        "a large array": (network(scale={"array": ["float64", 2**40]}), bytes(2**20)),
-        "many large arrays": (network(scale=arrays(9, 2**17 - 1)), bytes(2**20)),
-        "many small arrays": (network(scale=arrays(30_000, 1)), bytes(2**20)),
-        "many empty arrays": (network(scale=arrays(30_000, 0)), b""),
-        "nothing of everything": (network(scale=arrays(900, 0, 2**16)), bytes(2**20)),
-        "a list": (network(scale={"list": [0] * 300_000}), body),
-        "lists": (network(scale={"list": [{"list": []}] * 80_000}), body),
-        "a long series": (
-            network(taylor={"Taylor": fields["taylor"]["Taylor"] | {"order": 9999}}),
-            body,
-        ),
-        "info of dictionaries": (header | {"info": {"a": [{}] * 250_000}}, body),
-        "info of numbers": (header | {"info": {"a": [nan] * 200_000}}, body),
-        "info of keys": (header | {"info": {f"{i}": [] for i in range(80_000)}}, body),
-    }
-
-
-PROBE = """
-import resource, sys
-import diffrax_conserve as dfc
-dfc.load(sys.argv[1])
-start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-for path in sys.argv[2:]:
-    for function in (dfc.learned.read_info, dfc.load):
-        try:
-            function(path)
-        except ValueError:
-            pass
-    print(path, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start)
-"""
-
-
-@pytest.mark.slow
-def test_memory(tmp_path):
-    """The peak of a process that reads all of them, over that of one that has read a good file."""
-    good, paths = tmp_path / "good.network", []
-    for name, (header, body) in greedy(good).items():
-        paths.append(tmp_path / f"{name}.network")
-        paths[-1].write_bytes(forged(header, body))
-        assert paths[-1].stat().st_size < 3e6
-    dfc.save(good, NETWORKS["deeponet"])
-    command = [sys.executable, "-c", PROBE, str(good), *map(str, paths)]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    largest = int(out.split()[-1]) * 1024
-    assert largest < 100e6, out
+    for raw in HEADERS:
+        path.write_bytes(forged(None, b"", raw))
+        for function in (dfc.learned.read_info, dfc.load):
+            with pytest.raises(ValueError, match=r"malformed, though its checksum is right"):
+                function(path)

@@ -38,10 +38,7 @@ def test_every_attack_has_its_turn_and_its_share():
 
 @pytest.mark.parametrize(
     ("code", "wrong"),
-    [
-        ("raise SystemExit(3)", "crashed"),
-        ("import time; time.sleep(60)", "not ended after 1.0 s"),
-    ],
+    [("raise SystemExit(3)", "crashed"), ("import time; time.sleep(60)", "not ended after 1.0 s")],
 )
 def test_a_program_that_crashes_or_hangs_is_wrong(monkeypatch, code, wrong):
     monkeypatch.setattr(runner, "GRACE", 1.0 - far.TIMEOUT)

@@ -1,6 +1,5 @@
 """A law over many cases, of which `make test` runs some and `make slow` the others."""
 
-import itertools
 import zlib
 from collections.abc import Callable, Iterable
 
@@ -26,11 +25,3 @@ def some_of(arguments: str, cases: Iterable, *, ids: Iterable[str], period: int)
         return pytest.mark.parametrize(arguments, params)(test)
 
     return decorate
-
-
-def combinations(*choices: dict) -> dict[str, tuple]:
-    """All combinations of named choices, named."""
-    return {
-        "-".join(names): tuple(choice[name] for choice, name in zip(choices, names, strict=True))
-        for names in itertools.product(*choices)
-    }

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 
-from ..problems import RIGID_BODY, rigid_body
+from ..problems import RIGID_BODY, rigid_body, solve
 
 EPS = float(np.finfo(float).eps)
-# Implicit methods keep their last stage, so that lanes depend on each other within the tolerance.
+# Of implicit methods, which keep their last stage, lanes depend on each other within the tolerance.
 # The first one keeps its last stage.
 ADAPTIVE = [dfx.Tsit5(), dfx.Heun()]
 GOOD, NAN, FAILED, REJECTED = range(4)
@@ -37,18 +37,9 @@ MANIFOLD = {"energy": dfc.FirstIntegral(energy), "momentum": RIGID_BODY["momentu
 
 @eqx.filter_jit
 def lane(solver, controller, y0, kind, dt0):
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(vector_field),
-        dfc.ManifoldProjection(solver, MANIFOLD),
-        0.0,
-        1.0,
-        dt0,
-        y0,
-        args=kind,
-        stepsize_controller=controller,
-        max_steps=600,
-        throw=False,
-    )
+    solver = dfc.ManifoldProjection(solver, MANIFOLD)
+    options = dict(stepsize_controller=controller, max_steps=600, throw=False)
+    sol = solve(vector_field, solver, y0, dt0=dt0, args=kind, **options)
     return sol.ys[-1], dfx.is_okay(sol.result), sol.stats["num_rejected_steps"]
 
 

@@ -8,6 +8,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from ..problems import solve
+
 ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-7)
 
 
@@ -15,18 +17,9 @@ ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-7)
 @eqx.filter_vmap(in_axes=(None, None, None, None, 0, 0, None))
 def okay(field, fn, solver, controller, y0, args, times):
     t1, dt0 = times
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(field),
-        dfc.ManifoldProjection(solver, dfc.FirstIntegral(fn)),
-        jnp.zeros_like(t1),
-        t1,
-        dt0,
-        y0,
-        args,
-        stepsize_controller=controller,
-        max_steps=4096,
-        throw=False,
-    )
+    solver = dfc.ManifoldProjection(solver, dfc.FirstIntegral(fn))
+    options = dict(stepsize_controller=controller, max_steps=4096, throw=False)
+    sol = solve(field, solver, y0, t1=t1, dt0=dt0, args=args, **options)
     return dfx.is_okay(sol.result)
 
 

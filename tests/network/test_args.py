@@ -1,9 +1,6 @@
 """Flow maps of a family of equations, which take `args` as inputs."""
 
-import dataclasses
-
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -11,8 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-
-from ..learned import Scale, unchecked
+import diffrax_conserve.testing as dct
 
 BOX = dfc.learned.Box(
     {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
@@ -33,29 +29,21 @@ TERM = dfx.ODETerm(spring)
 
 def family(order=0, args_domain=BOX, **options):
     taylor = dfc.learned.Taylor(spring, order) if order else None
-    options = dict(width=16, depth=2, core=dfc.learned.Concatenated) | options
-    return dfc.DeepONet(
-        STATES, 0.5, taylor=taylor, args_domain=args_domain, key=jr.key(1), **options
-    )
+    options = dict(width=16, depth=2, core=dfc.learned.Concatenated, taylor=taylor) | options
+    return dfc.DeepONet(STATES, 0.5, args_domain=args_domain, key=jr.key(1), **options)
 
 
 def sample(key):
     return jr.uniform(key, (2,), minval=-1, maxval=1)
 
 
+def fit(**options):
+    return dfc.fit(family(), spring, key=jr.key(0), **(dict(sample=sample) | options))
+
+
 def solve(flow_map, args, check_field=False, **options):
     solver = dfc.DeepONetSolver(flow_map, check_field=check_field, **options)
     return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8, throw=False)
-
-
-@pytest.fixture(scope="module")
-def trained():
-    recipe = dfc.learned.second_order(family(), epochs=300)
-    recipe = dataclasses.replace(recipe, points=100)
-    return dfc.fit(family(1), spring, sample=sample, recipe=recipe, key=jr.key(2))
-
-
-# ---- The network ----
 
 
 @pytest.mark.parametrize("order", [0, 1])
@@ -72,30 +60,19 @@ def test_its_polynomial_has_the_args_of_the_call():
     np.testing.assert_allclose(slope, spring(0.0, Y0, ARGS), rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "wrap",
-    ["repeated", *(pytest.param(w, marks=pytest.mark.slow) for w in ("transformed", "function"))],
-)
-def test_what_wraps_a_flow_map_hands_args_on(wrap):
+def test_a_repeated_flow_map_hands_args_on():
     inner = family()
-    match wrap:
-        case "repeated":
-            outer = dfc.learned.Repeated(inner, 2)
-            expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
-        case "transformed":
-            outer = dfc.learned.Transformed(inner, Scale(jnp.array([2.0, 4.0])))
-            expected = inner(Y0 / jnp.array([2.0, 4.0]), ARGS, 0.4) * jnp.array([2.0, 4.0])
-        case "function":
-            function = lambda y0, args, h: inner(y0, args, h)  # noqa: E731
-            outer = dfc.learned.FlowMap(function, 0.5, args_domain=BOX)
-            expected = inner(Y0, ARGS, 0.4)
+    outer = dfc.learned.Repeated(inner, 2)
+    expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
     np.testing.assert_allclose(outer(Y0, ARGS, 0.4), expected, rtol=1e-13)
-    assert outer.args_domain is not None
-    one = solve(outer, ARGS).ys[0]
     y = Y0
     for _ in range(4):
         y = outer(y, ARGS, 0.5)
-    np.testing.assert_allclose(one, y, rtol=1e-12)
+    np.testing.assert_allclose(solve(outer, ARGS).ys[0], y, rtol=1e-12)
+
+
+def test_derivatives_by_args_are_those_of_differences():
+    dct.assert_gradients(lambda a: solve(family(), a).ys[0], ARGS, rtol=1e-7, forward=False)
 
 
 def test_draws_are_in_the_box_and_everywhere():
@@ -105,90 +82,6 @@ def test_draws_are_in_the_box_and_everywhere():
     for leaf in jax.tree.leaves(unit):
         np.testing.assert_allclose(jnp.std(leaf, axis=0), 1 / np.sqrt(3), rtol=0.1)
         np.testing.assert_allclose(jnp.mean(leaf, axis=0), 0, atol=0.1)
-
-
-@pytest.mark.parametrize(
-    ("make", "match"),
-    [
-        (lambda: family(args_domain=(0, 1)), "args_domain"),
-        (lambda: dfc.learned.FlowMap(spring, 0.5, args_domain=1.0), "args_domain"),
-        (lambda: family()(Y0, 0.1), r"called as `\(y0, args, h\)`"),
-        (lambda: family(args_domain=None)(Y0, ARGS, 0.1), r"called as `\(y0, h\)`"),
-        (lambda: family()(Y0, jnp.ones(3), 0.1), "takes `args` of the structure"),
-        (lambda: solve(family(), ARGS | {"b": jnp.ones(3)}), "takes `args` of the structure"),
-    ],
-)
-def test_wrong_uses_are_named(make, match):
-    with pytest.raises((TypeError, ValueError), match=match):
-        make()
-
-
-def test_a_layer_or_args_of_the_polynomial_are_refused():
-    layer = dfc.learned.ConservativeLayer(dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)))
-    with pytest.raises(ValueError, match="cannot have a `layer`"):
-        family(layer=layer)
-    with pytest.raises(ValueError, match="`taylor` has `args` of its own"):
-        dfc.DeepONet(
-            STATES, 0.5, taylor=dfc.learned.Taylor(spring, args=ARGS), args_domain=BOX,
-            key=jr.key(0),
-        )  # fmt: skip
-
-
-# ---- Training ----
-
-
-def _last(args, solver):
-    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8).ys[0]
-
-
-def test_derivatives_by_args_are_those_of_the_solve():
-    learned = unchecked(family())
-    reverse = eqx.filter_jit(jax.jacrev(_last))(ARGS, learned)
-    compiled_last = eqx.filter_jit(_last)
-    step = 1e-5
-    for name, direction in (("w", 1.0), ("b", jnp.array([0.0, 1.0]))):
-        ends = [
-            compiled_last({**ARGS, name: ARGS[name] + s * direction}, learned)
-            for s in (step, -step)
-        ]
-        slope = jnp.sum(reverse[name] * direction, axis=tuple(range(1, reverse[name].ndim)))
-        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=1e-7, atol=1e-9)
-
-
-def _forward(args, solver):
-    adjoint = dfx.ForwardMode()
-    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, adjoint=adjoint).ys[0]
-
-
-def _fine(args):
-    adjoint = dfx.ForwardMode()
-    return dfx.diffeqsolve(TERM, dfx.Dopri8(), 0.0, 2.0, 0.05, Y0, args, adjoint=adjoint).ys[0]
-
-
-def test_a_training_goes_on_bit_for_bit():
-    recipe = dataclasses.replace(dfc.learned.second_order(family(), epochs=4), points=20)
-    train = lambda recipe, **options: dfc.fit(  # noqa: E731
-        family(), spring, sample=sample, recipe=recipe, key=jr.key(2), **options
-    )
-    whole, _ = train(recipe)
-    _, log = train(recipe, seconds=1e-9)
-    assert log.ended == "seconds"
-    assert eqx.tree_equal(train(recipe, state=log.state)[0], whole)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
-        (dict(args=ARGS), "draws them from its `args_domain`"),
-        (dict(sample=dfc.learned.Pool(sample)), "`Pool` is for a flow map of one vector field"),
-    ],
-)
-def test_wrong_trainings_are_named(options, match):
-    with pytest.raises(ValueError, match=match):
-        dfc.fit(family(), spring, key=jr.key(0), **(dict(sample=sample) | options))
-
-
-# ---- The solver ----
 
 
 def test_args_outside_their_domain_are_steps_outside():
@@ -210,15 +103,6 @@ def test_args_outside_their_domain_are_steps_outside():
     np.testing.assert_allclose(replaced.ys, exact, rtol=1e-12)
 
 
-def test_args_may_differ_in_a_batch():
-    args = jax.vmap(BOX.sample)(jr.split(jr.key(7), 5))
-    flow_map = family()
-    batch = eqx.filter_jit(jax.vmap(lambda a: solve(flow_map, a).ys[0]))(args)
-    for i in range(5):
-        one = solve(flow_map, jax.tree.map(lambda x, i=i: x[i], args)).ys[0]
-        np.testing.assert_allclose(batch[i], one, rtol=1e-12)
-
-
 def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
     solve(family(1), ARGS, check_field=True)
     other = dfx.ODETerm(lambda t, y, args: 1.2 * spring(t, y, args))
@@ -227,13 +111,25 @@ def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
         jax.block_until_ready(dfx.diffeqsolve(other, solver, 0.0, 1.0, 0.5, Y0, ARGS).ys)
 
 
-def test_a_file_holds_its_args_domain(tmp_path):
-    flow_map = family()
-    dfc.save(tmp_path / "family", flow_map)
-    again = dfc.load(tmp_path / "family")
-    assert eqx.tree_equal(again, flow_map)
-    dfc.save(tmp_path / "repeated", dfc.learned.Repeated(flow_map, 2))
-    again = dfc.load(tmp_path / "repeated")
-    np.testing.assert_array_equal(
-        again(Y0, ARGS, 1.0), dfc.learned.Repeated(flow_map, 2)(Y0, ARGS, 1.0)
-    )
+LAYER = dfc.learned.ConservativeLayer(dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)))
+OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)
+
+
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        (lambda: family(args_domain=(0, 1)), "args_domain"),
+        (lambda: dfc.learned.FlowMap(spring, 0.5, args_domain=1.0), "args_domain"),
+        (lambda: family()(Y0, 0.1), r"called as `\(y0, args, h\)`"),
+        (lambda: family(args_domain=None)(Y0, ARGS, 0.1), r"called as `\(y0, h\)`"),
+        (lambda: family()(Y0, jnp.ones(3), 0.1), "takes `args` of the structure"),
+        (lambda: solve(family(), ARGS | {"b": jnp.ones(3)}), "takes `args` of the structure"),
+        (lambda: family(layer=LAYER), "cannot have a `layer`"),
+        (lambda: family(taylor=OWN_ARGS), "`taylor` has `args` of its own"),
+        (lambda: fit(args=ARGS), "draws them from its `args_domain`"),
+        (lambda: fit(sample=dfc.learned.Pool(sample)), "`Pool` is for a flow map of one vector"),
+    ],
+)
+def test_mistakes_are_named(make, match):
+    with pytest.raises((TypeError, ValueError), match=match):
+        make()

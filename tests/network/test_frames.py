@@ -1,5 +1,6 @@
-"""Moving frames: a flow map commutes with the symmetries of its equations, whatever its weights."""
+"""Frames: a flow map commutes with the symmetries of its equations, whatever its weights."""
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,6 @@ import diffrax_conserve as dfc
 from ..learned import CORES, LORENZ, SMALL, flow_map, states
 
 VORTICES = dfc.systems.PointVortices()
-# One compilation each, not one for each operation.
-FRAMES = jax.jit(jax.vmap(VORTICES.frame))
 STEP = 0.125
 
 
@@ -28,50 +27,6 @@ def transformed(y, order=(1, 2, 0), angle=0.7, scale=1.3, shift=(0.3, -2.0)):
     """The same vortices under other names, turned, shifted and scaled."""
     turn = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
     return scale * (y[jnp.array(order)] @ turn.T + jnp.array(shift))
-
-
-# ---- The frame of three vortices ----
-
-
-@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (1, 0, 2), (2, 1, 0)])
-def test_symmetries_leave_the_inputs_and_turn_the_basis(order):
-    y0s = states(system=VORTICES)
-    moved = jax.vmap(lambda y: transformed(y, order))(y0s)
-    frames, others = FRAMES(y0s), FRAMES(moved)
-    np.testing.assert_allclose(others.inputs, frames.inputs, atol=1e-12)
-    np.testing.assert_allclose(others.clock, frames.clock / 1.3**2, rtol=1e-12)
-    coefficients = jnp.array([0.3, -1.0, 0.5, 2.0])
-    change = (frames.basis @ coefficients).reshape(y0s.shape)
-    # A change of the state is turned and scaled, but not shifted.
-    expected = jax.vmap(lambda dy: transformed(dy, order, shift=(0.0, 0.0)))(change)
-    found = (others.basis @ coefficients).reshape(y0s.shape)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
-def test_its_basis_spans_what_the_vector_field_can_do():
-    y0s = states(system=VORTICES)
-    frames = FRAMES(y0s)
-    rates = jax.vmap(lambda y: VORTICES.vector_field(0.0, y, None))(y0s).reshape(len(y0s), 6)
-    coefficients = jax.vmap(dfc.learned.Frame.measure)(frames, rates)
-    again = jnp.einsum("snm,sm->sn", frames.basis, coefficients) * frames.clock[:, None]
-    np.testing.assert_allclose(again, rates, atol=1e-12)
-
-
-def test_the_closest_pair_is_first():
-    y = jnp.array([[0.0, 0.0], [5.0, 0.0], [0.0, 0.5]])
-    frame = FRAMES(y[None])
-    np.testing.assert_allclose(frame.clock, 4.0, rtol=1e-14)
-    np.testing.assert_allclose(frame.inputs[0, 2], 0.5 / np.hypot(5.0, 0.25), rtol=1e-14)
-
-
-@pytest.mark.parametrize("strengths", [(1.0, 1.0), (1.0, 1.0, 2.0), (1.0, 1.0, 1.0, 1.0)])
-def test_other_vortices_have_no_such_frame(strengths):
-    system = dfc.systems.PointVortices(strengths)
-    with pytest.raises(ValueError, match="three vortices of equal strengths"):
-        system.frame(system.y0)
-
-
-# ---- Flow maps with a frame ----
 
 
 @pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
@@ -109,24 +64,6 @@ def test_its_domain_is_one_of_shapes():
     np.testing.assert_array_equal(contains(0.01 * y0s), False)
 
 
-def test_wrong_frames_are_named():
-    y0s = states(5, VORTICES)
-    options = dict(key=jr.key(0), **SMALL)
-    with pytest.raises(TypeError):
-        dfc.DeepONet(y0s, 1.0, frame=1.0, **options)
-    with pytest.raises(TypeError, match=r"must return a `diffrax_conserve\.learned\.Frame`"):
-        dfc.DeepONet(y0s, 1.0, frame=lambda y: y, **options)
-    with pytest.raises(ValueError, match=r"`\(6, m\)`"):
-        dfc.DeepONet(y0s, 1.0, frame=lambda y: dfc.learned.Frame(y[0], jnp.ones((3, 2))), **options)
-    with pytest.raises(ValueError, match="cannot have a `layer`"):
-        framed(layer=dfc.learned.ConservativeLayer(VORTICES.manifold))
-    with pytest.raises(ValueError, match="for states of 6 numbers"):
-        framed()(jnp.ones(4), 0.1)
-
-
-# ---- Repeated ----
-
-
 def test_a_repeated_flow_map_is_its_steps_one_after_the_other():
     inner = flow_map(taylor=dfc.learned.Taylor(LORENZ.vector_field))
     repeated = dfc.learned.Repeated(inner, 3)
@@ -143,22 +80,102 @@ def test_a_repeated_flow_map_is_its_steps_one_after_the_other():
     np.testing.assert_allclose(gradient, chained, rtol=1e-12)
 
 
-def test_a_flow_map_without_a_domain_repeated():
-    class Still(eqx.Module):
-        max_step: float = 1.0
-
-        def __call__(self, y0, h):
-            return y0
-
-    repeated = dfc.learned.Repeated(Still(), 2)
-    assert repeated.order == 0
-    assert repeated.domain is None
+Frame, OTHERS = dfc.learned.Frame, dfc.systems.PointVortices((1.0, 1.0))
+LAYER = dfc.learned.ConservativeLayer(VORTICES.manifold)
 
 
-def test_wrong_repetitions_are_named():
-    with pytest.raises(ValueError, match="`count` must be a positive integer"):
-        dfc.learned.Repeated(flow_map(), 0)
-    with pytest.raises(TypeError, match="which is no flow map"):
-        dfc.learned.Repeated(lambda y0, h: y0, 2)
-    with pytest.raises(ValueError, match="Train its inner"):
-        dfc.fit(dfc.learned.Repeated(flow_map(), 2), LORENZ.vector_field, key=jr.key(0))
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda: OTHERS.frame(OTHERS.y0), ValueError, "three vortices of equal strengths"),
+        (lambda: framed(frame=1.0), TypeError, None),
+        (lambda: framed(frame=lambda y: y), TypeError, r"must return a .*learned\.Frame`"),
+        (lambda: framed(frame=lambda y: Frame(y[0], jnp.ones((3, 2)))), ValueError, r"`\(6, m\)`"),
+        (lambda: framed(layer=LAYER), ValueError, "cannot have a `layer`"),
+        (lambda: framed()(jnp.ones(4), 0.1), ValueError, "for states of 6 numbers"),
+        (lambda: dfc.learned.Repeated(flow_map(), 0), ValueError, "`count` must be a positive"),
+        (lambda: dfc.learned.Repeated(lambda y0, h: y0, 2), TypeError, "which is no flow map"),
+    ],
+)
+def test_mistakes_are_named(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
+
+
+# ---- The frame of Kepler's problem, and the flow map of the zoo that has it ----
+
+
+KEPLER = dfc.systems.Kepler(mu=1.7)
+Y0S = states(system=KEPLER)
+
+
+def reflected(y, angle=0.7, scale=1.3, mirror=-1.0):
+    """The same orbit turned, seen in a mirror, and larger."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    matrix = jnp.array([[c, -s], [s, c]]) @ jnp.diag(jnp.array([mirror, 1.0]))
+    q, p = y
+    return scale * q @ matrix.T, p @ matrix.T / jnp.sqrt(scale)
+
+
+@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+def test_untrained_it_commutes_with_those_of_kepler(core, order):
+    taylor = dfc.learned.Taylor(KEPLER.vector_field, order) if order else None
+    network = dfc.DeepONet(
+        Y0S, 0.1, taylor=taylor, core=CORES[core], frame=KEPLER.frame, key=jr.key(0), **SMALL
+    )
+    step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
+    found, expected = step(reflected(Y0S), 0.1 * 1.3**1.5), reflected(step(Y0S, 0.1))
+    scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in expected)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * scale)
+
+
+SYSTEM, ZOO = dfc.systems.Kepler(), dfc.load_pretrained("kepler")
+
+
+@jax.jit
+@jax.vmap
+def longest_step(y):
+    """Its error, whether its start is in the domain, and whether all of it is."""
+    exact = jax.tree.map(lambda x: x[0], SYSTEM.solution(jnp.array([0.5]), y))
+    differences = jax.tree.map(jnp.subtract, ZOO(y, 0.5), exact)
+    error = jnp.linalg.norm(jnp.concatenate(differences))
+    return error, ZOO.domain.contains(y), ZOO.inside(y, 0.5)
+
+
+def orbits(sizes):
+    """Random states on orbits with these major semi-axes."""
+    q, p = states(sizes.size, SYSTEM)
+    energy = jax.vmap(SYSTEM.energy, (None, 0, None))(0.0, (q, p), None)
+    factor = (-2 * energy * sizes)[:, None]
+    return q * factor, p / jnp.sqrt(factor)
+
+
+def test_its_step_against_keplers_equation():
+    """For all that are not too eccentric."""
+    error, starts, stays = map(np.asarray, longest_step(orbits(np.linspace(0.8, 1.2, 1000))))
+    np.testing.assert_array_equal(starts, stays)
+    assert starts.sum() > 500
+    error = error[starts]
+    assert 0 < np.sqrt(np.mean(error**2)) < 1e-6
+    assert np.max(error) < 2e-5
+
+
+def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
+    """Small orbits can start inside and be too fast a quarter later."""
+    size = np.geomspace(0.05, 20, 8000)
+    y0s = orbits(size)
+    error, starts, stays = longest_step(y0s)
+    error, left = error / np.maximum(size, 1), np.asarray(starts & ~stays)
+    assert left.sum() > 100
+    assert np.max(error[left]) > 1  # and without that it would be wrong
+    assert np.max(error[np.asarray(stays)]) < 1e-4
+
+    y0 = jax.tree.map(lambda x: x[np.argmax(np.where(left, error, 0))], y0s)
+    solver = dfc.DeepONetSolver(ZOO, outside=dfc.learned.Refuse())
+    sol = dfx.diffeqsolve(
+        dfx.ODETerm(SYSTEM.vector_field), solver, 0.0, 0.5, 0.5, y0,
+        saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False,
+    )  # fmt: skip
+    assert sol.result != dfx.RESULTS.successful
+    assert dfc.learned.domain_statistics(sol).num_outside == 1

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, flow_map, solution
-from ..problems import OMEGA0, RIGID_BODY, Counted
+from ..learned import EAST, LORENZ, RADIUS, flow_map, solution
+from ..problems import OMEGA0, RIGID_BODY
 
 ONE = jnp.ones(())
 
@@ -49,12 +49,6 @@ def test_the_move_is_along_the_gradients_at_the_candidate():
     np.testing.assert_allclose(rows.T @ multipliers, move, atol=1e-15)
 
 
-def test_a_state_on_the_manifold_stays():
-    layer = dfc.learned.ConservativeLayer(RIGID_BODY)
-    y = moved(layer, OMEGA0, layer.values(0.0, OMEGA0), ONE)
-    np.testing.assert_allclose(y, OMEGA0, rtol=0, atol=1e-15)
-
-
 def test_where_the_gradient_vanishes_nothing_blows_up():
     layer = dfc.learned.ConservativeLayer(RADIUS, steps=5)
     for scale in (0.0, 1e-300, 1e-12, 1e-3):
@@ -78,8 +72,6 @@ def test_many_constraints_use_the_dense_solve():
     np.testing.assert_allclose(y, y0, rtol=1e-14)
 
 
-# ---- The schedule ----
-
 CANDIDATE = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
 
 
@@ -99,56 +91,6 @@ def test_a_schedule_blends_successive_iterates():
         np.testing.assert_allclose(scheduled(p, 1.0), expected, rtol=1e-15)
         blend = 0.75 * scheduled(p - 1, 1.0) + 0.25 * scheduled(p, 1.0)
         np.testing.assert_allclose(scheduled(p, 0.25), blend, rtol=1e-14)
-
-
-def test_every_schedule_compiles_once():
-    energy = Counted(lambda t, y, args: jnp.sum(y**2))
-    layer = dfc.learned.ConservativeLayer(dfc.FirstIntegral(energy), steps=4)
-
-    @jax.jit
-    def run(p, s):
-        return layer(jnp.array([1.1, 0.2]), jnp.array(1.0), 0.0, ONE, (p, s))
-
-    run(jnp.asarray(0), ONE)
-    first = energy.calls
-    for p in range(1, 5):
-        run(jnp.asarray(p), ONE / 2)
-    assert energy.calls == first
-
-
-# ---- Derivatives ----
-
-
-def finite_difference(f, x, direction, h=1e-5):
-    return (f(x + h * direction) - f(x - h * direction)) / (2 * h)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("distance", [1e-3, 0.3])
-def test_first_and_second_derivatives(distance):
-    """To second order, since every loss with a time derivative needs the gradient of one."""
-    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)
-    values = layer.values(0.0, OMEGA0)
-    start = OMEGA0 + distance * jnp.array([0.3, -1.0, 0.5])
-    velocity, direction = jnp.array([0.2, 0.5, -0.4]), jnp.array([-0.7, 0.1, 0.4])
-
-    @jax.jit
-    def f(y):
-        return layer(y, values, 0.0, ONE)
-
-    @jax.jit
-    def rate(y):
-        return jnp.sum(jax.jvp(f, (y,), (velocity,))[1] ** 3)
-
-    @jax.jit
-    def derivatives(y):
-        first = jax.jvp(f, (y,), (velocity,))[1]
-        return first, jax.grad(rate)(y) @ direction, jax.jvp(rate, (y,), (direction,))[1]
-
-    first, reverse, forward = derivatives(start)
-    np.testing.assert_allclose(first, finite_difference(f, start, velocity), atol=1e-8)
-    np.testing.assert_allclose(reverse, finite_difference(rate, start, direction), atol=1e-7)
-    np.testing.assert_allclose(forward, reverse, atol=1e-12)
 
 
 def test_derivatives_with_respect_to_the_manifold_and_the_values():
@@ -179,9 +121,6 @@ def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifol
     assert all(abs(float(change)) < 1e-12 for change in changes.values())
 
 
-# ---- As a part of a network ----
-
-
 def test_a_conservative_network_is_its_candidate_moved():
     layer = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=12)
     plain, y0 = flow_map(), LORENZ.y0
@@ -194,13 +133,6 @@ def test_a_conservative_network_is_its_candidate_moved():
     pinn = eqx.filter_jit(solution(layer=layer))
     assert residual(layer, pinn(1.5), values) < 1e-14
     np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
-
-
-def test_args_are_passed_to_the_manifold():
-    weighted = dfc.FirstIntegral(lambda t, y, args: jnp.sum(args * y**2))
-    layer = dfc.learned.ConservativeLayer(weighted, steps=12, args=jnp.array([1.0, 3.0]))
-    pinn = dfc.PINN(EAST, 0.0, 1.0, key=jr.key(0), layer=layer, **SMALL)
-    assert abs(float(weighted.fn(0, pinn(0.7), layer.args)) - 1) < 1e-14
 
 
 def test_what_is_refused():

@@ -1,18 +1,21 @@
-"""PINNs and DeepONets: exact at the initial time, for every state that is a PyTree."""
+"""Networks: exact at the start for every PyTree, what they compute, and in which precision."""
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from jax.extend.core import jaxprs_in_params
 
 import diffrax_conserve as dfc
 
-from ..learned import LORENZ, SMALL, flow_map, solution, states
+from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, oscillator, solution, states
+from ..problems import solve
+from ..thinned import some_of
 
+KEY = jr.key(0)
 MIXED = {
     "position": jnp.array([[1.0, 2.0], [3.0, -4.0]]),
     "rest": (jnp.array(0.5), [jnp.array([7.0], jnp.float32)]),
@@ -32,21 +35,9 @@ def same_kind(a, b):
     )
 
 
-def test_a_pinn_starts_at_its_initial_state_exactly():
-    pinn = solution()
-    assert bool(jnp.all(pinn(0.0) == LORENZ.y0))
-    assert not bool(jnp.all(pinn(1.5) == LORENZ.y0))
-
-
 @eqx.filter_jit
 def advance(network, y0, h):
     return network(y0, h)
-
-
-@given(st.integers(0, 100), st.integers(-5, 5))
-def test_a_deeponet_starts_at_its_initial_state_exactly(seed, factor):
-    y0 = factor * jr.normal(jr.key(seed), (3,))
-    np.testing.assert_array_equal(advance(flow_map(), y0, jnp.zeros(())), y0)
 
 
 def test_any_pytree_of_arrays_is_a_state():
@@ -57,12 +48,6 @@ def test_any_pytree_of_arrays_is_a_state():
     net = dfc.DeepONet(stacked(MIXED), 0.5, key=jr.key(0), **SMALL)
     assert same_kind(advance(net, MIXED, jnp.array(0.2)), MIXED)
     assert eqx.tree_equal(advance(net, MIXED, jnp.array(0.0)), MIXED)
-
-
-def test_numbers_are_states():
-    assert dfc.PINN(2, 0, 1, key=jr.key(0), **SMALL)(0.0) == 2.0
-    net = dfc.DeepONet(jnp.arange(3.0), 1, key=jr.key(0), **SMALL)
-    assert net(2.0, 0.0) == 2.0
 
 
 def test_the_ansatz_of_the_pinn():
@@ -81,69 +66,133 @@ def test_the_ansatz_of_the_deeponet():
     np.testing.assert_allclose(net(y0, h), expected, rtol=1e-14)
 
 
-def test_without_normalisation_the_inputs_are_raw():
-    pinn = solution(t1=4.0, normalise=False)
-    np.testing.assert_allclose(
-        pinn(3.0), LORENZ.y0 + 3 / 4 * pinn.window(0).net(jnp.array([3.0])), rtol=1e-15
-    )
-    net, y0 = flow_map(core=dfc.learned.Product, normalise=False), LORENZ.y0
-    b, tau = (x.reshape(3, 4) for x in (net.core.branch(y0), net.core.trunk(jnp.array([0.2]))))
-    np.testing.assert_allclose(net(y0, 0.2), y0 + 0.8 * jnp.sum(b * tau, axis=1) / 2, rtol=1e-14)
-
-
 @pytest.mark.parametrize(
-    ("width", "depth", "latent"), [pytest.param(5, 1, 3, marks=pytest.mark.slow), (7, 4, 2)]
+    ("make", "error", "match"),
+    [
+        (lambda: solution(width=0), ValueError, "`width`"),
+        (lambda: solution(depth=-1), ValueError, "`depth`"),
+        (lambda: solution(activation="tan"), ValueError, "`activation`"),
+        (lambda: solution(windows=0), ValueError, "`windows` must be"),
+        (lambda: solution(windows=[2.0, 1.0]), ValueError, "must increase"),
+        (lambda: solution(slope=-1.0), ValueError, "`slope` must be"),
+        (lambda: solution(t1=0.0), ValueError, "`t0` must be less than `t1`"),
+        (lambda: flow_map(max_step=0.0), ValueError, "`max_step` must be positive"),
+        (lambda: flow_map(core="gated"), TypeError, "`core` is 'gated', but it must be"),
+        (lambda: flow_map()(jnp.ones(4), 0.1), ValueError, "of 3 numbers, but was given one of 4"),
+        (lambda: dfc.DeepONet((EAST, LORENZ.y0), 1.0, key=KEY), ValueError, "leading axis"),
+        (lambda: dfc.PINN(jnp.array([1j]), 0.0, 1.0, key=KEY), TypeError, "complex"),
+        (lambda: dfc.learned.Taylor(LORENZ.vector_field, 0), ValueError, "`order` must be a posit"),
+        (lambda: dfc.learned.single_precision(solution()), TypeError, "contains no `DeepONet`"),
+    ],
 )
-def test_sizes(width, depth, latent):
-    net = dfc.DeepONet(
-        states(),
-        1.0,
-        width=width,
-        depth=depth,
-        latent=latent,
-        core=dfc.learned.Product,
-        key=jr.key(0),
-    )
-    assert [w.shape for w in net.core.branch.weights] == [
-        (3, width),
-        *[(width, width)] * (depth - 1),
-        (width, 3 * latent),
-    ]
-    assert len(net.core.trunk.weights) == depth + 1
+def test_mistakes_are_named(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
 
 
-def test_the_activation_by_name_and_as_a_function():
-    by_name, by_function = solution(activation="sin"), solution(activation=jnp.sin)
-    assert bool(jnp.all(by_name(1.5) == by_function(1.5)))
-    assert not bool(jnp.all(by_name(1.5) == solution()(1.5)))
+# ---- The parts of a flow map beyond branch times trunk, and the windows of a PINN ----
 
 
-def test_the_same_key_makes_the_same_network():
-    assert eqx.tree_equal(flow_map(seed=3), flow_map(seed=3))
-    assert not eqx.tree_equal(flow_map(seed=3), flow_map(seed=4))
+KINDS = pytest.mark.parametrize("core", CORES.values(), ids=CORES)
 
 
-def test_float32_stays_float32():
-    y0 = LORENZ.y0.astype(jnp.float32)
-    pinn = dfc.PINN(y0, 0.0, 1.0, key=jr.key(0), **SMALL)
-    assert eqx.filter_eval_shape(pinn, 0.5).dtype == jnp.float32
-    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(eqx.filter(pinn, eqx.is_array)))
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_the_polynomial_of_a_linear_system(order):
+    matrix = jr.normal(jr.key(0), (3, 3))
+    taylor = dfc.learned.Taylor(lambda t, y, args: args * (matrix @ y), order, args=2.0)
+    y0, h = jnp.array([1.0, -2.0, 0.5]), 0.3
+    expected, term = np.asarray(y0), np.asarray(y0)
+    for j in range(1, order + 1):
+        term = 2 * h / j * (np.asarray(matrix) @ term)
+        expected = expected + term
+    np.testing.assert_allclose(taylor(y0, h), expected, rtol=1e-14)
 
 
-@pytest.mark.parametrize("options", [dict(width=0), dict(depth=-1), dict(activation="tan")])
-def test_sizes_that_are_refused(options):
-    with pytest.raises(ValueError, match=f"`{next(iter(options))}`"):
-        solution(**options)
+@some_of("order", [0, 1, 2, 3], ids="0123", period=2)
+@KINDS
+def test_untrained_it_has_the_order_of_its_polynomial(core, order):
+    taylor = dfc.learned.Taylor(LORENZ.vector_field, order) if order else None
+    network = flow_map(core=core, taylor=taylor)
+    assert network.order == order
+    steps = 0.02 / 2.0 ** np.arange(3)
+    exact = LORENZ.reference(jnp.asarray(steps[::-1]))[::-1]
+    errors = [jnp.linalg.norm(network(LORENZ.y0, h) - y) for h, y in zip(steps, exact, strict=True)]
+    slopes = np.diff(np.log2(np.asarray(errors)))
+    np.testing.assert_allclose(slopes, -(order + 1), atol=0.15)
 
 
-def test_what_else_is_refused():
-    with pytest.raises(ValueError, match="`t0` must be less than `t1`"):
-        dfc.PINN(LORENZ.y0, 1.0, 1.0, key=jr.key(0))
-    with pytest.raises(ValueError, match="`max_step` must be positive"):
-        dfc.DeepONet(states(), 0.0, key=jr.key(0))
-    with pytest.raises(ValueError, match="leading axis"):
-        dfc.DeepONet((jnp.ones(3), jnp.ones(4)), 1.0, key=jr.key(0))
-    with pytest.raises(ValueError, match="states of 3 numbers, but was given one of 4"):
-        flow_map()(jnp.ones(4), 0.1)
-    with pytest.raises(TypeError, match="complex"):
-        dfc.PINN(jnp.array([1j]), 0.0, 1.0, key=jr.key(0))
+@KINDS
+def test_every_kind_starts_at_its_state(core):
+    network = flow_map(core=core, taylor=dfc.learned.Taylor(LORENZ.vector_field))
+    np.testing.assert_array_equal(network(LORENZ.y0, 0.0), LORENZ.y0)
+    slope = jax.jacfwd(lambda h: network(LORENZ.y0, h))(0.0)
+    np.testing.assert_allclose(slope, LORENZ.vector_field(0.0, LORENZ.y0, None), rtol=1e-14)
+
+
+def test_a_solve_across_windows():
+    pinn = dfc.PINN(EAST, 0.0, 4.0, windows=2, width=8, depth=1, slope=2.0, key=jr.key(0))
+    end = pinn.window(0)(2.0)
+    pinn = eqx.tree_at(lambda p: p.y0s, pinn, jnp.stack([EAST, end]))
+    ts = jnp.linspace(0, 4, 9)
+    options = dict(t1=4.0, dt0=0.4, saveat=dfx.SaveAt(ts=ts))
+    ys = solve(oscillator, dfc.PINNSolver(pinn), EAST, **options).ys
+    np.testing.assert_allclose(ys, jax.jit(jax.vmap(pinn))(ts), atol=1e-8)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.1, 0.125, 0.25, 0.3, 1.0])
+def test_box_cox_is_a_power_and_has_an_inverse(exponent):
+    y = jnp.logspace(-12, 1, 40)
+    boxcox = dfc.learned.BoxCox(exponent)
+    expected = (y**exponent - 1) / exponent if exponent else jnp.log(y)
+    np.testing.assert_allclose(boxcox(y), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(boxcox.inverse(boxcox(y)), y, rtol=1e-10, atol=1e-15)
+    assert jnp.all(boxcox.inverse(-20.0 * jnp.ones(2)) >= 0)
+
+
+# ---- A network evaluated in float32 inside a flow map in float64 ----
+
+
+EPS32 = float(np.finfo(np.float32).eps)
+
+
+def both(core):
+    """A network and the same in single precision."""
+    network = flow_map(core=core, taylor=dfc.learned.Taylor(LORENZ.vector_field, 1))
+    return network, dfc.learned.single_precision(network)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return both(dfc.learned.Gated)
+
+
+def products(jaxpr):
+    """The dtypes of the factors of all products of matrices."""
+    found = set()
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "dot_general":
+            found |= {v.aval.dtype.name for v in eqn.invars}
+        for inner in jaxprs_in_params(eqn.params):
+            found |= products(inner)
+    return found
+
+
+@pytest.mark.parametrize("core", CORES.values(), ids=CORES)
+def test_only_the_network_is_rounded(core):
+    network, single = both(core)
+    y0s, h = states(20), 0.2
+    exact, rounded = (jax.jit(jax.vmap(lambda y, f=f: f(y, h)))(y0s) for f in (network, single))
+    assert rounded.dtype == jnp.float64
+    # The network's output is multiplied by (h / Δ)² S, and here it is of order one.
+    size = (h / network.max_step) ** 2 * np.asarray(network.scale)
+    error = np.abs(np.asarray(exact - rounded)) / size
+    assert 0 < np.max(error) < 32 * EPS32
+    assert products(jax.make_jaxpr(single)(LORENZ.y0, h).jaxpr) == {"float32"}
+    np.testing.assert_array_equal(single(LORENZ.y0, 0.0), LORENZ.y0)
+
+
+def test_inside_other_flow_maps_and_solvers(pair):
+    network, single = pair
+    for within in (lambda f: dfc.learned.Repeated(f, 2), dfc.DeepONetSolver, lambda f: (f, 1.0)):
+        assert eqx.tree_equal(dfc.learned.single_precision(within(network)), within(single))
+    assert eqx.tree_equal(dfc.learned.single_precision(single), single)

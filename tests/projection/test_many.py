@@ -1,7 +1,7 @@
-"""Many constraints: the matrix is factored once, and nothing else changes."""
+"""Many constraints, formulas of the user, and half precision."""
 
-import math
-
+import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,27 +9,10 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from ..problems import solve
+from ..thinned import some_of
+
 EPS = float(np.finfo(float).eps)
-BONDS = 150
-
-
-def bonds(t, q, args):
-    return jnp.sum(jnp.diff(q, axis=0) ** 2, -1) - args
-
-
-CHAIN = dfc.Constraint(bonds)
-
-
-def chain(count=BONDS, noise=1e-4):
-    rng = np.random.default_rng(0)
-    d = rng.normal(size=(count, 3))
-    q = np.concatenate([np.zeros((1, 3)), np.cumsum(d / np.linalg.norm(d, axis=1)[:, None], 0)])
-    return jnp.asarray(q + noise * rng.normal(size=q.shape))
-
-
-@jax.jit
-def projected(q, length=1.0):
-    return dfc.project(CHAIN, q, args=length, projection=dfc.SimplifiedNewton())
 
 
 def test_dependent_linear_constraints_against_their_pseudoinverse():
@@ -55,56 +38,79 @@ def test_dependent_linear_constraints_against_their_pseudoinverse():
     np.testing.assert_allclose(gradients, cosines - cosines @ inverse @ rows, atol=200 * EPS)
 
 
-@pytest.mark.parametrize("near", [1e-6, 1e-8, 1e-10])
-def test_the_derivative_with_nearly_dependent_constraints_is_right_or_nan(near):
-    rng, n, m = np.random.default_rng(0), 200, 132
-    rows, y, v = rng.normal(size=(m, n)), rng.normal(size=n), rng.normal(size=n)
-    rows[-40:] = rows[:40] + near * rng.normal(size=(40, n))
-    _, slope = _slope(rows, y, rows @ y, v)
-    _, _, basis = np.linalg.svd(rows, full_matrices=False)
-    error = np.abs(slope - (v - basis.T @ (basis @ v)))
-    assert np.all(np.isnan(error)) or np.max(error) < 1e-3
+# ---- A projection that the user writes down is used as it is, and checked ----
 
 
-@jax.jit
-def _slope(rows, y, values, v):
-    def project(y):
-        integrals = dfc.FirstIntegral(lambda t, y, rows: rows @ y)
-        simplified = dfc.SimplifiedNewton()
-        return dfc.project(integrals, y, args=rows, value=values, projection=simplified)[0]
-
-    return jax.jvp(project, (y,), (v,))
+SPHERE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
 
 
-def test_the_scale_of_terms_that_do_not_cancel():
-    """Their sum is as large as that of their moduli, and so is the roundoff."""
-    rng = np.random.default_rng(1)
-    matrix, y = rng.uniform(0.5, 1.5, (130, 2000)), rng.uniform(0.5, 1.5, 2000)
-    kept = dfc.Constraint(lambda t, y, b: jnp.asarray(matrix) @ y - b)
-    project = jax.jit(lambda y, b: dfc.project(kept, y, args=b, projection=dfc.SimplifiedNewton()))
-    _, info = project(y * (1 + 1e-6 * rng.normal(size=2000)), matrix @ y)
-    assert info.ok
-    _, info = project(1.001 * y, matrix @ y)
-    # The residual is a thousandth of the sum of the moduli.
-    np.testing.assert_allclose(info.residual_before, 1e-3, rtol=0.01)
+def rescale(t, y, args, values):
+    return y * jnp.sqrt(values["square"] / jnp.sum(y**2))
 
 
-def test_a_large_state_takes_no_iteration_more_than_it_needs():
-    def energy(t, y, args):
-        return jnp.sum(y**4) / 4
+def rotation(t, y, args):
+    return args * jnp.stack([y[1], -y[0]])
 
-    integral = dfc.FirstIntegral(energy, value=2.0)
-    project = jax.jit(lambda y: dfc.project(integral, y, projection=dfc.SimplifiedNewton()))
-    y = np.random.default_rng(3).normal(size=1000)
-    y *= (2.0 / energy(0.0, y, None)) ** 0.25
-    counts = []
-    for off in (1e-9, 1e-5, 1e-2):
-        found, info = project(y * (1 + off))
-        counts.append(int(info.num_steps))
-        assert info.ok
-        exact = math.fsum(float(x) ** 4 for x in found) / 4
-        scale = 2.0 + math.fsum(float(x) ** 4 for x in found)
-        assert abs(exact - 2.0) <= 16 * EPS * scale
-    assert counts[0] == 1 < counts[1] < counts[2]
-    _, infos = jax.jit(jax.vmap(project))(np.stack([y * (1 + off) for off in (1e-9, 1e-5, 1e-2)]))
-    assert infos.num_steps.tolist() == counts
+
+def run(projection, y0, args, **kwargs):
+    solver = dfc.ManifoldProjection(dfc.RK4(), SPHERE, projection=projection)
+    return solve(rotation, solver, y0, args=args, **kwargs)
+
+
+def test_it_agrees_with_newton_and_so_do_its_derivatives():
+    def total(y, value, projection):
+        found, _ = dfc.project(SPHERE, y, value={"square": value}, projection=projection)
+        return jnp.sum(found**3)
+
+    gradient = jax.jit(jax.value_and_grad(total, (0, 1)), static_argnums=2)
+    y, value = jnp.array([3.0, 4.1]), jnp.array(25.0)
+    closed, newton = (gradient(y, value, p) for p in (dfc.ClosedForm(rescale), dfc.Newton()))
+    for a, b in zip(jax.tree.leaves(closed), jax.tree.leaves(newton), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_a_wrong_formula_fails(errors_raise):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="was not reached"):
+        run(dfc.ClosedForm(lambda t, y, args, values: 1.01 * y), jnp.array([3.0, 4.0]), 1.0)
+
+
+def test_wrong_input_is_explained():
+    for fn in (lambda t, y, args, values: (y,), lambda t, y, args, values: y[:1]):
+        with pytest.raises(ValueError, match="`fn` of a `ClosedForm` returned"):
+            run(dfc.ClosedForm(fn), jnp.array([3.0, 4.0]), 1.0)
+
+
+# ---- States of half precision work with every projection, or are refused with a remedy ----
+
+
+SQUARE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+WORK = {
+    "simplified": dfc.SimplifiedNewton(),
+    "bounded": dfc.SimplifiedNewton(lower=-2.0),
+    "formula": dfc.ClosedForm(lambda t, y, args, v: y * jnp.sqrt(v["square"] / jnp.sum(y**2))),
+    "directional": dfc.Directional(),
+    "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
+}
+
+
+def in_half_precision(projection, dtype):
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection)
+    saveat = dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype))
+    y0 = jnp.array([1.0, 0.5], dtype)
+    return solve(rotation, solver, y0, args=jnp.ones((), dtype), dt0=0.125, saveat=saveat)
+
+
+@some_of("name", WORK, ids=WORK, period=3)
+def test_it_works_in_half_precision(name):
+    for dtype in (jnp.float16, jnp.bfloat16):
+        ys = in_half_precision(WORK[name], dtype).ys
+        assert ys.dtype == dtype
+        squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
+        # The tolerance, of a scale of three times the square, and what rounding the state costs.
+        limit = (16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
+        np.testing.assert_allclose(squares, 1.25, atol=limit)
+
+
+def test_it_is_refused_before_compilation():
+    with pytest.raises(TypeError, match="Convert the state to float32"):
+        in_half_precision(dfc.Newton(), jnp.float16)

@@ -1,8 +1,9 @@
-"""Projection part by part: positions, then velocities."""
+"""Projection part by part, and along the error estimate."""
 
 import diffrax as dfx
 import equinox as eqx
 import hypothesis.strategies as st
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from hypothesis import given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import evaluated
+from .. import problems
+from ..problems import drift_of, evaluated, largest, solve
 
 GRAVITY = 13.7503716373294544  # that of cvPendulum: the period is 2
 INF = jnp.inf
@@ -32,19 +34,7 @@ FIRST, SECOND = (
     dfc.SimplifiedNewton(metric=(INF, 1.0), atol=1e-15),
 )
 STAGED = dfc.Staged(("circle", FIRST), ("tangent", SECOND))
-Y0, TERM = (jnp.array([1.0, 0.0]), jnp.zeros(2)), dfx.ODETerm(pendulum)
-
-
-@eqx.filter_jit
-def solve(projection, y0=Y0, args=GRAVITY, t1=30.0, tol=1e-7, inner=None, **options):
-    inner = dfx.Tsit5() if inner is None else inner
-    solver = dfc.ManifoldProjection(inner, MANIFOLD, projection=projection)
-    controller = dfx.PIDController(rtol=tol, atol=tol)
-    options = {"dt0": None, "stepsize_controller": controller, "max_steps": 4096} | options
-    return dfx.diffeqsolve(TERM, solver, 0.0, t1, y0=y0, args=jnp.asarray(args), **options)
-
-
-vectors = st.tuples(st.floats(-1, 1), st.floats(-1, 1)).map(np.array)
+Y0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
 
 
 @eqx.filter_jit
@@ -52,14 +42,16 @@ def projected(y):
     return dfc.project(MANIFOLD, y, projection=STAGED)
 
 
+vector = st.tuples(st.floats(-1, 1), st.floats(-1, 1)).map(np.array)
+
+
 @settings(max_examples=20)
-@given(st.floats(0, 6.3), vectors, vectors, vectors)
+@given(st.floats(0, 6.3), vector, vector, vector)
 def test_it_is_the_two_projections_by_hand(angle, velocity, dq, dv):
     """Radially to the circle, then the velocity along it: CVODE's `proj`."""
     q = np.array([np.cos(angle), np.sin(angle)]) + 1e-2 * dq
-    v = velocity + 1e-2 * dv
+    v, unit = velocity + 1e-2 * dv, q / np.linalg.norm(q)
     (found_q, found_v), info = projected((q, v))
-    unit = q / np.linalg.norm(q)
     assert info.ok
     np.testing.assert_allclose(found_q, unit, atol=4e-15)
     np.testing.assert_allclose(found_v, v - unit * (unit @ v), atol=4e-15)
@@ -78,9 +70,9 @@ def test_what_an_earlier_stage_reached_is_held():
 
 def test_saved_times_and_dense_output_are_on_both():
     # The simplest of all solvers, as it is the projection that is in question.
-    fixed = {"inner": dfx.Euler(), "dt0": 0.02, "stepsize_controller": dfx.ConstantStepSize()}
+    solver = dfc.ManifoldProjection(dfx.Euler(), MANIFOLD, projection=STAGED)
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 41), dense=True)
-    sol = solve(STAGED, t1=2.0, saveat=saveat, **fixed)
+    sol = solve(pendulum, solver, Y0, args=GRAVITY, t1=2.0, dt0=0.02, saveat=saveat)
     between = evaluated(sol, jnp.linspace(0, 2, 33))
     for q, v in (sol.ys, between):
         np.testing.assert_allclose(jnp.sum(q**2, axis=1), 1, atol=4e-15)
@@ -99,16 +91,104 @@ def test_a_stage_that_cannot_hold_is_a_failure():
     assert not info.ok
 
 
-@pytest.mark.parametrize(
-    "stages", [(("circle", FIRST),), (("circle", FIRST), ("circle", SECOND)), (("no", FIRST),)]
-)
-def test_each_entry_has_one_stage(stages):
-    with pytest.raises(ValueError, match="Give each entry one stage"):
-        dfc.project(MANIFOLD, Y0, projection=dfc.Staged(*stages))
-
-
-def test_a_stage_is_a_pair():
+def test_mistakes_are_named():
+    one, two = ("circle", FIRST), ("circle", SECOND)
+    for stages in ((one,), (one, two), (("no", FIRST),)):
+        with pytest.raises(ValueError, match="Give each entry one stage"):
+            dfc.project(MANIFOLD, Y0, projection=dfc.Staged(*stages))
     with pytest.raises(TypeError, match="must be a pair"):
         dfc.Staged(FIRST)
     with pytest.raises(TypeError, match="not a projection of a state by itself"):
         dfc.Staged(("circle", dfc.Directional()))
+
+
+TODA = dfc.systems.get("toda-lattice")
+
+
+def momentum(y):
+    return jnp.sum(y[1], axis=-1)
+
+
+def energy(t, y, args):
+    return args * TODA.energy(t, y, None)
+
+
+TODA_ENERGY, TODA_TERM, TODA0 = dfc.FirstIntegral(energy), dfx.ODETerm(TODA.vector_field), TODA.y0
+ONE = jnp.array(1.0)
+
+
+def along(inner, y0=TODA0, args=ONE, t1=3.0, dt0=0.05, **options):
+    solver = dfc.ManifoldProjection(inner, TODA_ENERGY, projection=dfc.Directional())
+    options = dict(t1=t1, dt0=dt0, args=args) | options
+    return problems.solve(TODA.vector_field, solver, y0, **options)
+
+
+ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
+
+
+def test_energy_and_momentum_are_kept_at_every_saved_time():
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True)
+    sol = along(dfx.Bosh3(), saveat=saveat, stepsize_controller=ADAPTIVE)
+    assert largest(drift_of(sol, TODA_ENERGY, ONE)) < 4e-15
+    np.testing.assert_allclose(momentum(sol.ys), momentum(TODA0), atol=1e-13)
+    between = evaluated(sol, jnp.linspace(0.0, 3.0, 77))
+    energies = jax.vmap(energy, (None, 0, None))(0.0, between, ONE)
+    np.testing.assert_allclose(momentum(between), momentum(TODA0), atol=1e-13)
+    np.testing.assert_allclose(energies, energy(0.0, TODA0, ONE), rtol=4e-15)
+
+
+def test_it_lies_on_the_line_along_the_embedded_difference():
+    """One step against Bosh3 by hand."""
+
+    @jax.jit
+    def by_hand():
+        state = dfx.Bosh3().init(TODA_TERM, 0.0, 0.2, TODA0, ONE)
+        return dfx.Bosh3().step(TODA_TERM, 0.0, 0.2, TODA0, ONE, state, False)[:2]
+
+    plain, error = by_hand()
+    found = along(dfx.Bosh3(), t1=0.2, dt0=0.2).ys
+    w = np.concatenate(error)
+    moved = np.concatenate([a[-1] - b for a, b in zip(found, plain, strict=True)])
+    np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), atol=1e-15)
+    assert abs(energy(0.0, plain, ONE) - energy(0.0, TODA0, ONE)) > 1e-9
+
+
+@pytest.mark.slow
+def test_derivatives_agree_with_finite_differences():
+    def run(y0, args):
+        return along(dfx.Bosh3(), y0, args, t1=0.6, dt0=0.2).ys
+
+    dct.assert_gradients(run, TODA0, ONE, rtol=1e-6, forward=False)
+
+
+def test_a_tangent_direction_is_a_failure():
+    """On a circle whose field is constant speed, the error estimate is made tangent by hand."""
+
+    class Tangent(dfx.Euler):
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            y1, _, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+            return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
+
+    circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(Tangent(), circle, projection=dfc.Directional())
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+    sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
+def test_what_cannot_be_is_refused_before_compilation():
+    two = (TODA_ENERGY, dfc.FirstIntegral(lambda t, y, args: momentum(y)))
+
+    def step(inner, manifold):
+        solver = dfc.ManifoldProjection(inner, manifold, projection=dfc.Directional())
+        dfx.diffeqsolve(TODA_TERM, solver, 0, 1, 0.1, TODA0, ONE)
+
+    for inner, manifold, match in [
+        (dfx.Tsit5(), two, "2 scalar constraints"),
+        (dfx.HalfSolver(dfc.RK4()), TODA_ENERGY, "without its sign"),
+        (dfc.RK4(), TODA_ENERGY, "embedded method"),
+    ]:
+        with pytest.raises(ValueError, match=match):
+            step(inner, manifold)
+    with pytest.raises(ValueError, match=r"Elsewhere pass `projection=Newton\(\)`"):
+        dfc.project(TODA_ENERGY, TODA0, args=ONE, value=0.0, projection=dfc.Directional())

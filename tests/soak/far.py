@@ -16,6 +16,7 @@ import optimistix as optx
 
 import diffrax_conserve as dfc
 
+from ..problems import solve
 from .families import FAMILIES
 from .oracle import Tally, log_uniform, long, ratio, values
 
@@ -48,22 +49,13 @@ def compiled(name: str, mode: str) -> Any:
         return y, info.result == optx.RESULTS.successful
 
     def step(start: Any, candidate: Any, a: Any, value: Any, answer: Any) -> Any:
-        # Of its dtype: diffrax promotes a state to the dtype of the times.
-        zero, half = jnp.zeros((), start.dtype), jnp.full((), 0.5, start.dtype)
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(lambda t, y, args: args[1]),
-            # The field leads to the candidate, and conserves nothing.
-            dfc.ManifoldProjection(
-                dfx.Euler(), manifold, projection=projection, max_correction=jnp.inf
-            ),
-            zero,
-            half,
-            half,
-            start,
-            (a, 2 * (candidate - start)),
-            saveat=dfx.SaveAt(t1=True),
-            max_steps=2,
-            throw=False,
+        # The field leads to the candidate, and conserves nothing.
+        solver = dfc.ManifoldProjection(
+            dfx.Euler(), manifold, projection=projection, max_correction=jnp.inf
+        )
+        args, options = (a, 2 * (candidate - start)), dict(max_steps=2, throw=False)
+        sol = solve(
+            lambda t, y, args: args[1], solver, start, t1=0.5, dt0=0.5, args=args, **options
         )
         return sol.ys[0], sol.result == dfx.RESULTS.successful
 

@@ -22,17 +22,10 @@ from .oracle import Tally, log_uniform, ratio, values
 LANES, TIMEOUT = 1000, 600
 # Canonical systems: the first function is the energy, the state (q, p).
 SYSTEMS = {
-    "kepler": FAMILIES["kepler"],
-    "pendulum": FAMILIES["pendulum"],
-    "relativistic": FAMILIES["relativistic"],
-    "toda": FAMILIES["toda"],
-    "populations": FAMILIES["populations"],
+    **{k: FAMILIES[k] for k in ("kepler", "pendulum", "relativistic", "toda", "populations")},
     "exponentials": Family(lambda xp, y, a: [xp.exp(y[0]) + a[0] * xp.exp(y[1])], 2),
     "henon-heiles": Family(
-        lambda xp, y, a: [
-            0.5 * sum(x * x for x in y) + y[0] ** 2 * y[1] - y[1] ** 3 / 3,
-        ],
-        4,
+        lambda xp, y, a: [0.5 * sum(x * x for x in y) + y[0] ** 2 * y[1] - y[1] ** 3 / 3], 4
     ),
     "well": Family(lambda xp, y, a: [0.5 * y[1] ** 2 + a[0] / y[0] ** 2], 2, _positive),
     "quartic": Family(lambda xp, y, a: [y[0] ** 4 + a[0] * y[1] ** 2], 2, _normal),
@@ -82,6 +75,7 @@ def compiled(name: str, solver: str, newton: bool, mode: str, adaptive: bool) ->
         crossing = dfx.Event(
             lambda t, y, args, **_: y[0] - args[-1], root_finder=optx.Newton(1e-6, 1e-6)
         )
+        controller = dfx.PIDController(rtol, rtol) if adaptive else dfx.ConstantStepSize()
         sol = dfx.diffeqsolve(
             dfx.ODETerm(vector_field),
             wrapped,
@@ -91,9 +85,7 @@ def compiled(name: str, solver: str, newton: bool, mode: str, adaptive: bool) ->
             y0,
             jnp.append(a, y0[0] * 0.9),
             saveat=saveat,
-            stepsize_controller=dfx.PIDController(rtol, rtol)
-            if adaptive
-            else dfx.ConstantStepSize(),
+            stepsize_controller=controller,
             event=crossing if mode == "event" else None,
             max_steps=MAX_STEPS,
             throw=False,

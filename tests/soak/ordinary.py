@@ -8,7 +8,6 @@ this distance, and if the squares of their gradients are in the range of the dty
 """
 
 import functools
-import itertools
 from typing import Any
 
 import jax
@@ -27,16 +26,12 @@ LEFT_OUT = {"redundant", "nearly parallel", "saddle"}
 _STEPS = 60
 
 
-def _layers(seed: int, *sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    rng = np.random.default_rng(seed)
-    return [
-        (rng.normal(size=(m, n)) / np.sqrt(n), rng.normal(size=m))
-        for n, m in itertools.pairwise(sizes)
-    ]
-
-
 def _network(seed: int, gain: float) -> Any:
-    layers = _layers(seed, 2, 32, 32, 1)
+    rng = np.random.default_rng(seed)
+    layers = [
+        (rng.normal(size=(m, n)) / np.sqrt(n), rng.normal(size=m))
+        for n, m in ((2, 32), (32, 32), (32, 1))
+    ]
 
     def fn(xp: Any, y: Any, a: Any) -> list[Any]:
         x = gain * xp.stack([y[0], y[1]])
@@ -109,23 +104,15 @@ def reachable(family: Family, y: np.ndarray, a: np.ndarray, value: np.ndarray) -
             if step == 1:
                 counts &= reached | (off <= 0.5 * before)
             before = off
-            rows = (
-                np.stack([_derivative(family, y, a, k) for k in range(len(y))], axis=1)
-                / size[:, None]
-            )
-            g = g / size
+            units = np.eye(len(y), dtype=y.dtype)[:, :, None] + 0 * y
+            rows = [derivative(lambda z: family.fn(np, z, a), y, unit) for unit in units]
+            rows, g = np.stack(rows, axis=1) / size[:, None], g / size
             damping = np.minimum(1e-2, (g * g).sum(axis=0))
             gram = np.einsum("ikl,jkl->ijl", rows, rows)
             for i in range(m):
                 gram[i, i] = gram[i, i] * (1 + damping) + np.longdouble("1e-4000")
             y = y - np.einsum("ikl,il->kl", rows, _solved(gram, g))
     return counts & reached & np.isfinite(y).all(axis=0)
-
-
-def _derivative(family: Family, y: np.ndarray, a: np.ndarray, k: int) -> np.ndarray:
-    unit = np.zeros_like(y)
-    unit[k] = 1
-    return derivative(lambda z: family.fn(np, z, a), y, unit)
 
 
 def _solved(gram: np.ndarray, b: np.ndarray) -> np.ndarray:

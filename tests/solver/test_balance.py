@@ -10,6 +10,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..problems import drift_of, evaluated, largest
 
 EPS = np.finfo(np.float64).eps
@@ -35,41 +36,11 @@ BALANCE = dfc.FirstIntegral(energy, rate=power)
 Y0, ARGS = (jnp.array(1.2), jnp.array(0.3)), (jnp.array(0.1), jnp.array(0.4))
 
 
-def solve(y0=Y0, args=ARGS, *, t0=0.0, t1=2.0, dt0=0.1, **options):
-    """Compiled once for all times."""
-    return compiled(y0, args, *(jnp.asarray(t) for t in (t0, t1, dt0)), **options)
-
-
-@eqx.filter_jit
-def compiled(
-    y0,
-    args,
-    t0,
-    t1,
-    dt0,
-    *,
-    solver=None,
-    field=pendulum,
-    manifold=BALANCE,
-    saveat=None,
-    max_steps=256,
-    **options,
-):
+def solve(y0=Y0, args=ARGS, *, t1=2.0, solver=None, field=pendulum, manifold=BALANCE, **options):
     solver = dfx.Tsit5() if solver is None else solver
     solver = solver if manifold is None else dfc.ManifoldProjection(solver, manifold)
-    saveat = dfx.SaveAt(t0=True, steps=True, dense=True) if saveat is None else saveat
-    return dfx.diffeqsolve(
-        dfx.ODETerm(field),
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        saveat=saveat,
-        max_steps=max_steps,
-        **options,
-    )
+    options = dict(saveat=dfx.SaveAt(t0=True, steps=True, dense=True), max_steps=256) | options
+    return problems.solve(field, solver, y0, t1=t1, args=args, **options)
 
 
 def worst(solution, manifold=BALANCE, args=ARGS):
@@ -93,99 +64,45 @@ def test_the_balance_is_kept_to_roundoff():
     times = jnp.linspace(0.0, 2.0, 201)
     dense = eqx.tree_at(lambda s: (s.ts, s.ys), kept, (times, evaluated(kept, times)))
     assert worst(dense) <= 16 * EPS
-    exact = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))),
-        dfx.Dopri8(),
-        0.0,
-        2.0,
-        0.01,
-        (Y0, jnp.array(0.0)),
-        ARGS,
-    )
+    both = lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))  # noqa: E731
+    start = (Y0, jnp.array(0.0))
+    exact = problems.solve(both, dfx.Dopri8(), start, t1=2.0, dt0=0.01, args=ARGS)
     state, work = jax.tree.map(lambda y: y[-1], exact.ys)
     gained = energy(2.0, last_of(kept), ARGS) - energy(0.0, Y0, ARGS)
     assert abs(gained - work) < 1e-8
     assert largest(jax.tree.map(jnp.subtract, last_of(kept), state)) < 1e-7
 
 
-@pytest.mark.slow
-def test_the_balance_is_kept_backwards_between_the_steps():
-    saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(1.97, 0.03, 50), dense=True)
-    assert worst(solve(t0=2.0, t1=0.0, dt0=-0.1, saveat=saveat)) <= 16 * EPS
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("solver", "step", "order"),
-    [
-        pytest.param(dfc.RK4(), 0.25, 4, id="rk4"),
-        # Its dense output, and with it the balance, is of a lower order than the state.
-        pytest.param(dfx.Dopri8(), 1.0, 6, id="dopri8"),
-    ],
-)
-def test_the_order_survives(solver, step, order):
-    dct.assert_order(
-        dfc.ManifoldProjection(solver, BALANCE),
-        dfx.ODETerm(pendulum),
-        Y0,
-        t1=2.0,
-        dt0=step,
-        args=ARGS,
-        order=order,
-    )
-
-
-def final(x, adjoint=dfx.RecursiveCheckpointAdjoint()):
-    solution = solve(
-        (x[0], x[1]),
-        (x[2], x[3]),
-        saveat=dfx.SaveAt(t1=True),
-        adjoint=adjoint,
-        dt0=0.2,
-        solver=dfx.Euler(),  # the quickest to compile
-    )
-    return solution.ys[0][-1] + 2 * solution.ys[1][-1]
-
-
 def test_derivatives_are_those_of_differences():
-    x = jnp.stack([*Y0, *ARGS])
-    reverse = jax.jit(jax.grad(final))(x)
-    steps = 1e-4 * jnp.eye(4)
-    ends = jax.vmap(final)(jnp.concatenate([x + steps, x - steps]))
-    assert jnp.allclose(reverse, (ends[:4] - ends[4:]) / 2e-4, rtol=1e-6, atol=1e-7)
+    def end(y0, args):
+        # Euler's method is the quickest to compile.
+        options = dict(saveat=dfx.SaveAt(t1=True), dt0=0.2, solver=dfx.Euler())
+        return solve(y0, args, **options).ys
 
-
-COUPLING = 0.7
-
-
-def coupled(t, y, args):
-    """Two oscillators, of which the second one is damped."""
-    q, v, *_ = y
-    force = COUPLING * (q[1] - q[0])
-    return v, jnp.stack([-q[0] + force, -4 * q[1] - force - 0.2 * v[1]])
-
-
-def energies(t, y, args):
-    q, v, *_ = y
-    return v**2 / 2 + jnp.array([1.0, 4.0]) * q**2 / 2
-
-
-def powers(t, y, args):
-    q, v, *_ = y
-    force = COUPLING * (q[1] - q[0])
-    return jnp.stack([force * v[0], -force * v[1] - 0.2 * v[1] ** 2])
+    dct.assert_gradients(end, Y0, ARGS, rtol=1e-6, forward=False)
 
 
 def test_a_manifold_of_balances_and_integrals():
-    """Several balances in an array, next to an integral without a rate."""
+    """Two oscillators that exchange energy, of which the second one is damped; next to an integral
+    without a rate."""
+
+    def field(t, y, args):
+        q, v, constant = y
+        force = 0.7 * (q[1] - q[0])
+        return v, jnp.stack([-q[0] + force, -4 * q[1] - force - 0.2 * v[1]]), 0 * constant
+
+    def energies(t, y, args):
+        return y[1] ** 2 / 2 + jnp.array([1.0, 4.0]) * y[0] ** 2 / 2
+
+    def powers(t, y, args):
+        q, v, _ = y
+        force = 0.7 * (q[1] - q[0])
+        return jnp.stack([force * v[0], -force * v[1] - 0.2 * v[1] ** 2])
+
     manifold = {
         "energies": dfc.FirstIntegral(energies, rate=powers),
         "constant": dfc.FirstIntegral(lambda t, y, args: y[2]),
     }
-
-    def field(t, y, args):
-        return *coupled(t, y, args), jnp.zeros(())
-
     y0 = (jnp.array([1.0, 0.2]), jnp.array([0.1, 0.5]), jnp.array(3.0))
     solution = solve(y0, None, field=field, manifold=manifold)
     assert worst(solution, manifold, None) <= 16 * EPS
@@ -194,18 +111,9 @@ def test_a_manifold_of_balances_and_integrals():
 
 def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     """A friction that takes less than a unit of roundoff of the energy in each step."""
-    args = jax.tree.map(jnp.float32, (1e-6, 0.0))
-    y0 = jax.tree.map(jnp.float32, Y0)
-    times = jnp.array([0.0, 200.0, 0.01], jnp.float32)
-    solution = eqx.filter_jit(dfx.diffeqsolve)(
-        dfx.ODETerm(pendulum),
-        dfc.ManifoldProjection(dfx.Tsit5(), BALANCE),
-        *times,
-        y0,
-        args,
-        saveat=dfx.SaveAt(t1=True, solver_state=True),
-        max_steps=None,
-    )
+    y0, args = jax.tree.map(jnp.float32, (Y0, (1e-6, 0.0)))
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    solution = solve(y0, args, t1=200.0, dt0=0.01, saveat=saveat, max_steps=None)
     gained = float(solution.solver_state.gained[0])
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, manifold=None, **PRECISE)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))
@@ -213,15 +121,13 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
 
 
 def test_mistakes_are_named():
-    with pytest.raises(TypeError, match="rate"):
-        dfc.FirstIntegral(energy, rate=3)
-    wrong = dfc.FirstIntegral(energy, rate=lambda t, y, args: jnp.ones(2))
-    with pytest.raises(ValueError, match="`rate` of `manifold` returns"):
-        solve(manifold=wrong)
     sol = solve(saveat=dfx.SaveAt(t0=True, t1=True), solver=dfx.Euler())
-    with pytest.raises(ValueError, match="dense=True"):
-        dfc.drift(sol, BALANCE, ARGS)
-    with pytest.raises(ValueError, match="a balance law"):
-        dfc.learned.ConservativeLayer(BALANCE)
-    with pytest.raises(ValueError, match="a balance law"):
-        dct.assert_conserved(sol, BALANCE, ARGS)
+    wrong = dfc.FirstIntegral(energy, rate=lambda t, y, args: jnp.ones(2))
+    for make, text in [
+        (lambda: solve(manifold=wrong), "`rate` of `manifold` returns"),
+        (lambda: dfc.drift(sol, BALANCE, ARGS), "dense=True"),
+        (lambda: dfc.learned.ConservativeLayer(BALANCE), "a balance law"),
+        (lambda: dct.assert_conserved(sol, BALANCE, ARGS), "a balance law"),
+    ]:
+        with pytest.raises(ValueError, match=text):
+            make()

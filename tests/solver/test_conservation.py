@@ -1,80 +1,64 @@
-"""The drift of projected solves, at every kind of saved time."""
+"""The drift of projected solves at every kind of saved time, and their order."""
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+import pytest
+from hypothesis import given, settings
 
 import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
 
-from ..problems import RIGID_BODY, drift_of, largest, rigid_body, solve
-from ..thinned import combinations, some_of
+from ..problems import (
+    EXPONENTIAL,
+    EXPONENTIAL0,
+    KEPLER,
+    KEPLER0,
+    RIGID_BODY,
+    drift_of,
+    evaluated,
+    exponential,
+    exponential_solution,
+    kepler,
+    largest,
+    rigid_body,
+    solve,
+)
+from ..thinned import some_of
 
 SYSTEMS = ["rigid-body", "kepler", "point-vortices", "conservative-lorenz", "double-pendulum"]
-SOLVERS = {"dopri8": dfx.Dopri8(), "euler": dfx.Euler()}
-STEP = {"rigid-body": 0.02, "kepler": 0.02, "double-pendulum": 0.02}
-LIMIT = {jnp.float64: 4e-15, jnp.float32: 1e-6}
 
 
-@eqx.filter_jit
-def drift(solver, system, y0, step, saveat, num_steps=200):
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field),
-        dfc.ManifoldProjection(solver, system.manifold),
-        jnp.zeros((), step.dtype),
-        num_steps * step,
-        step,
-        y0,
-        saveat=saveat,
-        max_steps=num_steps + 2,
-    )
-    return dfc.drift(sol, system.manifold), sol.ys
+@some_of("name", SYSTEMS, ids=SYSTEMS, period=5)
+def test_drift_is_at_roundoff_in_single_precision(name):
+    def single(x):
+        return x.astype(jnp.float32) if eqx.is_inexact_array(x) else x
+
+    system = jax.tree.map(single, dfc.systems.get(name))
+    solver = dfc.ManifoldProjection(dfx.Dopri8(), system.manifold)
+    options = dict(t1=4.0, dt0=0.02, saveat=dfx.SaveAt(t0=True, steps=True), max_steps=202)
+    sol = solve(system.vector_field, solver, jax.tree.map(single, system.y0), **options)
+    assert largest(drift_of(sol, system.manifold)) <= 1e-6
+    assert all(y.dtype == jnp.float32 for y in jax.tree.leaves(sol.ys))
 
 
-def single(tree, dtype):
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, tree)
-
-
-CASES = combinations(
-    {name: name for name in SYSTEMS}, SOLVERS, {"float64": jnp.float64, "float32": jnp.float32}
-)
-
-
-@some_of("name,solver,dtype", CASES.values(), ids=CASES, period=10)
-def test_drift_is_at_roundoff_at_every_step(name, solver, dtype):
-    system = dfc.systems.get(name)
-    step = jnp.asarray(STEP.get(name, 0.05), dtype)
-    y0 = single(system.y0, dtype)
-    saveat = dfx.SaveAt(t0=True, steps=True)
-    worst, ys = drift(solver, single(system, dtype), y0, step, saveat)
-    assert largest(worst) <= LIMIT[dtype]
-    assert all(y.dtype == dtype for y in jax.tree.leaves(ys))
-    moved = jax.tree.map(lambda y, start: jnp.abs(y[200] - start), ys, y0)
-    assert largest(moved) > 1e-2  # a solution that stands still conserves everything
-
-
-@some_of(
-    "name,solver",
-    [("kepler", dfc.RK4()), ("rigid-body", dfx.Tsit5())],
-    ids=["kepler-rk4", "rigid-body-tsit5"],
-    period=2,
-)
-def test_saved_and_dense_times_lie_on_the_manifold(name, solver):
+def test_saved_and_dense_times_lie_on_the_manifold():
     """Where the solution without projection does not."""
-    system = dfc.systems.get(name)
-    ts = jnp.linspace(0, 4, 173)
+    system, ts = dfc.systems.get("kepler"), jnp.linspace(0, 4, 173)
 
     def run(solver, saveat):
         return solve(system.vector_field, solver, system.y0, t1=4.0, dt0=0.02, saveat=saveat)
 
-    projected = dfc.ManifoldProjection(solver, system.manifold)
+    projected = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
     saved = run(projected, dfx.SaveAt(ts=ts, dense=True))
     assert largest(drift_of(saved, system.manifold)) <= 4e-15
-    ys = eqx.filter_jit(lambda sol, ts: jax.vmap(sol.evaluate)(ts))(saved, ts)
+    ys = evaluated(saved, ts)
     for a, b in zip(jax.tree.leaves(ys), jax.tree.leaves(saved.ys), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-    plain = run(solver, dfx.SaveAt(ts=ts))
+    plain = run(dfc.RK4(), dfx.SaveAt(ts=ts))
     assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
@@ -95,33 +79,26 @@ def test_drift_does_not_grow_over_a_million_steps():
     assert largest(drift_of(sol, system.manifold)) <= 4e-15
 
 
-def test_wrapped_state_is_any_pytree_and_so_are_integrals_and_args():
-    def vector_field(t, y, args):
-        return {"q": y["v"]["p"] / args["m"], "v": {"p": -args["k"][0] * y["q"]}}
+ORBIT = dfc.systems.Kepler()
 
-    def integrals(t, y, args):
-        energy = y["v"]["p"] ** 2 / args["m"] / 2 + args["k"][0] * y["q"] ** 2 / 2
-        return {"each": energy[:2], "last": (energy[2],)}
 
-    y0 = {"q": jnp.array([1.0, 2.0, 3.0]), "v": {"p": jnp.array([0.5, 0.0, 1.0])}}
-    args = {"m": jnp.array([1.0, 2.0, 3.0]), "k": (2.0, "unused")}
-    manifold = [dfc.FirstIntegral(integrals)]
-    sol = solve(
-        vector_field,
-        dfc.ManifoldProjection(dfc.RK4(), manifold),
-        y0,
-        args=args,
-        t1=5.0,
-        saveat=dfx.SaveAt(ts=jnp.linspace(0, 5, 11)),
+@settings(max_examples=3)
+@given(packing=dct.restructurings(ORBIT.y0))
+def test_any_pytree_is_a_state(packing):
+    """Of integrals too: in other containers the solve is the same."""
+    manifold = [packing.manifold(ORBIT.manifold), {"both": packing.manifold(ORBIT.manifold)}]
+    field = packing.vector_field(ORBIT.vector_field)
+    saveat = dfx.SaveAt(t0=True, t1=True)
+    solver = dfc.ManifoldProjection(dfx.Heun(), manifold)
+    sol = solve(field, solver, packing.pack(ORBIT.y0), dt0=0.05, saveat=saveat)
+    assert jax.tree.structure(drift_of(sol, manifold)) == jax.tree.structure(
+        jax.tree.map(lambda x: 0, manifold, is_leaf=lambda x: isinstance(x, dfc.FirstIntegral))
     )
-    worst = drift_of(sol, manifold, args)
-    assert worst[0]["each"].shape == (11, 2)
-    assert largest(worst) <= 4e-15
-    frequency = np.sqrt(2.0 / np.array([1.0, 2.0, 3.0]))
-    exact = y0["q"] * np.cos(frequency * 5) + y0["v"]["p"] / args["m"] / frequency * np.sin(
-        frequency * 5
-    )
-    np.testing.assert_allclose(sol.ys["q"][-1], exact, atol=2e-4)
+    assert largest(drift_of(sol, manifold)) <= 4e-15
+    solver = dfc.ManifoldProjection(dfx.Heun(), ORBIT.manifold)
+    plain = solve(ORBIT.vector_field, solver, ORBIT.y0, dt0=0.05, saveat=saveat)
+    for a, b in zip(jax.vmap(packing.unpack)(sol.ys), plain.ys, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
 
 
 def test_at_and_near_a_steady_rotation():
@@ -131,3 +108,98 @@ def test_at_and_near_a_steady_rotation():
         saveat = dfx.SaveAt(t0=True, steps=True)
         sol = solve(rigid_body, solver, jnp.array(y0), t1=10.0, dt0=0.01, saveat=saveat)
         assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
+
+
+# ---- Projection keeps the order of the solver, as published; `Unrolled` is the same method ----
+
+
+def final(vector_field, solver, y0, t1, num_steps):
+    """The state at `t1`, with a leading axis."""
+    return solve(vector_field, solver, y0, t1=t1, dt0=t1 / num_steps, max_steps=None).ys
+
+
+@pytest.mark.parametrize(("num_steps", "error"), [(50, 5.62e-5), (100, 3.56e-6), (200, 2.24e-7)])
+def test_published_error_of_rk4(num_steps, error):
+    """`u' = -e^v, v' = e^u` to t = 5, projected on `e^u + e^v`."""
+    solver = dfc.ManifoldProjection(dfc.RK4(), EXPONENTIAL)
+    ys = final(exponential, solver, EXPONENTIAL0, 5.0, num_steps)
+    found = float(jnp.linalg.norm(ys[-1] - exponential_solution(5.0)))
+    assert float(f"{found:.2e}") == pytest.approx(error)
+
+
+@pytest.mark.parametrize(
+    ("manifold", "error"),
+    [(None, 1.46), (KEPLER[0], 3.48e-2), (KEPLER, 8.69e-3)],
+    ids=["plain", "energy", "energy and momentum"],
+)
+def test_published_error_of_kepler(manifold, error):
+    """RK4 with h = 0.2 to t = 20, where the exact position is known."""
+    solver = dfc.RK4() if manifold is None else dfc.ManifoldProjection(dfc.RK4(), manifold)
+    q, _ = final(kepler, solver, KEPLER0, 20.0, 100)
+    got = np.linalg.norm(q[-1] - np.array([-0.77007558, 0.78834482]))
+    assert float(f"{got:.2e}") == pytest.approx(error)
+
+
+ORDERS = {
+    dfx.Euler(): 0.005,
+    dfx.Heun(): 0.02,
+    dfc.RK4(): 0.1,
+    dfx.Tsit5(): 0.05,
+    dfx.Dopri5(): 0.1,
+    dfx.Dopri8(): 0.17,
+}
+
+
+@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=3)
+def test_the_order_survives(solver):
+    """On the Toda lattice, kept on its energy."""
+    system = dfc.systems.get("toda-lattice")
+    projected = dfc.ManifoldProjection(solver, system.manifold["energy"])
+    term = dfx.ODETerm(system.vector_field)
+    dct.assert_order(projected, term, system.y0, t1=2.0, dt0=ORDERS[solver])
+
+
+def test_rk4_is_the_classical_method():
+    """On `y' = A y` a step is the Taylor polynomial of degree four."""
+    rng = np.random.default_rng(0)
+    a, y = rng.normal(size=(3, 3)), rng.normal(size=3)
+    h, expected, term = 0.3, y.copy(), y.copy()
+    for k in range(1, 5):
+        term = h / k * a @ term
+        expected = expected + term
+    got = final(lambda t, y, args: a @ y, dfc.RK4(), jnp.asarray(y), h, 1)
+    np.testing.assert_allclose(got[-1], expected, rtol=1e-14)
+
+
+def test_dense_output_of_rk4_is_of_fourth_order():
+    def error(num_steps):
+        ts = jnp.linspace(0, 1, 37)
+        ys = solve(
+            exponential, dfc.RK4(), EXPONENTIAL0, dt0=1 / num_steps, saveat=dfx.SaveAt(ts=ts)
+        ).ys
+        return jnp.max(jnp.abs(ys - jax.vmap(exponential_solution)(ts)))
+
+    assert np.log2(error(20) / error(40)) == pytest.approx(4, abs=0.4)
+
+
+SOLVERS = [dfx.Tsit5(), dfx.Dopri5(), dfx.Dopri8(), dfx.Bosh3(), dfx.Heun(), dfx.Ralston()]
+
+
+def adaptive(solver):
+    controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    options = dict(stepsize_controller=controller, saveat=dfx.SaveAt(ts=jnp.linspace(0, 1.5, 7)))
+    return solve(kepler, solver, KEPLER0, t1=1.5, dt0=None, **options)
+
+
+@some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=6)
+def test_same_steps_and_dense_output(solver):
+    ours, theirs = adaptive(dfc.Unrolled(solver)), adaptive(solver)
+    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
+    for x, y in zip(jtu.tree_leaves(ours.ys), jtu.tree_leaves(theirs.ys), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [dfx.Euler(), dfx.Kvaerno5(), "Tsit5", dfc.RK4()])
+def test_other_solvers_are_refused(solver):
+    with pytest.raises(TypeError, match="explicit Runge-Kutta"):
+        dfc.Unrolled(solver)

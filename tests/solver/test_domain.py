@@ -1,10 +1,12 @@
-"""What becomes of a step that starts outside the domain of its flow map."""
+"""A flow map is for states of its domain, and for its own equation."""
+
+import dataclasses
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxtyping
+import jax.random as jr
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,9 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import DRIVEN0, EAST, RADIUS, Still, Within, oscillator, states, unchecked
+from .. import problems
+from ..learned import DRIVEN0, EAST, LORENZ, Still, Within, oscillator, states, unchecked
+from ..thinned import some_of
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
@@ -36,21 +40,12 @@ BARE = Rotation(jnp.array(1e-3))
 KNOWS = Within(BARE, EASTERN)
 
 
-def solve(solver, y0=EAST, *, t0=0.0, t1=5.0, dt0=0.5, **options):
-    # Arrays: for other numbers nothing is compiled anew.
-    return compiled(solver, y0, *map(jnp.asarray, (t0, t1, dt0)), **options)
-
-
-@eqx.filter_jit
-def compiled(solver, y0, t0, t1, dt0, max_steps=200, **options):
-    return dfx.diffeqsolve(TERM, solver, t0, t1, dt0, y0, max_steps=max_steps, **options)
+def solve(solver, y0=EAST, *, t1=5.0, dt0=0.5, **options):
+    return problems.solve(oscillator, solver, y0, t1=t1, dt0=dt0, max_steps=200, **options)
 
 
 def message(sol):
     return dfx.RESULTS[sol.result]
-
-
-# ---- The box ----
 
 
 @given(st.integers(0, 10**6))
@@ -67,33 +62,9 @@ def test_a_box_contains_what_it_was_built_around_and_nothing_beyond(seed):
     assert not box.contains({**highest, "p": (jnp.array(jnp.nan),)})
 
 
-@given(st.integers(0, 10**6))
-def test_an_extended_box_is_the_one_around_all(seed):
-    rng = np.random.default_rng(seed)
-    points = {"q": rng.normal(size=(7, 2)), "p": (rng.normal(size=7),)}
-    first, others = (jax.tree.map(lambda x, s=s: x[s], points) for s in (np.s_[:3], np.s_[3:]))
-    assert eqx.tree_equal(
-        dfc.learned.Box.around(first).extended(others), dfc.learned.Box.around(points)
-    )
-
-
-def test_wrong_boxes_are_refused():
-    with pytest.raises(ValueError, match="Both must be those of a state"):
-        dfc.learned.Box(jnp.zeros(2), jnp.ones(3))
-    with pytest.raises(ValueError, match="stacked along a leading axis"):
-        dfc.learned.Box.around({"q": jnp.array(1.0)})
-    with pytest.raises(ValueError, match="The box is for states of the structure"):
-        dfc.learned.Box.around(states()).contains(DRIVEN0)
-    with pytest.raises(TypeError, match="real"):
-        dfc.learned.Box.around(1j * jnp.ones((3, 2)))
-
-
-# ---- Ignore and report ----
-
-
-@pytest.mark.parametrize("t0", [0.0, pytest.param(-3.0, marks=pytest.mark.slow)])
-def test_the_report_counts_steps_and_knows_the_first_time(t0):
-    sol = solve(unchecked(KNOWS, outside=dfc.learned.Report()), t0=t0, t1=t0 + 5.0, saveat=STATE)
+def test_the_report_counts_steps_and_knows_the_first_time():
+    solver, t0 = unchecked(KNOWS, outside=dfc.learned.Report()), -3.0
+    sol = solve(solver, t0=t0, t1=t0 + 5.0, saveat=STATE)
     starts = jnp.concatenate([EAST[None], sol.ys[:9]])
     outside = ~jax.vmap(EASTERN.contains)(starts)
     found = dfc.learned.domain_statistics(sol)
@@ -102,51 +73,9 @@ def test_the_report_counts_steps_and_knows_the_first_time(t0):
     np.testing.assert_allclose(found.first_outside, t0 + 0.5 * jnp.argmax(outside))
     bare = solve(unchecked(BARE), saveat=STATE).ys
     np.testing.assert_allclose(sol.ys, bare, rtol=0, atol=1e-14)
-
-
-def test_a_solve_that_stays_inside_has_no_first_time():
-    found = dfc.learned.domain_statistics(
-        solve(unchecked(KNOWS, outside=dfc.learned.Report()), t1=1.0, saveat=STATE)
+    assert (
+        dfc.learned.domain_statistics(solve(solver, t1=1.0, saveat=STATE)).first_outside == jnp.inf
     )
-    assert found.fraction_outside == 0
-    assert found.first_outside == jnp.inf
-
-
-def test_the_report_is_seen_through_projection_and_in_a_batch():
-    solver = dfc.ManifoldProjection(unchecked(KNOWS, outside=dfc.learned.Report()), RADIUS)
-
-    def lane(y0):
-        return solve(solver, y0, saveat=STATE)
-
-    sols = jax.vmap(lane)(jnp.stack([EAST, -EAST, 3 * EAST]))
-    found, domain = dfc.statistics(sols), dfc.learned.domain_statistics(sols)
-    np.testing.assert_array_equal(found.num_projections, [10, 10, 10])
-    np.testing.assert_array_equal(domain.first_outside, [2.0, 0.0, 0.0])
-    assert domain.num_outside[0] < domain.num_outside[2]
-    assert jnp.all(found.residual_after < 4e-15)
-
-
-def limited(max_error, error=1e-3):
-    network = Rotation(jnp.array(error))
-    return unchecked(network, outside=dfc.learned.Report(), max_error=jnp.array(max_error))
-
-
-def test_a_large_error_counts_as_outside():
-    """The error of a step is 1e-3 √2 h up to higher orders."""
-
-    def outside(max_error, h):
-        return dfc.learned.domain_statistics(
-            solve(limited(max_error), dt0=h, saveat=STATE)
-        ).num_outside
-
-    assert outside(6e-4, 0.5) == 0
-    assert outside(3e-4, 0.5) == 10
-    assert outside(3e-4, 0.25) == 0
-    assert outside(1.0, 0.5) == 0
-    with_nan = limited(1.0, error=jnp.nan)
-    sol = solve(with_nan, saveat=STATE, throw=False)
-    assert dfc.learned.domain_statistics(sol).num_outside == 1
-    assert "is not finite" in message(sol)
 
 
 def test_rejected_steps_do_not_count():
@@ -157,33 +86,23 @@ def test_rejected_steps_do_not_count():
     assert dfc.learned.domain_statistics(sol).num_steps == sol.stats["num_accepted_steps"]
 
 
-# ---- Fail ----
-
-
-@pytest.mark.parametrize(
-    ("y0", "t0", "time"),
-    [(EAST, -20.0, -18.0), pytest.param(-EAST, 0.0, 0.0, marks=pytest.mark.slow)],
-)
-def test_leaving_the_domain_fails_at_a_time(y0, t0, time, errors_raise):
+def test_leaving_the_domain_fails_at_a_time(errors_raise):
     solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
-    sol = solve(solver, y0, t0=t0, t1=t0 + 5.0, throw=False, saveat=STATE)
+    sol = solve(solver, t0=-20.0, t1=-15.0, throw=False, saveat=STATE)
     assert "a step starts outside the domain" in message(sol)
-    assert dfc.learned.domain_statistics(sol).first_outside == time
+    assert dfc.learned.domain_statistics(sol).first_outside == -18.0
     with pytest.raises(eqx.EquinoxRuntimeError, match=r"outside=diffrax\.Tsit5"):
-        jax.block_until_ready(solve(solver, y0, t0=t0, t1=t0 + 5.0).ys)
+        jax.block_until_ready(solve(solver, t0=-20.0, t1=-15.0).ys)
     assert solve(solver, t1=2.0).result == dfx.RESULTS.successful
-
-
-def test_one_lane_may_fail():
-    solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
-    sols = jax.vmap(lambda y0: solve(solver, y0, t1=1.5, throw=False))(jnp.stack([EAST, -EAST]))
-    okay = sols.result == dfx.RESULTS.successful
-    np.testing.assert_array_equal(okay, [True, False])
 
 
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
     solver = unchecked(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
+    report = unchecked(BARE, outside=dfc.learned.Report(), max_error=3e-4)
+    for length, outside in ((0.5, 10), (0.25, 0)):  # errors of 1e-3 √2 times it
+        sol = solve(report, dt0=length, saveat=STATE)
+        assert dfc.learned.domain_statistics(sol).num_outside == outside
     loose = dfx.PIDController(rtol=1.0, atol=1.0)
     sol = solve(solver, stepsize_controller=loose, saveat=STATE)
     assert sol.result == dfx.RESULTS.successful
@@ -193,18 +112,8 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
     assert found.num_outside == 0
 
 
-# ---- Another solver ----
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [dfx.Dopri5()]
-    + [
-        pytest.param(solver, marks=pytest.mark.slow)
-        for solver in (dfc.RK4(), dfc.ManifoldProjection(dfx.Heun(), RADIUS))
-    ],
-)
-def test_another_solver_takes_all_steps_outside_and_none_inside(solver):
+def test_another_solver_takes_all_steps_outside_and_none_inside():
+    solver = dfx.Dopri5()
     sol = solve(unchecked(KNOWS, outside=solver), saveat=STATE)
     y, taken = EAST, 0
     for i in range(10):
@@ -223,15 +132,11 @@ def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     assert sol.result == dfx.RESULTS.max_steps_reached
 
 
-@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_derivatives(whole):
-    """Of steps of either kind; and of a solve that is partly here, partly there, and nowhere near
-    the boundary."""
+def test_derivatives():
+    """Of steps of either kind, nowhere near the boundary."""
 
     def f(error, y0):
         solver = unchecked(Within(Rotation(error), EASTERN), outside=dfx.Bosh3())
-        if whole:
-            return solve(solver, y0, t1=2.5, max_steps=8).ys
         times = jnp.array(0.0), jnp.array(0.5)
         states = [solver.init(TERM, *times, y, None) for y in (y0, -y0)]
         return [
@@ -239,54 +144,121 @@ def test_derivatives(whole):
             for y, state in zip((y0, -y0), states, strict=True)
         ]
 
-    point = jnp.array(0.1), jnp.array([0.9, 0.2])
-    dct.assert_gradients(f, *point, rtol=1e-6, forward=False)
+    dct.assert_gradients(f, jnp.array(0.1), jnp.array([0.9, 0.2]), rtol=1e-6, forward=False)
 
 
-# ---- What is refused ----
-
-
-@pytest.mark.parametrize(
-    "outside",
-    [dfc.learned.Report(), dfc.learned.Refuse(), dfx.Tsit5()],
-)
-def test_a_policy_needs_a_domain_or_an_error(outside):
-    with pytest.raises(ValueError, match=r"it has no `domain`.*Box.around.*or pass `max_error`"):
-        unchecked(Still(), outside=outside)
-    unchecked(Still(), outside=outside, max_error=1e-3)
+Box, REPORT = dfc.learned.Box, dfc.learned.Report()
+NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
 
 
 @pytest.mark.parametrize(
-    ("options", "text"),
+    ("make", "error", "text"),
     [
-        (dict(max_error=1e-3), "but these are ignored"),
-        (
-            dict(outside=dfc.learned.Report(), max_error=0.0),
-            "`max_error` is 0.0, but it must be positive",
-        ),
-        (dict(outside=dfx.SemiImplicitEuler()), "which needs several terms"),
-        (dict(outside=dfx.Kvaerno5()), "whose root finder takes its tolerances from"),
+        (lambda: Box(jnp.zeros(2), jnp.ones(3)), ValueError, "Both must be those of a state"),
+        (lambda: Box.around({"q": jnp.array(1.0)}), ValueError, "stacked along a leading axis"),
+        (lambda: Box.around(states()).contains(DRIVEN0), ValueError, "for states of the structure"),
+        (lambda: Box.around(1j * jnp.ones((3, 2))), TypeError, "real"),
+        (lambda: unchecked(Still(), outside=REPORT), ValueError, NO_DOMAIN),
+        (lambda: unchecked(Still(), outside=dfx.Tsit5()), ValueError, NO_DOMAIN),
+        (lambda: unchecked(KNOWS, max_error=1e-3), ValueError, "but these are ignored"),
+        (lambda: unchecked(KNOWS, outside=REPORT, max_error=0.0), ValueError, "must be positive"),
+        (lambda: unchecked(KNOWS, outside=dfx.SemiImplicitEuler()), ValueError, "several terms"),
+        (lambda: unchecked(KNOWS, outside=dfx.Kvaerno5()), ValueError, "takes its tolerances from"),
+        (lambda: unchecked(KNOWS, outside="report"), TypeError, "`outside` is 'report'"),
+        (lambda: unchecked(KNOWS, sweep="newton"), TypeError, "`sweep` is 'newton'"),
+        (lambda: unchecked(Within(Still(), 1.0), outside=REPORT), TypeError, "no method `contains"),
     ],
 )
-def test_wrong_options(options, text):
-    with pytest.raises(ValueError, match=text):
-        unchecked(KNOWS, **options)
+def test_mistakes_are_named(make, error, text):
+    with pytest.raises(error, match=text):
+        make()
 
 
-def test_what_is_no_policy():
-    """As users see it: the run-time type checker of the suite would answer first."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        with pytest.raises(TypeError, match="`outside` is 'report', but it must be"):
-            unchecked(KNOWS, outside="report")
-        with pytest.raises(TypeError, match="`sweep` is 'newton', but it must be"):
-            unchecked(KNOWS, sweep="newton")
-        with pytest.raises(TypeError, match="`core` is 'gated', but it must be"):
-            dfc.DeepONet(states(), 0.25, core="gated", key=jax.random.key(0))
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+# ---- A flow map is refused for an equation that it was not trained for ----
 
 
-def test_a_domain_without_contains():
-    with pytest.raises(TypeError, match="no method `contains"):
-        unchecked(Within(Still(), (0.0, 1.0)), outside=dfc.learned.Report())
+TAYLOR = dfc.DeepONet(
+    states(), 0.25, width=6, depth=1, key=jr.key(0),
+    core=dfc.learned.Concatenated, taylor=dfc.learned.Taylor(LORENZ.vector_field),
+)  # fmt: skip
+MESSAGE = "not trained for this vector field"
+
+
+@eqx.filter_jit
+def end(solver, system, y0):
+    term = dfx.ODETerm(system.vector_field)
+    return dfx.diffeqsolve(term, solver, 0.0, 0.5, 0.25, y0).ys[-1]
+
+
+OTHER = dfc.systems.ConservativeLorenz(sigma=1.01)
+SOLVER = dfc.DeepONetSolver(TAYLOR)
+
+
+def test_another_parameter_is_refused(errors_raise):
+    end(SOLVER, LORENZ, LORENZ.y0)
+    with pytest.raises(RuntimeError, match=MESSAGE):
+        end(SOLVER, OTHER, LORENZ.y0)
+    off = dfc.DeepONetSolver(TAYLOR, check_field=False)
+    np.testing.assert_array_equal(end(off, OTHER, LORENZ.y0), end(SOLVER, LORENZ, LORENZ.y0))
+
+
+def test_one_lane_of_a_batch_is_refused_alone():
+    @eqx.filter_jit
+    def result(y0, sigma):
+        system = dataclasses.replace(LORENZ, sigma=sigma)
+        term = dfx.ODETerm(system.vector_field)
+        return dfx.diffeqsolve(term, SOLVER, 0.0, 0.5, 0.25, y0, throw=False).result
+
+    found = jax.vmap(result)(states(4), jnp.array([1.0, 1.0, 1.5, 1.0]))
+    okay = found == dfx.RESULTS.successful
+    np.testing.assert_array_equal(okay, [True, True, False, True])
+    assert MESSAGE in dfx.RESULTS[jax.tree.map(lambda x: x[2], found)]
+
+
+def test_it_is_not_differentiated():
+    off = dfc.DeepONetSolver(TAYLOR, check_field=False)
+    slope = jax.vmap(jax.grad(lambda solver, y0: jnp.sum(end(solver, LORENZ, y0)), 1), (None, 0))
+    on, without = (eqx.filter_jit(slope)(solver, states(3)) for solver in (SOLVER, off))
+    np.testing.assert_allclose(on, without, rtol=1e-12)
+
+
+def test_a_state_at_rest_is_not_refused():
+    rest = jnp.zeros(3)
+    np.testing.assert_array_equal(LORENZ.vector_field(0.0, rest, None), rest)
+    end(SOLVER, OTHER, rest)
+
+
+def refused(name, system, y0s):
+    """How many of the states are refused."""
+    solver, term = dfc.DeepONetSolver(dfc.load_pretrained(name)), dfx.ODETerm(system.vector_field)
+    init = lambda y0: solver.init(term, 0.0, 0.1, y0, None).refused  # noqa: E731
+    return int(jnp.sum(eqx.filter_jit(jax.vmap(init))(y0s) > 0))
+
+
+NAMES = [
+    *(name + kind for name in dfc.systems.names()[2:5] for kind in ("", "-standard")),
+    *("kepler", "pollu", "robertson"),
+]
+
+
+@some_of("name", NAMES, ids=NAMES, period=4)
+def test_a_shipped_flow_map_is_for_its_own_system(name):
+    """At every state of its domain, also those whose slope is learned."""
+    system = dfc.systems.get(name.removesuffix("-standard"))
+    assert refused(name, system, states(1000, system, seed=5)) == 0
+
+
+def test_a_stiff_field_is_not_compared_where_it_changes_within_a_step():
+    """States within a factor of three of those of POLLU six minutes after the emission."""
+    pollu = dfc.systems.get("pollu")
+    y0 = pollu.reference(jnp.array([6.0]))[0]
+    near = y0 * 3.0 ** jr.uniform(jr.key(0), (1000, 20), minval=-1.0, maxval=1.0)
+    assert refused("pollu", pollu, near) == 0
+    assert refused("pollu", pollu, y0[None]) == 0
+
+
+def test_a_learned_slope_is_refused_where_it_is_nothing_like_the_field(errors_raise):
+    solver = dfc.DeepONetSolver(dfc.load_pretrained("double-pendulum-standard"))
+    end(solver, dfc.systems.DoublePendulum(), dfc.systems.DoublePendulum().y0)
+    with pytest.raises(RuntimeError, match="not trained for this vector field"):
+        end(solver, dfc.systems.DoublePendulum(gravity=1.0), dfc.systems.DoublePendulum().y0)

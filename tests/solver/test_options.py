@@ -1,4 +1,4 @@
-"""When to project, and what the projections did."""
+"""When to project and when to save, and what the projections did."""
 
 import diffrax as dfx
 import jax
@@ -8,7 +8,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import OMEGA0, RIGID_BODY, drift_of, rigid_body, solve
+from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body, rotational_energy, solve
 
 STEPS = dfx.SaveAt(t0=True, steps=True, solver_state=True, dense=True)
 
@@ -52,9 +52,6 @@ def test_options_can_be_traced_and_batched():
     np.testing.assert_allclose(batch[1], batch[0], rtol=1e-3)
 
 
-# ---- statistics ----
-
-
 def test_statistics_are_those_of_the_projections():
     sol = run()
     statistics = dfc.statistics(sol)
@@ -63,18 +60,14 @@ def test_statistics_are_those_of_the_projections():
     assert statistics.num_projections == steps
     assert steps <= statistics.num_iterations <= steps * statistics.max_iterations
     assert statistics.residual_after <= 4e-15
-    # Against a step made by hand.
-    infos = []
+    # Against steps made by hand.
+    infos, y = [], OMEGA0
     values = {name: f.fn(0.0, OMEGA0, None) for name, f in RIGID_BODY.items()}
-
-    @jax.jit
-    def step(y):
-        candidate = solve(rigid_body, dfc.RK4(), y, t1=0.1).ys[-1]
-        return dfc.project(RIGID_BODY, candidate, value=values, projection=dfc.SimplifiedNewton())
-
-    y = OMEGA0
     for _ in range(steps):
-        y, info = step(y)
+        candidate = solve(rigid_body, dfc.RK4(), y, t1=0.1).ys[-1]
+        y, info = dfc.project(
+            RIGID_BODY, candidate, value=values, projection=dfc.SimplifiedNewton()
+        )
         infos.append(info)
     # To the scale of a solve all terms inside `fn` count.
     ratio = statistics.residual_before / max(i.residual_before for i in infos)
@@ -83,21 +76,80 @@ def test_statistics_are_those_of_the_projections():
     assert abs(int(statistics.num_iterations) - sum(int(i.num_steps) for i in infos)) <= steps
 
 
-@pytest.mark.slow
-def test_statistics_of_a_batch_and_of_a_nested_solver():
-    def lane(scale):
-        solver = dfx.HalfSolver(dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY))
-        saveat = dfx.SaveAt(t1=True, solver_state=True)
-        return solve(rigid_body, solver, scale * OMEGA0, saveat=saveat, dt0=0.5)
-
-    statistics = dfc.statistics(jax.vmap(lane)(jnp.array([0.5, 1.0])))
-    np.testing.assert_array_equal(statistics.num_projections, [4, 4])  # the two halves
-    assert statistics.correction[0] < statistics.correction[1]
-
-
 def test_statistics_need_the_solver_state():
     with pytest.raises(ValueError, match="solver_state=True"):
         dfc.statistics(solve(rigid_body, dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY), OMEGA0))
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     with pytest.raises(ValueError, match="ManifoldProjection"):
         dfc.statistics(solve(rigid_body, dfx.Tsit5(), OMEGA0, saveat=saveat))
+
+
+# ---- Every way to save, to stop, and to choose steps that diffrax has ----
+
+
+SOLVER = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+ENERGY = rotational_energy(0.0, OMEGA0, None)
+
+
+def saved(saveat, **kwargs):
+    return solve(rigid_body, SOLVER, OMEGA0, saveat=saveat, **kwargs)
+
+
+@jax.jit
+def energies(ys):
+    return jax.vmap(lambda y: rotational_energy(0.0, y, None))(ys)
+
+
+def test_subs_and_functions_of_the_state():
+    ts = jnp.linspace(0, 1, 6)
+    ends, steps = dfx.SubSaveAt(t0=True, t1=True), dfx.SubSaveAt(steps=2)
+    subs = {"end": ends, "energy": dfx.SubSaveAt(ts=ts, fn=rotational_energy), "steps": steps}
+    sol = saved(dfx.SaveAt(subs=subs), max_steps=16)
+    np.testing.assert_allclose(sol.ys["energy"], ENERGY, rtol=4e-16)
+    np.testing.assert_allclose(energies(sol.ys["end"]), ENERGY, rtol=4e-16)
+    finite = jnp.isfinite(sol.ts["steps"])
+    np.testing.assert_allclose(energies(sol.ys["steps"][finite]), ENERGY, rtol=4e-16)
+
+
+ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("controller", "times"),
+    [
+        (dfx.StepTo(ts=jnp.array([0.0, 0.13, 0.5, 1.0])), [0.13, 0.5]),
+        (dfx.ClipStepSizeController(ADAPTIVE, [0.3], [0.51], store_rejected_steps=5), [0.3, 0.51]),
+    ],
+    ids=["step-to", "clip"],
+)
+def test_every_controller_hits_its_times_on_the_manifold(controller, times):
+    dt0 = None if isinstance(controller, dfx.StepTo) else 0.1
+    options = dict(stepsize_controller=controller, dt0=dt0, max_steps=64)
+    sol = saved(dfx.SaveAt(t0=True, steps=True), **options)
+    assert largest(drift_of(sol, RIGID_BODY)) <= 4e-16
+    for t in times:
+        assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6
+
+
+def test_a_steady_state_by_the_implicit_adjoint():
+    """A damped flow on a sphere ends at the point in the direction of `args`, which is
+    differentiated by the implicit function theorem."""
+
+    def towards(t, y, args):
+        return args - jnp.sum(args * y) * y
+
+    sphere = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+
+    def end(args):
+        options = dict(
+            adjoint=dfx.ImplicitAdjoint(),
+            event=dfx.Event(dfx.steady_state_event(rtol=1e-9, atol=1e-9)),
+            # At the limit of stability the steps keep an error of some ten tolerances.
+            stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-11),
+            max_steps=4096,
+        )
+        solver = dfc.ManifoldProjection(dfx.Tsit5(), sphere)
+        return solve(towards, solver, jnp.eye(3)[0], args=args, t1=jnp.inf, **options).ys[-1]
+
+    args = jnp.array([1.0, 2.0, 2.0])
+    np.testing.assert_allclose(end(args), args / 3, rtol=0, atol=1e-8)

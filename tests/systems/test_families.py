@@ -1,24 +1,15 @@
-"""Facts about single systems, from their sources."""
+"""The catalogue by name, vector fields from what they conserve, and facts from the sources."""
 
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import diffrax_conserve as dfc
 from diffrax_conserve import check_invariance, systems
-
-
-def test_sampled_vortices_lie_apart_in_the_annulus():
-    n = 3
-    system = systems.PointVortices()
-    ys = jax.jit(jax.vmap(lambda key: system.sample(key)))(jr.split(jr.key(0), 500))
-    r = np.linalg.norm(ys, axis=-1)
-    assert r.min() >= 0.5
-    assert r.max() <= 1.5
-    gaps = np.linalg.norm(ys[:, :, None] - ys[:, None], axis=-1) + np.eye(n)
-    assert gaps.min() >= 0.3 / n
+from diffrax_conserve.systems import hamiltonian_vector_field, nambu_vector_field
 
 
 def test_laplace_runge_lenz_vector_is_conserved_but_redundant():
@@ -37,15 +28,6 @@ def test_solar_system_has_the_positions_of_its_source():
     np.testing.assert_allclose(v[5] - v[0], [0.00276725, -0.00170702, -0.00136504])
 
 
-def test_centre_of_mass_is_a_first_integral_that_depends_on_time():
-    system = systems.OuterSolarSystem()
-    centre = dfc.FirstIntegral(system.centre_of_mass)
-    ys = jax.vmap(system.sample)(jr.split(jr.key(0), 20))
-    ys = (ys[0], ys[1] + 0.001)  # a frame in which it moves
-    ts = jnp.linspace(-1e3, 1e3, 20)
-    assert check_invariance(system.vector_field, centre, ys, t=ts).ok
-
-
 def test_toda_traces_begin_with_henons_integral():
     system = systems.TodaLattice(a=1.4, b=0.8, particles=4)
     q, p = y = system.sample(jr.key(0))
@@ -54,26 +36,6 @@ def test_toda_traces_begin_with_henons_integral():
     traces = system.higher_traces(0.0, y, None)
     assert traces.shape == (2,)
     np.testing.assert_allclose(traces[0], henon)
-
-
-def test_a_ring_of_two_is_refused():
-    with pytest.raises(ValueError, match="at least 3 particles"):
-        systems.TodaLattice(particles=2)
-
-
-def test_predators_and_prey_rest_at_their_equilibrium():
-    system = systems.LotkaVolterra(alpha=2.0, beta=3.0, gamma=4.0, delta=5.0)
-    rest = jnp.array([4 / 5, 2 / 3])
-    np.testing.assert_allclose(system.vector_field(0.0, rest, None), 0.0, atol=1e-15)
-    np.testing.assert_allclose(jax.grad(system.first_integral, 1)(0.0, rest, None), 0.0, atol=1e-15)
-
-
-def test_pendulum_energy_is_conserved_only_on_the_constraints():
-    system = systems.CartesianPendulum()
-    y = (jnp.array([1.0, 0.5]), jnp.array([0.3, 0.2]))  # q · v is not zero
-    f = system.vector_field(0.0, y, None)
-    _, rate = jax.jvp(lambda y: system.energy(0.0, y, None), (y,), (f,))
-    assert abs(rate) > 1e-2
 
 
 def test_the_body_axis_turns_by_the_angular_velocity():
@@ -92,6 +54,81 @@ def test_the_waves_conserve_at_every_state_also_with_modes_that_are_left_out():
         assert dfc.check_invariance(wave.vector_field, wave.manifold, states).ok
 
 
-def test_waves_need_a_mode_besides_the_mean():
+def test_what_is_too_small_is_refused():
+    with pytest.raises(ValueError, match="at least 3 particles"):
+        systems.TodaLattice(particles=2)
     with pytest.raises(ValueError, match="at least 4 points"):
         systems.KortewegDeVries(points=3)
+
+
+def test_every_system_is_found_by_its_own_name():
+    for name in (*systems.names(), *systems.names(stiff=True)):
+        assert systems.get(name).name == name
+
+
+def test_every_exported_system_is_listed():
+    exported = {
+        x.name
+        for x in vars(systems).values()
+        if isinstance(x, type)
+        and issubclass(x, systems.AbstractSystem)
+        and not x.__name__.startswith("Abstract")
+    }
+    assert exported == {*systems.names(), *systems.names(stiff=True)}
+    assert len(exported) == 15
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [
+        ("keplar", "Did you mean .*'kepler'"),
+        ("Rigid_Body", "Did you mean .*'rigid-body'"),
+        ("zzz", "The catalogue holds: harmonic-oscillator, rigid-body"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_the_close_ones(wrong, right):
+    with pytest.raises(ValueError, match=right):
+        systems.get(wrong)
+
+
+CANONICAL = ("harmonic-oscillator", "double-pendulum", "kepler", "henon-heiles", "toda-lattice")
+
+
+@pytest.mark.parametrize("name", CANONICAL)
+def test_hamiltons_equations_agree_with_those_written_by_hand(name):
+    system = systems.get(name)
+    f = hamiltonian_vector_field(system.energy)
+    y = system.sample(jr.key(0))
+    written, derived = (g(0.0, y, None) for g in (system.vector_field, f))
+    assert jax.tree.structure(written) == jax.tree.structure(derived)
+    np.testing.assert_allclose(ravel_pytree(derived)[0], ravel_pytree(written)[0], atol=1e-14)
+
+
+def test_nambus_equations_are_those_of_lorenz():
+    system = systems.ConservativeLorenz(sigma=1.3, rho=0.7)
+    y = system.sample(jr.key(0))
+    f = nambu_vector_field(system.casimir, system.energy)
+    np.testing.assert_allclose(f(0.0, y, None), system.vector_field(0.0, y, None), atol=1e-15)
+
+
+@pytest.mark.parametrize("as_pair", [tuple, list])
+def test_pairs_and_stacked_arrays_give_the_same(as_pair):
+    def energy(t, y, args):
+        q, p = y
+        return args * (jnp.sum(p**4) / 4 + jnp.sum(q[..., 0] ** 2 * q[..., 1])) * t
+
+    y = jr.normal(jr.key(0), (2, 3, 2))
+    f = hamiltonian_vector_field(energy)
+    pair = f(2.0, as_pair(y), 3.0)
+    assert type(pair) is as_pair
+    np.testing.assert_array_equal(jnp.stack(pair), f(2.0, y, 3.0))
+
+
+@pytest.mark.parametrize("y", [jnp.ones(3), jnp.array(1.0), (jnp.ones(2),), {"q": jnp.ones(2)}])
+def test_a_state_of_the_wrong_form_is_refused(y):
+    f = hamiltonian_vector_field(lambda t, y, args: 0.0)
+    with pytest.raises(TypeError, match=r"must be a pair `\(q, p\)`"):
+        f(0.0, y, None)
+    f = nambu_vector_field(lambda t, y, args: 0.0, lambda t, y, args: 0.0)
+    with pytest.raises(TypeError, match=r"shape \(3,\)"):
+        f(0.0, jnp.ones(4), None)

@@ -13,8 +13,6 @@ E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131. Its misprints, corrected here:
    figures in "the (q, q) plane".)
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,15 +21,10 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve import reproduce as _reproduce
 from diffrax_conserve import systems
-from diffrax_conserve.reproduce._trained import build
 
 COUNT = 100
 RELATIVE = 1e-13
-
-
-# ---- The formulas, as printed ----
 
 
 def oscillator_energy(y, m, k):
@@ -93,17 +86,16 @@ def lorenz_l(y, rho):
     return (y**2 + z**2) / 2 - rho * z
 
 
-def pairs(n):
-    return [(i, j) for i in range(n) for j in range(n) if i != j]
-
-
 def distance(y, i, j):
     return jnp.sqrt((y[i, 0] - y[j, 0]) ** 2 + (y[i, 1] - y[j, 1]) ** 2)
 
 
+PAIRS = [(i, j) for i in range(3) for j in range(3) if i != j]
+
+
 def vortex_field(y, gamma):
     dx, dy = [0.0] * len(gamma), [0.0] * len(gamma)
-    for i, j in pairs(len(gamma)):
+    for i, j in PAIRS:
         r = distance(y, i, j)
         dx[i] = dx[i] - gamma[j] * (y[i, 1] - y[j, 1]) / (2 * jnp.pi * r**2)
         dy[i] = dy[i] + gamma[j] * (y[i, 0] - y[j, 0]) / (2 * jnp.pi * r**2)
@@ -111,64 +103,43 @@ def vortex_field(y, gamma):
 
 
 def vortex_energy(y, gamma):
-    terms = [
-        gamma[i] * gamma[j] * jnp.log(distance(y, i, j)) for i, j in pairs(len(gamma)) if i < j
-    ]
+    terms = [gamma[i] * gamma[j] * jnp.log(distance(y, i, j)) for i, j in PAIRS if i < j]
     return -sum(terms) / (4 * jnp.pi)
 
 
-# ---- Against the catalogue ----
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """A system as a function of its parameters, and what the paper has for its equations."""
-
-    make: object  # from parameters to a system of the catalogue
-    field: object  # from a state and parameters
-    integrals: dict  # by our name: from a state and parameters to what ours must be
-    parameters: int
-    ours: object = lambda y, *parameters: y  # our state, from the paper's
-    theirs: object = lambda rate, *parameters: rate  # the paper's rate of change, from ours
-
-
+# By system: from parameters to a system of the catalogue, the paper's field, and by our names its
+# integrals as ours must be.
 CASES = {
     # Ours is for unit mass: its momentum is the velocity, its energy that of a unit of mass.
-    "harmonic-oscillator": Case(
+    "harmonic-oscillator": (
         lambda m, k: systems.HarmonicOscillator(jnp.sqrt(k / m)),
         oscillator_field,
         {"energy": lambda y, m, k: oscillator_energy(y, m, k) / m},
-        2,
-        ours=lambda y, m, k: jnp.stack([y[0], y[1] / m]),
-        theirs=lambda rate, m, k: jnp.stack([rate[0], rate[1] * m]),
     ),
-    "rigid-body": Case(
+    "rigid-body": (
         lambda *inertia: systems.RigidBody(jnp.stack(inertia)),
         rigid_body_field,
         {
             "energy": rigid_body_energy,
             "squared angular momentum": lambda w, *inertia: rigid_body_momentum(w),
         },
-        3,
     ),
-    "double-pendulum": Case(
+    "double-pendulum": (
         lambda m1, m2, l1, l2, g: systems.DoublePendulum(
             jnp.stack([m1, m2]), jnp.stack([l1, l2]), gravity=g
         ),
         pendulum_field,
         {"energy": pendulum_energy},
-        5,
     ),
-    "conservative-lorenz": Case(
+    "conservative-lorenz": (
         lambda sigma, rho: systems.ConservativeLorenz(sigma, rho),
         lorenz_field,
         {
             "Casimir": lambda y, sigma, rho: -sigma * lorenz_h(y, sigma),
             "energy": lambda y, sigma, rho: lorenz_l(y, rho),
         },
-        2,
     ),
-    "point-vortices": Case(
+    "point-vortices": (
         lambda *gamma: systems.PointVortices(jnp.stack(gamma)),
         lambda y, *gamma: vortex_field(y, gamma),
         {
@@ -176,7 +147,6 @@ CASES = {
             "linear impulse": lambda y, *gamma: jnp.stack(gamma) @ y,
             "angular impulse": lambda y, *gamma: jnp.stack(gamma) @ jnp.sum(y**2, axis=1),
         },
-        3,
     ),
 }
 
@@ -190,36 +160,35 @@ def largest_relative(ours, theirs):
 
 @pytest.mark.parametrize("name", list(CASES))
 def test_equations_and_integrals_are_those_printed(name):
-    case = CASES[name]
+    make, field, integrals = CASES[name]
+    # Of our state to the paper's.
+    masses = (lambda m, k: jnp.stack([1.0, m])) if "oscillator" in name else lambda *p: 1.0
     system = systems.get(name)
     state_key, parameter_key = jr.split(jr.key(13))
     ys = jax.jit(jax.vmap(system.sample))(jr.split(state_key, COUNT))
-    shape = (COUNT, case.parameters)
+    shape = (COUNT, len(DEFAULTS[name]))
     parameters = jr.uniform(parameter_key, shape, minval=0.5, maxval=2.0)
     # The first ones are the default.
     parameters = parameters.at[0].set(jnp.array(DEFAULTS[name]))
-    assert eqx.tree_equal(case.make(*map(jnp.asarray, DEFAULTS[name])), system)
+    assert eqx.tree_equal(make(*map(jnp.asarray, DEFAULTS[name])), system)
 
     @jax.jit
     @jax.vmap
     def both(y, p):
-        own = case.make(*p)
-        state = case.ours(y, *p)
-        rates = case.theirs(own.vector_field(0.0, state, None), *p), case.field(y, *p)
+        own, state = make(*p), y / masses(*p)
+        rates = own.vector_field(0.0, state, None) * masses(*p), field(y, *p)
         values = {
             key: (own.manifold[key].fn(0.0, state, None), printed(y, *p))
-            for key, printed in case.integrals.items()
+            for key, printed in integrals.items()
         }
         return rates, values
 
     rates, values = both(ys, parameters)
     assert values.keys() == system.manifold.keys()
     assert largest_relative(*rates) <= RELATIVE
-    for ours, theirs in values.values():
-        assert largest_relative(ours, theirs) <= RELATIVE
+    for pair in values.values():
+        assert largest_relative(*pair) <= RELATIVE
 
-
-# ---- The numbers that it states ----
 
 DEFAULTS = {
     "harmonic-oscillator": (1.0, 1.0),  # m, k
@@ -268,50 +237,27 @@ def test_initial_states_fill_the_papers_domains():
     assert_fills(np.linalg.norm(drawn("point-vortices"), axis=-1), 0.5, 1.5)
 
 
-def hidden(net):
-    """Widths of the hidden layers."""
-    return [w.shape[-1] for w in net.weights[:-1]]
-
-
-@pytest.mark.parametrize("kind", ["standard", "conservative"])
-@pytest.mark.parametrize("name", list(DEFAULTS))
-def test_networks_and_recipe_have_the_papers_numbers(name, kind):
-    network = build(systems.get(name), kind, jr.key(0), jr.key(1))
-    if name in HORIZONS:
-        assert (network.t0, network.t1) == (0.0, HORIZONS[name])
-        nets = [network.nets]
+@pytest.mark.parametrize("kind", ["pinn", "deeponet"])
+def test_networks_and_recipe_have_the_papers_numbers(kind):
+    paper, system = dfc.learned.paper, systems.ConservativeLorenz()
+    layer = dfc.learned.ConservativeLayer(system.manifold, steps=3)
+    if kind == "pinn":
+        network = paper.pinn(system.y0, 0.0, 1.0, key=jr.key(0), layer=layer)
+        nets, points = [network.nets], 2000
     else:
-        assert network.max_step == STEPS[name][0]
-        nets = [network.core.branch, network.core.trunk]
+        y0s = jax.vmap(system.sample)(jr.split(jr.key(0), 9))
+        network = paper.deeponet(y0s, 0.25, key=jr.key(0), layer=layer)
+        nets, points = [network.core.branch, network.core.trunk], 5000
     for net in nets:
-        assert hidden(net) == [40] * 4
+        assert [w.shape[-1] for w in net.weights[:-1]] == [40] * 4
         assert net.activation is jnp.tanh
-    assert (network.layer is not None) == (kind == "conservative")
-
-
-@pytest.mark.parametrize("name", list(DEFAULTS))
-def test_the_recipe_has_the_papers_numbers(name):
-    network = build(systems.get(name), "standard", jr.key(0), jr.key(1))
-    recipe = dfc.learned.paper.recipe(network)
-    assert recipe.epochs == 5000
-    assert recipe.points == (2000 if name in HORIZONS else 5000)
+    recipe = paper.recipe(network)
+    assert (recipe.epochs, recipe.points) == (5000, points)
     assert recipe.refresh is None  # the full batch
     # The first update of Adam is the learning rate, whatever the gradient.
     update, _ = recipe.optimiser.update(jnp.array(3.0), recipe.optimiser.init(jnp.array(1.0)))
     np.testing.assert_allclose(update, -1e-3, rtol=1e-6)
-
-
-def test_the_iterations_are_the_papers():
-    """p(e) = floor(e (P + 1) / E), which would be P + 1 at e = E, a step never made."""
-    epochs, most = 5000, 3
-    network = build(systems.get("conservative-lorenz"), "conservative", jr.key(0), jr.key(1))
-    schedule = dfc.learned.paper.recipe(network).schedule
-    p, _ = jax.vmap(lambda e: schedule(e, epochs, most))(jnp.arange(epochs))
-    np.testing.assert_array_equal(p, np.floor(np.arange(epochs) * (most + 1) / epochs))
-    assert (p[0], p[-1]) == (0, most)
-
-
-def test_the_reproduction_has_all_five():
-    assert {n for n in systems.names() if _reproduce._trained.is_learned(systems.get(n))} == set(
-        DEFAULTS
-    )
+    if kind == "deeponet":
+        # p(e) = floor(e (P + 1) / E), which would be P + 1 at e = E, a step never made.
+        p, _ = jax.vmap(lambda e: recipe.schedule(e, 5000, 3))(jnp.arange(5000))
+        np.testing.assert_array_equal(p, np.floor(np.arange(5000) * 4 / 5000))
