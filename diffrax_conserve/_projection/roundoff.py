@@ -21,52 +21,69 @@ from .scalars import walk
 
 # What other operations contain is taken as one function.
 _NAMES = """
-add add_any sub reduce_sum dot_general cumsum conv_general_dilated
+add add_any sub reduce_sum cumsum
 acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 lgamma log log1p
 logistic pow sin sinh tan tanh
 """
 _COUNTED = frozenset(_NAMES.split())
+# Sums of products, each with an error of its own.
+_PRODUCTS = {"dot_general", "conv_general_dilated"}
 
 
 def hidden_terms(
     fn: Callable[[Array], Float[Array, " m"]], y: Float[Array, " n"]
 ) -> Float[Array, " m"]:
     """The roundoff of `fn(y)` in units of roundoff."""
-    evaluated = ft.partial(_evaluated, jax.make_jaxpr(fn)(y))
+    closed = jax.make_jaxpr(fn)(y)
     like: list[Array] = []
-    out = jax.eval_shape(lambda y: evaluated(y, lambda x: like.append(x) or x), y)
+    out = jax.eval_shape(lambda y: _evaluated(closed, y, lambda x, _: like.append(x) or x), y)
     if not like:
         return jnp.zeros(out.shape, out.dtype)
 
     def shifted(shifts: list[Array]) -> tuple[Array, list[Array]]:
-        given, operands = iter(shifts), []
-        out = evaluated(y, lambda x: operands.append(x) or x + next(given))
-        return out, operands
+        given, sizes = iter(shifts), []
+        return _evaluated(closed, y, lambda x, s: sizes.append(s) or x + next(given)), sizes
 
     zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
-    value, vjp, operands = jax.vjp(shifted, zeros, has_aux=True)
+    value, vjp, sizes = jax.vjp(shifted, zeros, has_aux=True)
     (adjoints,) = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
-    pairs = zip(adjoints, operands, strict=True)
-    terms = [jnp.abs(adjoint * x).reshape(value.size, -1) for adjoint, x in pairs]
-    sizes = jnp.nan_to_num(jnp.concatenate(terms, axis=1)).astype(value.dtype)
+    pairs = zip(adjoints, sizes, strict=True)
+    terms = jnp.concatenate([jnp.abs(v * s).reshape(value.size, -1) for v, s in pairs], axis=1)
+    terms = jnp.where(jnp.isfinite(terms), terms, 0).astype(value.dtype)
     # Squares of small energies underflow in float32.
-    largest = jnp.max(sizes, axis=1, keepdims=True)
-    unit = sizes / jnp.where(largest > 0, largest, 1)
+    largest = jnp.max(terms, axis=1, keepdims=True)
+    unit = terms / jnp.where(largest > 0, largest, 1)
     return largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
 
 
-def _evaluated(closed: Any, y: Array, changed: Callable[[Any], Any]) -> Array:
-    """The value of a jaxpr whose operands are `changed` where they depend on `y`."""
+def _evaluated(closed: Any, y: Array, changed: Callable[[Any, Any], Any]) -> Array:
+    """The value of a jaxpr whose operands are `changed(x, size)` where they depend on `y`."""
+
+    def constant(x: Any) -> tuple[Any, bool]:
+        return x, False
 
     def equation(eqn: Any, given: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
-        inputs = [x for x, _ in given]
-        if eqn.primitive.name in _COUNTED or list(jex.jaxprs_in_params(eqn.params)):
-            moving = [
-                moves and jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x, moves in given
+        name, inner = eqn.primitive.name, eqn.params.get("call_jaxpr")
+        if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
+            return walk(inner, given, constant, equation)
+        inputs, moves = [x for x, _ in given], any(moves for _, moves in given)
+        evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
+        if name in _PRODUCTS and moves:
+            return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), True)]
+        if name in _COUNTED or list(jex.jaxprs_in_params(eqn.params)):
+            inputs = [
+                changed(x, x) if own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
+                for x, own in given
             ]
-            inputs = [changed(x) if moves else x for x, moves in zip(inputs, moving, strict=True)]
-        outs = eqn.primitive.bind(*inputs, **eqn.primitive.get_bind_params(eqn.params))
-        outs = outs if eqn.primitive.multiple_results else [outs]
-        return [(x, any(moves for _, moves in given)) for x in outs]
+        outs = evaluate(*inputs)
+        return [(x, moves) for x in (outs if eqn.primitive.multiple_results else [outs])]
 
-    return walk(closed, [(y, True)], lambda x: (x, False), equation)[0][0]
+    return walk(closed, [(y, True)], constant, equation)[0][0]
+
+
+def _has_loop(jaxpr: Any) -> bool:
+    """Whether a jaxpr has a loop, through which there is no reverse mode."""
+    return any(
+        eqn.primitive.name == "while" or any(map(_has_loop, jex.jaxprs_in_params(eqn.params)))
+        for eqn in jaxpr.eqns
+    )

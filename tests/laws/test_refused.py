@@ -2,6 +2,7 @@
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -97,3 +98,33 @@ def test_a_molecule_from_its_equilibrium_length_is_not_refused(energy, units, dt
         lanes = tuple(jnp.full(100, x, dtype) for x in args)
         done = okay(morse, energy, dfc.RK4(), dfx.ConstantStepSize(), y0, lanes, times)
         assert np.all(done), np.asarray(y0)[~np.asarray(done)][:5]
+
+
+@jax.custom_vjp
+def height(q):
+    return 1 - jnp.cos(q)
+
+
+height.defvjp(lambda q: (height(q), q), lambda q, g: (g * jnp.sin(q),))
+SPRINGS = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
+# A pendulum whose height has a derivative of its own, and a chain of springs far from the origin,
+# where the products of the stiffness matrix cancel.
+HIDDEN = {
+    "custom rule": (pendulum, lambda t, y, args: y[1] ** 2 / 2 + height(y[0]), 1e-3, 2),
+    "matrix": (
+        lambda t, y, args: jnp.concatenate([y[3:], -SPRINGS @ y[:3]]),
+        lambda t, y, args: (y[3:] @ y[3:] + y[:3] @ SPRINGS @ y[:3]) / 2,
+        1e3,
+        6,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_terms_that_no_gradient_shows_are_found(name):
+    field, energy, size, n = HIDDEN[name]
+    rng = np.random.default_rng(2)
+    y0 = size + 0.1 * min(size, 1) * rng.normal(size=(100, n))
+    times = jnp.asarray([5.0, 0.1])
+    done = okay(field, energy, dfx.Tsit5(), dfx.ConstantStepSize(), y0, jnp.zeros(100), times)
+    assert np.all(done), np.mean(done)
