@@ -103,8 +103,9 @@ def _solve(vector_field, solver, t0, t1, dt0, y0, args, kwargs):
 
 @eqx.filter_jit
 def drift_of(sol, manifold, args=None):
-    """`dfc.drift` in one program."""
-    return dfc.drift(sol, manifold, args)
+    """`dfc.drift` in one program; NaN if the solve failed, of which here the times are NaN too."""
+    failed = jnp.any(jnp.isnan(sol.ts))
+    return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), dfc.drift(sol, manifold, args))
 
 
 @eqx.filter_jit

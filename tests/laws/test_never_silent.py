@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 
 import diffrax_conserve as dfc
 
@@ -59,6 +59,7 @@ coordinates = st.floats(-3, 3, allow_nan=False).map(lambda x: round(x, 6))
     a=st.floats(0.1, 30),
     b=coordinates,
 )
+@example(state=(0.0, 0.0, 1.0), direction=(0.0, 0.0, 1.0), decade=2.0, a=1.0, b=0.0)
 def test_success_means_on_the_manifold_at_the_state_that_is_returned(
     name, dtype, state, direction, decade, a, b
 ):
