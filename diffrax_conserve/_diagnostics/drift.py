@@ -125,7 +125,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     )
 
     def at(t: Array, y: Y) -> Values:
-        padded = ~jnp.isfinite(t)
+        padded = jnp.isinf(t)
         t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), (t, y), (t0, y0))
         residual = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
         return relative(jtu.tree_map(lambda x: jnp.where(padded, 0, x), residual), scale)

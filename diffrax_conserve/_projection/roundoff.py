@@ -48,7 +48,8 @@ def hidden_terms(
     value, vjp, sizes = jax.vjp(shifted, zeros, has_aux=True)
     (adjoints,) = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
     pairs = zip(adjoints, sizes, strict=True)
-    terms = jnp.concatenate([jnp.abs(v * s).reshape(value.size, -1) for v, s in pairs], axis=1)
+    terms = [jnp.abs(v * s[None]).reshape(value.size, -1) for v, s in pairs]
+    terms = jnp.concatenate(terms, axis=1)
     terms = jnp.where(jnp.isfinite(terms), terms, 0).astype(value.dtype)
     # Squares of small energies underflow in float32.
     largest = jnp.max(terms, axis=1, keepdims=True)

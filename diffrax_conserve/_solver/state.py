@@ -42,7 +42,7 @@ _FIRST = register(
     "state jumped to another part of the manifold. Take smaller steps, or pass another "
     "`max_correction`.",
     "the projection of a step failed: the manifold was not reached. " + _SMALLER + "If it is, the "
-    "constraints may contradict each other or the bounds, or the terms that cancel inside `fn` have "
+    "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
     "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
 )
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
