@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 
 from .scalars import walk
 
-# What other operations contain is taken as one function.
+# An operation with other operations inside is taken as one function, unless it is looked into.
 _NAMES = """
-add add_any sub reduce_sum cumsum
+add add_any sub reduce_sum cumsum fft
 acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 lgamma log log1p
 logistic pow sin sinh tan tanh
 """
@@ -57,29 +57,72 @@ def hidden_terms(
     return largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
 
 
+# A value, and whether it depends on the state.
+_Pair = tuple[Any, bool]
+
+
+def _constant(x: Any) -> _Pair:
+    return x, False
+
+
 def _evaluated(closed: Any, y: Array, changed: Callable[[Any, Any], Any]) -> Array:
     """The value of a jaxpr whose operands are `changed(x, size)` where they depend on `y`."""
+    return walk(closed, [(y, True)], _constant, ft.partial(_equation, changed))[0][0]
 
-    def constant(x: Any) -> tuple[Any, bool]:
-        return x, False
 
-    def equation(eqn: Any, given: list[tuple[Any, bool]]) -> list[tuple[Any, bool]]:
-        name, inner = eqn.primitive.name, eqn.params.get("call_jaxpr")
-        if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
-            return walk(inner, given, constant, equation)
-        inputs, moves = [x for x, _ in given], any(moves for _, moves in given)
-        evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
-        if name in _PRODUCTS and moves:
-            return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), True)]
-        if name in _COUNTED or list(jex.jaxprs_in_params(eqn.params)):
-            inputs = [
-                changed(x, x) if own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
-                for x, own in given
-            ]
-        outs = evaluate(*inputs)
-        return [(x, moves) for x in (outs if eqn.primitive.multiple_results else [outs])]
+def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
+    name, params = eqn.primitive.name, eqn.params
+    inputs, moves = [x for x, _ in given], any(moves for _, moves in given)
+    inside = ft.partial(walk, constant=_constant, equation=ft.partial(_equation, changed))
+    inner = params.get("call_jaxpr")
+    if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
+        return inside(inner, given)
+    if name in ("checkpoint", "remat2"):
+        return inside(jex.ClosedJaxpr(params["jaxpr"], ()), given)
+    if name == "cond":
+        branches = [inside(branch, given[1:]) for branch in params["branches"]]
+        which = jnp.clip(inputs[0].astype(int), 0, len(branches) - 1)
+        return [
+            (jnp.stack([x for x, _ in outs])[which], any(flag for _, flag in outs))
+            for outs in zip(*branches, strict=True)
+        ]
+    if name == "scan":
+        return [(x, moves) for x in _scanned(changed, params, inputs)]
+    evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
+    if name in _PRODUCTS and moves:
+        return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), True)]
+    if name in _COUNTED or list(jex.jaxprs_in_params(params)):
+        inputs = [
+            changed(x, x) if own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
+            for x, own in given
+        ]
+    outs = evaluate(*inputs)
+    return [(x, moves) for x in (outs if eqn.primitive.multiple_results else [outs])]
 
-    return walk(closed, [(y, True)], constant, equation)[0][0]
+
+def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:
+    """A scan whose operands are changed. A first run finds their sizes."""
+    first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
+    consts, init, xs = inputs[:first], inputs[first:last], inputs[last:]
+
+    def run(shifts: list[Array] | None) -> Any:
+        def body(carry: list[Any], x: Any) -> tuple[list[Any], Any]:
+            given, sizes = None if shifts is None else iter(x[1]), []
+
+            def shifted(x: Any, size: Any) -> Any:
+                sizes.append(size)
+                return x if given is None else x + next(given)
+
+            values = [(x, True) for x in (*consts, *carry, *x[0])]
+            outs = walk(params["jaxpr"], values, _constant, ft.partial(_equation, shifted))
+            outs = [x for x, _ in outs]
+            return outs[: last - first], (outs[last - first :], sizes)
+
+        return jax.lax.scan(body, init, (xs, shifts), params["length"], params["reverse"])
+
+    _, (_, sizes) = run(None)
+    carry, (ys, _) = run([changed(jnp.zeros_like(size), size) for size in sizes])
+    return [*carry, *ys]
 
 
 def _has_loop(jaxpr: Any) -> bool:

@@ -3,6 +3,7 @@
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -100,17 +101,28 @@ def test_a_molecule_from_its_equilibrium_length_is_not_refused(energy, units, dt
         assert np.all(done), np.asarray(y0)[~np.asarray(done)][:5]
 
 
-@jax.custom_vjp
 def height(q):
     return 1 - jnp.cos(q)
 
 
-height.defvjp(lambda q: (height(q), q), lambda q, g: (g * jnp.sin(q),))
+height_with_rule = jax.custom_vjp(height)
+height_with_rule.defvjp(lambda q: (height(q), q), lambda q, g: (g * jnp.sin(q),))
+HEIGHTS = {
+    "rule": height_with_rule,
+    "checkpoint": jax.checkpoint(height),
+    "cond": lambda q: lax.cond(q > 0, height, height, q),
+    "scan": lambda q: lax.scan(lambda sum, q: (sum + height(q), None), 0 * q, q[None])[0],
+}
 SPRINGS = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
-# A pendulum whose height has a derivative of its own, and a chain of springs far from the origin,
+
+
+def pendulum_of(height):
+    return pendulum, lambda t, y, args: y[1] ** 2 / 2 + height(y[0]), 1e-3, 2
+
+
+# Pendulums whose height is inside other operations, and a chain of springs far from the origin,
 # where the products of the stiffness matrix cancel.
-HIDDEN = {
-    "custom rule": (pendulum, lambda t, y, args: y[1] ** 2 / 2 + height(y[0]), 1e-3, 2),
+HIDDEN = {name: pendulum_of(height) for name, height in HEIGHTS.items()} | {
     "matrix": (
         lambda t, y, args: jnp.concatenate([y[3:], -SPRINGS @ y[:3]]),
         lambda t, y, args: (y[3:] @ y[3:] + y[:3] @ SPRINGS @ y[:3]) / 2,

@@ -75,6 +75,10 @@ def test_a_state_that_is_not_finite_never_passes(bad):
     text = fails(dct.assert_conserved, sol, first, rtol=1e300, atol=1e300)
     assert "not finite at time 0.3 (saved state, row 3 of 21)" in text
     assert "not finite" in fails(dct.assert_on_manifold, first, sol.ys[3], value=0.0)
+    # A row that diffrax padded has the time infinity, one of a failed solve may have NaN.
+    lost = sol.ys.at[3].set(bad), sol.ts.at[3].set(jnp.nan)
+    lost = eqx.tree_at(lambda s: (s.ys, s.ts), sol, lost)
+    assert not np.isfinite(dfc.drift(lost, RIGID_BODY["energy"])[3])
 
 
 def test_an_unsuccessful_solve_is_reported_as_that():
