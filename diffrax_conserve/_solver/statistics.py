@@ -57,10 +57,10 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
           num_projections  18
           num_iterations   3
           max_iterations   1
-          residual_before  3.6e-07
-          residual_after   1.5e-07
+          residual_before  4.6e-07
+          residual_after   1.9e-07
           correction       1.0e-06
-          roundoff         4.7e-01
+          roundoff         3.2e-01
         ```
     """
     check_solution(sol, "statistics")
