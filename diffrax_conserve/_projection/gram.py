@@ -12,7 +12,7 @@ import jax.scipy as jsp
 from jaxtyping import Array, Float
 
 # Up to this many constraints a solve is written out, so that XLA fuses it with what is around it.
-WRITTEN_OUT_MAX = 3
+WRITTEN_OUT_MAX = 4
 
 
 def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:

@@ -26,7 +26,7 @@ Scalars = tuple[Any, ...]
 
 # Compile time grows with the number of scalar operations.
 MAX_SCALARS = 32
-MAX_OPERATIONS = 1024
+MAX_OPERATIONS = 512
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
@@ -34,7 +34,7 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     XLA's tendency to repeat the whole computation for each element of the result."""
     out = jax.eval_shape(fn, y)
     size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
-    written = in_scalars(fn, y, limit=512 // size)
+    written = in_scalars(fn, y, limit=MAX_OPERATIONS // size)
     if written is None:
         return fn(y)
     return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
