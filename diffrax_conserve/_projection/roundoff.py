@@ -89,13 +89,11 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if name == "scan":
         return [(x, moves) for x in _scanned(changed, params, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
-    if name in _PRODUCTS and moves:
+    counted = [own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x, own in given]
+    if name in _PRODUCTS and any(counted):
         return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), True)]
     if name in _COUNTED or list(jex.jaxprs_in_params(params)):
-        inputs = [
-            changed(x, x) if own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) else x
-            for x, own in given
-        ]
+        inputs = [changed(x, x) if own else x for x, own in zip(inputs, counted, strict=True)]
     outs = evaluate(*inputs)
     return [(x, moves) for x in (outs if eqn.primitive.multiple_results else [outs])]
 
