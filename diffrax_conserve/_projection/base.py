@@ -281,32 +281,17 @@ def _project(
     target: Target, t: RealScalarLike, candidate: Y, step: Step | None
 ) -> tuple[Y, ProjectionInfo]:
     values = target.values if target.gained is None else target.values + target.gained
-    problem = problem_of(
-        target.projection, target.manifold, values, target.hidden, t, candidate, target.args, step
-    )
-    y, info = target.projection.solve(problem, ravel(candidate))
-    return unravel(y, problem.like), info
-
-
-def problem_of(
-    projection: AbstractProjection,
-    manifold: Manifold,
-    values: Float[Array, " m"],
-    hidden: Float[Array, " m"],
-    t: RealScalarLike,
-    like: Any,
-    args: Args,
-    step: Step | None = None,
-) -> Problem:
-    """The problem of a projection at a time, for states like `like`."""
-    like = jax.eval_shape(lambda: like)
-    equations = equations_of(manifold, values, t, like, args, hidden)
-    weights = inverse_metric(projection.metric, like)
+    manifold, args = target.manifold, target.args
+    like = jax.eval_shape(lambda: candidate)
+    equations = equations_of(manifold, values, t, like, args, target.hidden)
+    weights = inverse_metric(target.projection.metric, like)
+    equations = dataclasses.replace(equations, weights=weights)
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     keys = tuple(_key(path[0]) if path else None for path, _ in flat)
     shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
-    equations = dataclasses.replace(equations, weights=weights)
-    return Problem(equations, t, args, shaped, like, keys, step)
+    problem = Problem(equations, t, args, shaped, like, keys, step)
+    y, info = target.projection.solve(problem, ravel(candidate))
+    return unravel(y, problem.like), info
 
 
 def _key(entry: Any) -> Any:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
+from .._tree import tree_tangents
 from .equations import Equations, any_lane, relative
 from .gram import (
     WRITTEN_OUT_MAX,
@@ -250,12 +251,8 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
             moved = equations.weighted(vjp(multiplier)[0][None])[0]
         return candidate + moved, equations.residual(candidate + moved)
 
-    t_y, t_g = (
-        jnp.zeros_like(x) if t is None else t
-        for x, t in zip(
-            (y, multiplier), eqx.filter_jvp(displaced, primals, tangents)[1], strict=True
-        )
-    )
+    tangent = eqx.filter_jvp(displaced, primals, tangents)[1]
+    t_y, t_g = tree_tangents((y, multiplier), tangent)
     _, jacobian = equations.linearise(y)
     heights = row_sizes(jacobian)
     gram = gram_matrix(jacobian / heights[:, None], rows)

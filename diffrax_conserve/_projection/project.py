@@ -87,7 +87,7 @@ def _hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, "
     value, jacobian = equations.linearise(y)
     shown = jnp.abs(value) + equations.scale(jacobian, y)
     hidden = hidden_terms(equations.residual, y)
-    return jnp.where((hidden > ROUNDOFF_MULTIPLE / 4 * shown) & (hidden < jnp.inf), hidden, 0)
+    return jnp.where(hidden > ROUNDOFF_MULTIPLE / 4 * shown, hidden, 0)
 
 
 def given_values(

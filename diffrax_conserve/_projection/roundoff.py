@@ -54,7 +54,8 @@ def hidden_terms(
     # Squares of small energies underflow in float32.
     largest = jnp.max(terms, axis=1, keepdims=True)
     unit = terms / jnp.where(largest > 0, largest, 1)
-    return largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
+    total = largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
+    return jnp.where(jnp.isfinite(total), total, 0)
 
 
 # A value, and whether it depends on the state.

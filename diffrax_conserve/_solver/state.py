@@ -17,7 +17,7 @@ from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
 from .._projection.equations import equations_of
 from .._projection.roundoff import hidden_terms
-from .._tree import ravel, tree_stop_gradient
+from .._tree import ravel, tree_size, tree_stop_gradient
 from .diffrax_private import member as _member
 from .diffrax_private import register
 
@@ -144,11 +144,8 @@ def started(
     equations = equations_of(manifold, numbers, t, y, args)
     equations, vector = tree_stop_gradient((equations, vector))
     hidden = hidden_terms(equations.residual, vector)
-    hidden = jnp.where(jnp.isfinite(hidden), hidden, 0)
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
-    sizes = [
-        sum(jnp.size(x) for x in jtu.tree_leaves(part)) for part in treedef.flatten_up_to(values)
-    ]
+    sizes = [tree_size(part) for part in treedef.flatten_up_to(values)]
     must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], sizes)
     if must_hold.any():
         g, jacobian = equations.linearise(vector)
@@ -184,7 +181,7 @@ def verdict(
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype) * every
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
     excess = jnp.sum(correction - share * moved - 8 * float(info.eps) ** 0.5 * size)
-    cause = jnp.where(ok, 0, jnp.where(jnp.isfinite(excess), _NOT_REACHED, _NOT_FINITE))
+    cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
