@@ -77,8 +77,9 @@ def solve(
 
     # Jitted, because jax batches the loop over the steps several times.
     in_arrays = jax.jit(ft.partial(run, False))
-    lane = jax.jit(ft.partial(run, True)) if small and not fresh else in_arrays
-    alone = jax.custom_batching.custom_vmap(in_arrays)
+    if fresh or not small:
+        return in_arrays(arrays)
+    alone, lane = jax.custom_batching.custom_vmap(in_arrays), jax.jit(ft.partial(run, True))
 
     @alone.def_vmap
     def batched(size: int, axes: Any, arrays: Any) -> Any:
