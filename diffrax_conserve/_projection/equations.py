@@ -15,6 +15,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
@@ -62,7 +63,7 @@ class Equations(eqx.Module):
             if value.size == 1:
                 rows.append(vjp(jnp.ones_like(value))[0][None])
             else:
-                rows.append(jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))[0])
+                rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
 
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:

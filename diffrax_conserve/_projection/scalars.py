@@ -158,41 +158,12 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
 # A requested precision or type may be ignored: the sum of products is computed in the type of the
 # state.
 _DOT = {"dimension_numbers", "precision", "preferred_element_type"}
-# The operations from which constant matrices are mostly built, in numpy: jax would compile each one
-# separately, in 30 ms.
-_ON_NUMBERS: dict[str, Callable[..., np.ndarray]] = {
-    "add": lambda x, y, **_: x + y,
-    "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
-    "eq": lambda x, y, **_: x == y,
-    "ge": lambda x, y, **_: x >= y,
-    "integer_pow": lambda x, y, **_: x**y,
-    "iota": lambda dtype, shape, dimension, **_: _broadcast(
-        np.arange(shape[dimension], dtype=dtype), shape, (dimension,)
-    ),
-    "mul": lambda x, y, **_: x * y,
-    "neg": lambda x, **_: -x,
-    "sub": lambda x, y, **_: x - y,
-}
 
-
-# XLA recomputes a sine in each loop that uses it, and a gradient has dozens of such loops. It does
-# not recompute quotients, so the sine is divided by a 1 that XLA cannot simplify away.
-@jax.custom_jvp
-def _sin(x: Array) -> Array:
-    return lax.sin(x) / _one(x)
-
-
-@jax.custom_jvp
-def _cos(x: Array) -> Array:
-    return lax.cos(x) / _one(x)
-
-
-def _one(x: Array) -> Array:
-    return lax.stop_gradient(x) * 0 + 1
-
-
-_sin.defjvps(lambda t, _, x: t * _cos(x))
-_cos.defjvps(lambda t, _, x: -t * _sin(x))
+def _once(fn: Callable[[Array], Array], x: Array) -> Array:
+    """`fn(x)`, which XLA would compute again in each loop that uses it: a gradient has dozens of
+    them. It does not compute quotients again, so this is divided by a 1 that XLA cannot simplify
+    away."""
+    return fn(x) / (lax.stop_gradient(x) * 0 + 1)
 
 
 def _product(x: Any, y: Any) -> Any:
@@ -210,7 +181,13 @@ def _sum(x: Any, y: Any) -> Any:
     return lax.add(x, y)
 
 
-_INSTEAD = {"sin": _sin, "cos": _cos, "mul": _product, "add": _sum, "add_any": _sum}
+_INSTEAD: dict[str, Callable[..., Any]] = {
+    "sin": ft.partial(_once, lax.sin),
+    "cos": ft.partial(_once, lax.cos),
+    "mul": _product,
+    "add": _sum,
+    "add_any": _sum,
+}
 
 
 class _WriteOut:
@@ -249,8 +226,9 @@ class _WriteOut:
         if name == "pad" and all(low >= 0 <= high for low, high, _ in given["padding_config"]):
             places, value = inputs
             return [self._pad(places, value, given["padding_config"])]
-        if all(self._is_known(places) for places in inputs):
-            return self._fold(eqn, inputs)
+        if name == "iota":
+            indices = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
+            return [self._constant(_broadcast(indices, params["shape"], (params["dimension"],)))]
         if name in _ELEMENTWISE:
             fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
             return [self._elementwise(fn, inputs)]
@@ -260,24 +238,6 @@ class _WriteOut:
         if name == "dot_general" and given.keys() <= _DOT and same_type:
             return [self._dot(inputs, params["dimension_numbers"])]
         raise _NotWrittenOut(name)
-
-    def _is_known(self, places: _Places) -> bool:
-        return all(isinstance(self.scalars[i], np.generic) for i in places.flat)
-
-    def _fold(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
-        """Evaluates an equation of constants now, for example where a matrix is built from its
-        indices."""
-        arrays = [
-            np.array([self.scalars[i] for i in places.flat], _dtype(var)).reshape(places.shape)
-            for places, var in zip(inputs, eqn.invars, strict=True)
-        ]
-        if eqn.primitive.name in _ON_NUMBERS:
-            with np.errstate(all="ignore"):
-                out = _ON_NUMBERS[eqn.primitive.name](*arrays, **eqn.params)
-            return [self._constant(np.asarray(out, _dtype(eqn.outvars[0])))]
-        with jax.ensure_compile_time_eval():
-            out = eqn.primitive.bind(*arrays, **eqn.params)
-        return [self._constant(x) for x in (out if eqn.primitive.multiple_results else [out])]
 
     def _elementwise(self, fn: Callable[..., Array], inputs: list[_Places]) -> _Places:
         inputs = [*np.broadcast_arrays(*inputs)]
