@@ -229,43 +229,41 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     )
 
 
-def conserved_values(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
+def conserved_values(
+    manifold: Manifold, t: RealScalarLike, y: Y, args: Args, given: Values | None = None
+) -> Values:
     """`manifold` with each entry replaced by the value of `fn` that a solve started at
-    `(t, y, args)` conserves, zero for a constraint."""
+    `(t, y, args)` conserves: that in `given`, its own `value`, or that of the state; zero for a
+    constraint.
 
-    def conserved(entry: FirstIntegral | Constraint) -> Values:
-        given = getattr(entry, "value", None)
-        found = entry.fn(t, y, args) if given is None else given
-        return jtu.tree_map(jnp.zeros_like if isinstance(entry, Constraint) else jnp.asarray, found)
-
-    return jtu.tree_map(conserved, manifold, is_leaf=is_entry)
-
-
-_CONSTRAINTS_MAX = 2048
-
-
-def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> None:
-    """Raises unless the functions of the manifold return real floating-point arrays, in total at
-    least one scalar and at most as many as the state has unknowns."""
-    count, unknowns = 0, tree_size(y)
-    for name, entry in named_entries(manifold):
+    Raises unless the functions return real floating-point arrays, in total at least one scalar and
+    at most as many as the state has unknowns, and each value has the shapes of what its function
+    returns.
+    """
+    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
+    values = [getattr(entry, "value", None) for entry in entries]
+    if given is not None:
+        try:
+            values = treedef.flatten_up_to(given)
+        except ValueError as error:
+            raise ValueError(
+                f"`value` has the structure {jtu.tree_structure(given)}, which is not that of "
+                f"`manifold`, {treedef}. Put the conserved value in the place of each "
+                "`FirstIntegral` and `None` in the place of each `Constraint`."
+            ) from error
+    found = []
+    for (name, entry), value in zip(named_entries(manifold), values, strict=True):
         output = eqx.filter_eval_shape(entry.fn, t, y, args)
-        for leaf in jtu.tree_leaves(output):
-            if not jnp.issubdtype(dtype_of(leaf), jnp.floating):
-                raise TypeError(
-                    f"`fn` of `{name}` must return a PyTree of real floating-point arrays, but it "
-                    f"returned {leaf!r}. Convert it, for example by `jnp.asarray(..., "
-                    "dtype=float)`, or split a complex value into its real and its imaginary part."
-                )
-        count += tree_size(output)
-        if rate_of(entry) is not None:
-            rates = eqx.filter_eval_shape(entry.rate, t, y, args)
-            _check_shapes(f"`rate` of `{name}` returns", rates, output)
-            if not all(map(is_real, jtu.tree_leaves(rates))):
-                raise TypeError(
-                    f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must "
-                    "return real numbers, as `fn` does. Return their real part."
-                )
+        _check_output(name, entry, output, t, y, args)
+        if isinstance(entry, Constraint):
+            value = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), output)
+        elif given is None and value is None:
+            value = entry.fn(t, y, args)
+        else:
+            check_numbers("value", value)
+            _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
+        found.append(jtu.tree_map(jnp.asarray, value))
+    count, unknowns = tree_size(found), tree_size(y)
     if count == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
     if count > unknowns:
@@ -279,24 +277,30 @@ def check_outputs(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> No
             f"matrix of at most {_CONSTRAINTS_MAX} rows. Project parts of the state by solves of "
             "their own."
         )
+    return treedef.unflatten(found)
 
 
-def check_values(manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args) -> None:
-    """Raises unless the conserved values have the shapes of what the first integrals return."""
-    treedef = jtu.tree_structure(manifold, is_leaf=is_entry)
-    try:
-        flat = treedef.flatten_up_to(values)
-    except ValueError as error:
-        raise ValueError(
-            f"`value` has the structure {jtu.tree_structure(values)}, which is not that of "
-            f"`manifold`, {treedef}. Put the conserved value in the place of each `FirstIntegral` "
-            "and `None` in the place of each `Constraint`."
-        ) from error
-    for (name, entry), value in zip(named_entries(manifold), flat, strict=True):
-        if isinstance(entry, FirstIntegral):
-            check_numbers("value", value)
-            output = eqx.filter_eval_shape(entry.fn, t, y, args)
-            _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
+_CONSTRAINTS_MAX = 2048
+
+
+def _check_output(
+    name: str, entry: Any, output: Values, t: RealScalarLike, y: Y, args: Args
+) -> None:
+    for leaf in jtu.tree_leaves(output):
+        if not jnp.issubdtype(dtype_of(leaf), jnp.floating):
+            raise TypeError(
+                f"`fn` of `{name}` must return a PyTree of real floating-point arrays, but it "
+                f"returned {leaf!r}. Convert it, for example by `jnp.asarray(..., dtype=float)`, "
+                "or split a complex value into its real and its imaginary part."
+            )
+    if rate_of(entry) is not None:
+        rates = eqx.filter_eval_shape(entry.rate, t, y, args)
+        _check_shapes(f"`rate` of `{name}` returns", rates, output)
+        if not all(map(is_real, jtu.tree_leaves(rates))):
+            raise TypeError(
+                f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must return "
+                "real numbers, as `fn` does. Return their real part."
+            )
 
 
 def _check_shapes(what: str, given: Any, output: Any) -> None:

@@ -92,7 +92,11 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
 
 def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
     """`M⁻¹` as a vector; an infinite weight freezes its component."""
-    return None if metric is None else 1 / spread(metric, like)
+    if metric is None:
+        return None
+    remedy = "Give one weight (or an array of weights) for each leaf of the state."
+    check_like("metric", metric, like, remedy)
+    return 1 / spread(metric, like)
 
 
 def spread(tree: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
@@ -121,10 +125,3 @@ def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> N
             f"The state has leaves of the dtypes {', '.join(map(str, dtypes))}, but {user} needs "
             "one precision. Convert them to one."
         )
-
-
-def check_metric(metric: PyTree[ArrayLike] | None, y: Y) -> None:
-    """Raises unless `metric` is structured like the state."""
-    if metric is not None:
-        remedy = "Give one weight (or an array of weights) for each leaf of the state."
-        check_like("metric", metric, y, remedy)

@@ -5,22 +5,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
-from .._manifold import (
-    Constraint,
-    FirstIntegral,
-    check_manifold,
-    check_outputs,
-    check_values,
-    conserved_values,
-    has_value,
-    is_entry,
-    named_entries,
-)
+from .._manifold import check_manifold, conserved_values, has_value, named_entries
 from .._tree import ravel, tree_stop_gradient
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
 from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of
 from .newton import Newton
-from .options import check_metric, check_state
+from .options import check_state
 from .roundoff import hidden_terms
 
 
@@ -73,8 +63,6 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     vector = ravel(y)
-    check_metric(projection.metric, y)
-    check_outputs(manifold, t, y, args)
     values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
     hidden = _hidden_scale(equations_of(manifold, values, t, y, args), vector)
     return Target(projection, manifold, values, hidden, args, jnp.asarray(1)).project(t, y)
@@ -94,20 +82,11 @@ def given_values(
     manifold: Manifold, value: Values | None, t: RealScalarLike, y: Y, args: Args
 ) -> Values:
     """The conserved values that are given by `value`, or by the entries of the manifold."""
-    own = conserved_values(manifold, t, y, args)
-    if value is None:
-        for name, entry in named_entries(manifold):
-            if not has_value(entry):
-                raise ValueError(
-                    f"`{name}` has no conserved value, so every state would do. Pass `value=...`, "
-                    "for example `value=integral.fn(t, y_start, args)`, or write "
-                    "`FirstIntegral(fn, value=...)`."
-                )
-        check_values(manifold, own, t, y, args)
-        return own
-    check_values(manifold, value, t, y, args)
-
-    def choose(entry: FirstIntegral | Constraint, given: Values, own: Values) -> Values:
-        return own if isinstance(entry, Constraint) else jtu.tree_map(jnp.asarray, given)
-
-    return jtu.tree_map(choose, manifold, value, own, is_leaf=is_entry)
+    for name, entry in named_entries(manifold):
+        if value is None and not has_value(entry):
+            raise ValueError(
+                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, for "
+                "example `value=integral.fn(t, y_start, args)`, or write `FirstIntegral(fn, "
+                "value=...)`."
+            )
+    return conserved_values(manifold, t, y, args, value)

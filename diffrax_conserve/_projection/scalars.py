@@ -159,6 +159,7 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
 # state.
 _DOT = {"dimension_numbers", "precision", "preferred_element_type"}
 
+
 def _once(fn: Callable[[Array], Array], x: Array) -> Array:
     """`fn(x)`, which XLA would compute again in each loop that uses it: a gradient has dozens of
     them. It does not compute quotients again, so this is divided by a 1 that XLA cannot simplify

@@ -13,7 +13,6 @@ from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .equations import Equations
 from .options import inverse_metric
-from .project import check_metric
 
 
 @final
@@ -84,7 +83,6 @@ class Staged(AbstractProjection):
             )
         y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
-            check_metric(projection.metric, problem.state(candidate))
             part = _restricted(problem, self.names[:number], projection)
             y, info = projection.solve(part, y)
             infos.append(info)

@@ -14,8 +14,6 @@ from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     check_manifold,
-    check_outputs,
-    check_values,
     check_vector_field,
     conserved_values,
     evaluate,
@@ -28,8 +26,7 @@ from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
 from .equations import equations_of
 from .gram import combined, gram_matrix, gram_solve
-from .options import inverse_metric, positive_weights
-from .project import check_metric, check_state
+from .options import check_state, inverse_metric, positive_weights
 from .scalars import written_out
 
 
@@ -141,10 +138,7 @@ class TangentField(eqx.Module):
         """The given field, the correction that is added to it, and the multipliers."""
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
-        check_metric(self.metric, y)
-        check_outputs(self.manifold, t, y, args)
         values = conserved_values(self.manifold, t, y, args)
-        check_values(self.manifold, values, t, y, args)
         slope = slope_like(y, self.vector_field(t, y, args))
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)

@@ -23,14 +23,12 @@ from .._manifold import (
     Constraint,
     FirstIntegral,
     check_manifold,
-    check_outputs,
-    check_values,
     conserved_values,
     named_entries,
 )
 from .._options import check_count, check_number
 from .._projection.base import AbstractProjection, Target, check_projection
-from .._projection.options import check_metric, check_state, option
+from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .state import ProjectionStatistics, State, member, started, verdict
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
@@ -187,10 +185,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             )
         t = t0 * time_direction(terms, t0)
         check_state(y0, kind=jnp.inexact)
-        check_metric(self.projection.metric, y0)
-        check_outputs(self.manifold, t, y0, args)
         values = conserved_values(self.manifold, t, y0, args)
-        check_values(self.manifold, values, t, y0, args)
         values, hidden = started(self.manifold, values, t, y0, args)
         given = any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold))
         return State(

@@ -12,7 +12,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
-from ..._manifold import check_manifold, check_outputs
+from ..._manifold import check_manifold, conserved_values
 from ..._options import check_number
 from ..._projection.options import check_state
 from ..._tree import ravel
@@ -226,4 +226,4 @@ def _check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recip
     check_state(y0, "a `Pool`")
     check_output(flow_map, (y0, float(flow_map.max_step)), y0, "model")
     if pool.manifold is not None:
-        check_outputs(pool.manifold, 0.0, y0, args)
+        conserved_values(pool.manifold, 0.0, y0, args)
