@@ -39,10 +39,9 @@ Entry = FirstIntegral | Constraint
 class InvarianceEntry:
     """The result of `check_invariance` for one entry of the manifold.
 
-    `kind` is "first integral", "balance" (with a `rate`) or "constraint"; `defect` is the largest
-    relative defect, found at the state with the index `state`. `is_constant` tells that the
-    gradient is zero at every state: a function that does not depend on the state, or that autodiff
-    does not see through, is conserved by any field.
+    `kind` is "first integral", "balance" or "constraint"; `defect` is the largest relative defect,
+    at the state with the index `state`. `is_constant` tells that the gradient is zero at every
+    state: such a function is conserved by any field.
     """
 
     name: str
@@ -103,21 +102,19 @@ def check_invariance(
 
     which is a few units of roundoff if $I$ is a first integral, and of order one at almost every
     state if it is not: a misprint in either $I$ or $f$ is found without a solver. The derivative of
-    a [`diffrax_conserve.Constraint`][] must vanish only where the constraints hold, so the states
-    must satisfy all constraints of the manifold. A `rate` is subtracted from the derivative, and
-    its size is added to the denominator.
+    a [`diffrax_conserve.Constraint`][] must vanish only on the manifold, so the states must lie on
+    it. A `rate` is subtracted from the derivative, and its size is added to the denominator.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`, or a `diffrax.ODETerm` of it.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree like `y` with a leading
-        axis over the states. Take states in general position: at an equilibrium every function is
-        conserved.
+        axis over the states, in general position: at an equilibrium every function is conserved.
     - `t`: the time, or one for each state. Give several for integrals that depend on time.
     - `args`: passed to `vector_field` and to the functions of the manifold.
-    - `key`: seeds the sampler; by default `jax.random.key(0)`.
-    - `num_states`: how many states to draw from the sampler.
+    - `key`, `num_states`: the seed of the sampler, by default `jax.random.key(0)`, and how many
+        states to draw from it.
     - `rtol`: the largest relative defect that is attributed to roundoff; by default ten thousand
         times the machine epsilon of the states.
 
@@ -136,9 +133,7 @@ def check_invariance(
         import diffrax_conserve as dfc
 
         system = dfc.systems.RigidBody()
-        report = dfc.check_invariance(system.vector_field, system.manifold, system.sample)
-        print(report)
-        assert report.ok
+        print(dfc.check_invariance(system.vector_field, system.manifold, system.sample))
         ```
 
         ```text

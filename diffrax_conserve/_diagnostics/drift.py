@@ -35,9 +35,8 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$. Roundoff is
     proportional to this scale.
 
-    For a balance law, a `FirstIntegral` with a `rate`, the integral of the rate from $t_0$ to $t_k$
-    is subtracted from the numerator. It is computed along the dense output of the (wrapped) solver,
-    which the solution must have.
+    For a `FirstIntegral` with a `rate` the integral of the rate from $t_0$ to $t_k$ is subtracted
+    from the numerator, computed along the dense output, which the solution must have.
 
     **Arguments:**
 
@@ -55,9 +54,8 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     **Raises:**
 
     `ValueError` if `sol` is a batch, has no saved states, has a single one without a conserved
-    value to compare it with, or was saved by `SaveAt(subs=...)`; if dense output shows that the
-    saved values are not states; or if a balance law has no dense output. `TypeError` if `sol` is
-    not a solution.
+    value to compare it with, was saved by `SaveAt(subs=...)` or `SaveAt(fn=...)`, or lacks dense
+    output for a `rate`. `TypeError` if `sol` is not a solution.
 
     !!! example
 

@@ -35,8 +35,6 @@ from .scalars import components, in_scalars, joined
 # or if it is below `_SMALL_ANGLE` and the correction, relative to the state and divided by the
 # sine, is above `_SHORT_CORRECTION`. Whether they are so everywhere is tested at this distance.
 _SMALL_ANGLE, _SHORT_CORRECTION, _OFFSET = 1e-2, 1e-5, 1e-3
-# The largest state of which a batch is written out in scalars.
-_UNKNOWNS_MAX = 8
 # The bisections of a step where it must be shortened.
 _HALVINGS = 30
 # With bounds, a component that an iteration reduces to this share of itself is zero.
@@ -69,7 +67,7 @@ def solve(
     candidate; with `fresh` those of the last state. A damping that vanishes with the residual helps
     far from the manifold."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
-    small = candidate.size <= _UNKNOWNS_MAX and equations.magnitude.size <= WRITTEN_OUT_MAX
+    small = equations.magnitude.size <= WRITTEN_OUT_MAX
 
     def run(small: bool, arrays: Any) -> Solved:
         given = eqx.combine(arrays, static)

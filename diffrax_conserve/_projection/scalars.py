@@ -25,7 +25,6 @@ from jaxtyping import Array, PyTree
 Scalars = tuple[Any, ...]
 
 # Compile time grows with the number of scalar operations.
-MAX_SCALARS = 32
 MAX_OPERATIONS = 512
 
 
@@ -47,7 +46,7 @@ def in_scalars(
     if it is too large or uses a primitive that is not supported here."""
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
-    if sum(map(prod, shapes)) > MAX_SCALARS:
+    if sum(map(prod, shapes)) > limit:
         return None
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)

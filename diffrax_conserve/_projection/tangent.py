@@ -1,5 +1,6 @@
 """Vector fields made tangent to a manifold, and the forces of constraints."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, final
@@ -143,16 +144,16 @@ class TangentField(eqx.Module):
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
-        weights = inverse_metric(self.metric, y)
+        equations = dataclasses.replace(equations, weights=inverse_metric(self.metric, y))
 
-        def residual(t: RealScalarLike, y: Y) -> Array:
-            return ravel(evaluate(self.manifold, t, y, args)) - numbers
+        def evaluated(t: RealScalarLike, y: Y) -> Array:
+            return ravel(evaluate(self.manifold, t, y, args))
 
         t = jnp.asarray(t, jnp.result_type(float, t))
-        g, along = jax.jvp(residual, (t, y), (jnp.ones_like(t), slope))
-        # That of a balance law, otherwise zero.
-        rate = ravel(rates(self.manifold, t, y, args))
-        wrong = (rate - along - self.gain * g).astype(vector.dtype)
+        found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
+        # The rate is that of a balance law, otherwise zero.
+        wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (found - numbers)
+        wrong = (wanted - along).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             vector, wrong = given
@@ -161,7 +162,7 @@ class TangentField(eqx.Module):
             sizes = jnp.max(jnp.abs(jacobian), axis=1)
             sizes = jnp.where(sizes > 0, sizes, 1)
             unit = jacobian / sizes[:, None]
-            rows = unit if weights is None else unit * weights
+            rows = equations.weighted(unit)
             multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
             return combined(multiplier, rows), multiplier / sizes
 

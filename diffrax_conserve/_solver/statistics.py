@@ -10,11 +10,9 @@ from .state import ProjectionStatistics
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:
     """The statistics of the projections of a solve.
 
-    They are part of the state of a `ManifoldProjection`, so `diffeqsolve` must return it, by
-    `SaveAt(solver_state=True)`. Otherwise they are not computed.
-
-    diffrax discards the solver state of a rejected step, so rejected steps appear only in
-    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept: from `worst`,
+    They are part of the state of a `ManifoldProjection`, which `diffeqsolve` returns by
+    `SaveAt(solver_state=True)`; otherwise they are not computed. Rejected steps appear only in
+    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept:
     `entry_name(manifold, int(statistics(sol).worst))` is the name of the entry that failed.
 
     **Arguments:**
@@ -40,15 +38,10 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
         square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-        sol = diffrax.diffeqsolve(
-            term,
-            dfc.ManifoldProjection(diffrax.Tsit5(), square),
-            t0=0,
-            t1=9,
-            dt0=0.5,
-            y0=jnp.array([1.0, 0.0]),
-            saveat=diffrax.SaveAt(t1=True, solver_state=True),
-        )
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
+        saveat = diffrax.SaveAt(t1=True, solver_state=True)
+        y0 = jnp.array([1.0, 0.0])
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.5, y0, saveat=saveat)
         print(dfc.statistics(sol))
         ```
 
