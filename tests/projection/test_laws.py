@@ -96,6 +96,21 @@ def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weig
         np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
 
 
+def test_a_component_that_vanished_stays_zero():
+    """Otherwise the last correction moves it by roundoff, which is all that its constraint has."""
+    entries = jax.random.uniform(jax.random.key(0), (500, 3), minval=0.1)
+    matrices = jax.vmap(lambda x: jnp.array([[0, 0, 0, x[0]], [0, x[1], 1, x[2]]]))(entries)
+
+    def result(matrix):
+        plane = dfc.Constraint(lambda t, y, args: matrix @ y)
+        y = jnp.array([0.0, 0.0, 0.28125, 1.0])
+        y, info = dfc.project(plane, y, projection=dfc.SimplifiedNewton())
+        return y[3], info.ok
+
+    last, ok = jax.jit(jax.vmap(result))(matrices)
+    assert np.all(ok) and np.all(last == 0)
+
+
 @given(y=near, weights=vectors(3, 2.0))
 def test_newton_finds_the_nearest_point(y, weights):
     """On a curve: the weighted correction is orthogonal to the tangent, and no point found by
