@@ -21,7 +21,7 @@ class SimplifiedNewton(AbstractProjection):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    With more than three constraints the matrix is that at the candidate, factored once. Two
+    With more than four constraints the matrix is that at the candidate, factored once. Two
     iterations are enough for nearly every step of an integrator. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
