@@ -258,10 +258,22 @@ class Target(eqx.Module):
         error = None if error is None else ravel(error)
         return Step(start, end, ravel(y0), error, path(), self.direction)
 
+    @eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
     def project(
         self, t: RealScalarLike, candidate: Y, step: Step | None = None
     ) -> tuple[Y, ProjectionInfo]:
-        return _project(self, t * self.direction, candidate, step)
+        values = self.values if self.gained is None else self.values + self.gained
+        manifold, t, args = self.manifold, t * self.direction, self.args
+        like = jax.eval_shape(lambda: candidate)
+        equations = equations_of(manifold, values, t, like, args, self.hidden)
+        weights = inverse_metric(self.projection.metric, like)
+        equations = dataclasses.replace(equations, weights=weights)
+        flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+        keys = tuple(_key(path[0]) if path else None for path, _ in flat)
+        shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
+        problem = Problem(equations, t, args, shaped, like, keys, step)
+        y, info = self.projection.solve(problem, ravel(candidate))
+        return unravel(y, problem.like), info
 
     def project_if(
         self, due: Bool[Array, ""] | None, t: RealScalarLike, candidate: Y, step: Step | None = None
@@ -274,24 +286,6 @@ class Target(eqx.Module):
         idle = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         idle = dataclasses.replace(idle, ok=jnp.asarray(True))
         return lax.cond(needed, lambda: self.project(t, candidate, step), lambda: (candidate, idle))
-
-
-@eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
-def _project(
-    target: Target, t: RealScalarLike, candidate: Y, step: Step | None
-) -> tuple[Y, ProjectionInfo]:
-    values = target.values if target.gained is None else target.values + target.gained
-    manifold, args = target.manifold, target.args
-    like = jax.eval_shape(lambda: candidate)
-    equations = equations_of(manifold, values, t, like, args, target.hidden)
-    weights = inverse_metric(target.projection.metric, like)
-    equations = dataclasses.replace(equations, weights=weights)
-    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    keys = tuple(_key(path[0]) if path else None for path, _ in flat)
-    shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
-    problem = Problem(equations, t, args, shaped, like, keys, step)
-    y, info = target.projection.solve(problem, ravel(candidate))
-    return unravel(y, problem.like), info
 
 
 def _key(entry: Any) -> Any:

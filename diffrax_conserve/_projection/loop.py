@@ -159,14 +159,16 @@ def _tested(
     now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
     left = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
     more = left > 0
-    return jnp.where(more, _corrected(equations, kept, y, g, jacobian, on), y), left, more.astype(int)
+    y = jnp.where(more, _corrected(equations, kept, y, g, jacobian, on), y)
+    return y, left, more.astype(int)
 
 
 def _corrected(
     equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array, on: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`, where `y` may be `on` the manifold. The damping is the squared residual, relative to the scale at the
-    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`; `on` tells whether `y` is on the manifold. The damping is the squared
+    residual, relative to the scale at the candidate: near a state where all terms vanish it never
+    becomes small relative to theirs."""
     if kept.factors is not None:
         rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:

@@ -1,5 +1,6 @@
 """The options of projections: their checks, and their vectors."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -7,11 +8,10 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Y
-from .._options import check_count, check_number, check_numbers, dtype_of
+from .._options import check_count, check_number, dtype_of
 from .._tree import ravel, real_view
 
 
@@ -42,7 +42,7 @@ def check_options(projection: Any) -> None:
     if hasattr(projection, "max_steps"):
         check_count("max_steps", projection.max_steps)
     for name in ("lower", "upper"):
-        check_numbers(name, getattr(projection, name, None), least=-np.inf)
+        check_number(name, getattr(projection, name, None), least=-math.inf)
 
 
 # The options that the Newton iterations share.
@@ -74,18 +74,13 @@ projection is used, the bounds are not shaped like the state.
 
 def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
     """`metric`, checked now if its values are known, and at run time if they are tracers."""
-    message = (
-        "`metric` has a weight that is not positive. Every weight must be greater than 0; they are "
-        "per component, not a matrix."
-    )
+    check_number("metric", metric, above=0.0)
 
     def check(weight: ArrayLike) -> ArrayLike:
-        check_number("metric", weight)
-        if isinstance(weight, jax.core.Tracer):
-            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
-        if not np.all(np.asarray(weight) > 0):
-            raise ValueError(message)
-        return weight
+        if not isinstance(weight, jax.core.Tracer):
+            return weight
+        message = "`metric` has a weight that is not positive. It has one for each component."
+        return eqx.error_if(weight, ~jnp.all(weight > 0), message)
 
     return jtu.tree_map(check, metric)
 

@@ -20,7 +20,6 @@ from .._custom_types import (
 )
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import (
-    Constraint,
     FirstIntegral,
     check_manifold,
     conserved_values,
@@ -194,7 +193,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             hidden,
             jnp.zeros_like(values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
-            jnp.asarray(True) if given and self._is_limited(terms) else None,
+            jnp.asarray(True) if given and self._limit(terms) is not None else None,
             ProjectionStatistics.zero(values.dtype),
         )
 
@@ -231,15 +230,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         step = target.step(t0, t1, y0, error, path)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
-        failed, hopeless = verdict(
-            info.ok,
-            state,
-            (t0, t1),
-            (y0, candidate, y1),
-            self.max_correction if self._is_limited(terms) else None,
-            self.every,
-            any(isinstance(x, Constraint) for _, x in named_entries(self.manifold)),
-        )
+        states, limit = (y0, candidate, y1), self._limit(terms)
+        failed, hopeless = verdict(info.ok, state, (t0, t1), states, limit)
         dense_info = dict(
             inner=dense_info,
             ends=(y0, y1),
@@ -256,13 +248,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         )
         return y1, error, dense_info, state.next(inner, target.gained, info, due), result
 
-    def _is_limited(self, terms: PyTree[dfx.AbstractTerm]) -> bool:
-        """Whether `max_correction` applies: not to constraints, whose correction may do all the
-        work of a step, nor to noise or a network, which may leave the manifold as fast as they
-        move."""
+    def _limit(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
+        """`max_correction` for the steps since the last projection, where it applies: not to
+        constraints, whose correction may do all the work of a step, nor to noise or a network,
+        which may leave the manifold as fast as they move."""
         integrals = all(isinstance(x, FirstIntegral) for _, x in named_entries(self.manifold))
         evaluated = getattr(innermost(self.solver), "evaluates_vector_field", True)
-        return self.max_correction is not None and integrals and evaluated and is_ode(terms)
+        if self.max_correction is None or not (integrals and evaluated and is_ode(terms)):
+            return None
+        return self.max_correction * self.every
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**

@@ -35,8 +35,9 @@ _FIRST = register(
     "manifold is not finite there. Start on the manifold: "
     "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`. " + _ENTRY,
     "the projection of a step failed: the state that the wrapped solver proposed is not finite, or "
-    "a function of the manifold there or at the initial state, or the iteration diverged. Check "
-    "the vector field and `fn`. " + _SMALLER + _ENTRY,
+    "a function of the manifold there, or the iteration diverged. Check the vector field and `fn`. "
+    + _SMALLER
+    + _ENTRY,
     "the projection of a step failed: the correction moved the state further than `max_correction` "
     "allows. Perhaps the quantity is not conserved at all, which `check_invariance` tells, or the "
     "state jumped to another part of the manifold. Take smaller steps, or pass another "
@@ -167,8 +168,6 @@ def verdict(
     times: tuple[RealScalarLike, RealScalarLike],
     states: tuple[Y, Y, Y],
     max_correction: RealScalarLike | None,
-    every: int,
-    has_constraints: bool,
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """The cause of the failure of a step, 0 if it succeeded; and whether a failure is final,
     because the candidate is already very close to the last state, the step is a roundoff of time,
@@ -178,7 +177,7 @@ def verdict(
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
     size = jnp.abs(candidate)
     # One sum, hence one kernel. A correction within the second term is allowed in any step.
-    share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype) * every
+    share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
     excess = jnp.sum(correction - share * moved - 8 * float(info.eps) ** 0.5 * size)
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
@@ -187,8 +186,7 @@ def verdict(
         too_far = too_far if state.is_first is None else too_far & ~state.is_first
         cause = jnp.where(too_far, _TOO_FAR, cause)
     lost = jnp.any(jnp.isnan(state.values))
-    if has_constraints:  # otherwise a function was not finite
-        cause = jnp.where(lost, _START, cause)
+    cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     near = jnp.sum(moved - max(5e-4, 16 * float(info.eps)) * size) <= 0
