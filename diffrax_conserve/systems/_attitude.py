@@ -1,6 +1,6 @@
 """The attitude of a free rigid body, as a unit quaternion."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,14 +34,12 @@ class RigidBodyAttitude(AbstractIntegratedSystem):
 
     inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
 
-    name: ClassVar[str] = "rigid-body-attitude"
-    title: ClassVar[str] = "Attitude of a free rigid body"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, VII.5."
-    )
-    t1: ClassVar[float] = 20.0
-    dt: ClassVar[float] = 0.1
-    axes: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    name = "rigid-body-attitude"
+    title = "Attitude of a free rigid body"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, VII.5."
+    t1 = 20.0
+    dt = 0.1
+    axes = ("x", "y", "z")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args

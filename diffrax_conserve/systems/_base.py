@@ -99,9 +99,10 @@ class AbstractSystem(eqx.Module):
         integrals; `None` if the system does not need any."""
         return None
 
-    @abc.abstractmethod
     def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
-        """Named curves in two or three coordinates, for a phase picture of the states `ys`."""
+        """Named curves in two or three coordinates, for a phase picture of the states `ys`: if the
+        system does not say otherwise, the first components of the (first leaf of the) state."""
+        return {self.title: jtu.tree_leaves(ys)[0][:, : len(self.axes)]}
 
     @property
     def args(self) -> None:
@@ -168,45 +169,35 @@ def _solution(system: AbstractSystem, ts: Float[Array, " times"], y0: Any) -> An
 
 
 class AbstractIntegratedSystem(AbstractSystem):
-    """A system without a known solution in closed form: its reference is computed numerically."""
+    """A system without a known solution in closed form: its reference is computed numerically.
+
+    The solver steps exactly to the times, because dense output has errors of 1e-10 even at
+    tolerances near roundoff. The tolerances are at roundoff because local errors add up: over the
+    default time spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to
+    errors of 1e-13 to 4e-11, with 1.6 times the steps.
+    """
 
     solver: ClassVar[dfx.AbstractSolver] = dfx.Dopri8()
     tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)  # relative and absolute
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        return integrate(self, ts, y0, self.solver, self.tolerances)
+        controller = dfx.PIDController(*self.tolerances)
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(self.vector_field),
+            self.solver,
+            t0=0.0,
+            t1=ts[-1],
+            dt0=None,
+            y0=y0,
+            args=self.args,
+            saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=dfx.ClipStepSizeController(controller, step_ts=ts),
+            max_steps=10**7,
+        )
+        return sol.ys
 
     def period(self, y0: Any = None) -> None:
         del y0
-
-
-def integrate(
-    system: AbstractSystem,
-    ts: Float[Array, " times"],
-    y0: Any,
-    solver: dfx.AbstractSolver = AbstractIntegratedSystem.solver,
-    tolerances: tuple[float, float] = AbstractIntegratedSystem.tolerances,
-) -> Any:
-    """The states at `ts`, in float64.
-
-    The solver steps exactly to `ts`, because dense output has errors of 1e-10 even at tolerances
-    near roundoff. The tolerances are at roundoff because local errors add up: over the default time
-    spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to errors of
-    1e-13 to 4e-11, with 1.6 times the steps.
-    """
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field),
-        solver,
-        t0=0.0,
-        t1=ts[-1],
-        dt0=None,
-        y0=y0,
-        args=system.args,
-        saveat=dfx.SaveAt(ts=ts),
-        stepsize_controller=dfx.ClipStepSizeController(dfx.PIDController(*tolerances), step_ts=ts),
-        max_steps=10**7,
-    )
-    return sol.ys
 
 
 def annulus(

@@ -1,6 +1,6 @@
 """The pendulum in Cartesian coordinates, with its constraints."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,14 +41,12 @@ class CartesianPendulum(AbstractSystem):
     length: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     gravity: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "cartesian-pendulum"
-    title: ClassVar[str] = "Pendulum in Cartesian coordinates"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, IV.4 and VII.1."
-    )
-    t1: ClassVar[float] = 30.0
-    dt: ClassVar[float] = 0.1
-    axes: ClassVar[tuple[str, ...]] = ("q₁", "q₂")
+    name = "cartesian-pendulum"
+    title = "Pendulum in Cartesian coordinates"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, IV.4, VII.1."
+    t1 = 30.0
+    dt = 0.1
+    axes = ("q₁", "q₂")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -131,9 +129,6 @@ class CartesianPendulum(AbstractSystem):
         phi = jnp.where(swings, jnp.arctan2(sine, half_rate), half_angle)
         signed = jnp.where(swings, modulus, jnp.copysign(modulus, half_rate))
         return swings, signed, m, incomplete_elliptic(phi, m)
-
-    def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
-        return {"mass": ys[0]}
 
 
 CartesianPendulum.__init__.__doc__ = r"""**Arguments:**

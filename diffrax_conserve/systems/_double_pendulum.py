@@ -1,6 +1,6 @@
 """The planar double pendulum, in angles and momenta."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -49,15 +49,15 @@ class DoublePendulum(AbstractIntegratedSystem):
     lengths: Pair = eqx.field(converter=real, default=(1.0, 1.0))
     gravity: Float[Array, ""] = eqx.field(converter=real, default=9.81)
 
-    name: ClassVar[str] = "double-pendulum"
-    title: ClassVar[str] = "Double pendulum"
-    citation: ClassVar[str] = (
+    name = "double-pendulum"
+    title = "Double pendulum"
+    citation = (
         "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
         "L. D. Landau and E. M. Lifshitz, Mechanics, §5."
     )
-    t1: ClassVar[float] = 10.0
-    dt: ClassVar[float] = 0.5
-    axes: ClassVar[tuple[str, ...]] = ("θ₁", "θ₂")
+    t1 = 10.0
+    dt = 0.5
+    axes = ("θ₁", "θ₂")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -102,9 +102,6 @@ class DoublePendulum(AbstractIntegratedSystem):
 
     def sample(self, key: PRNGKeyArray) -> State:
         return jr.uniform(key, (4,), minval=-jnp.pi / 6, maxval=jnp.pi / 6)
-
-    def trajectories(self, ys: Float[Array, "times 4"]) -> dict[str, Float[Array, "times 2"]]:
-        return {"angles": ys[:, :2]}
 
 
 DoublePendulum.__init__.__doc__ = r"""**Arguments:**

@@ -1,6 +1,6 @@
 """Hénon and Heiles' model of a star in a galaxy."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,12 +35,12 @@ class HenonHeiles(AbstractIntegratedSystem):
 
     coupling: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "henon-heiles"
-    title: ClassVar[str] = "Hénon-Heiles system"
-    citation: ClassVar[str] = "M. Hénon and C. Heiles, Astron. J. 69 (1964)."
-    t1: ClassVar[float] = 100.0
-    dt: ClassVar[float] = 0.25
-    axes: ClassVar[tuple[str, ...]] = ("q₁", "q₂")
+    name = "henon-heiles"
+    title = "Hénon-Heiles system"
+    citation = "M. Hénon and C. Heiles, Astron. J. 69 (1964)."
+    t1 = 100.0
+    dt = 0.25
+    axes = ("q₁", "q₂")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -67,11 +67,6 @@ class HenonHeiles(AbstractIntegratedSystem):
     def sample(self, key: PRNGKeyArray) -> State:
         q_key, p_key = jr.split(key)
         return annulus(q_key, inner=0.0, outer=0.3), annulus(p_key, inner=0.0, outer=0.4)
-
-    def trajectories(
-        self, ys: tuple[Float[Array, "times 2"], Float[Array, "times 2"]]
-    ) -> dict[str, Float[Array, "times 2"]]:
-        return {"star": ys[0]}
 
 
 HenonHeiles.__init__.__doc__ = r"""**Arguments:**

@@ -1,6 +1,6 @@
 """Kepler's problem: one body about a fixed centre."""
 
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -38,14 +38,12 @@ class Kepler(AbstractSystem):
 
     mu: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "kepler"
-    title: ClassVar[str] = "Kepler's problem"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.2."
-    )
-    t1: ClassVar[float] = 20.0
-    dt: ClassVar[float] = 0.2
-    axes: ClassVar[tuple[str, ...]] = ("q₁", "q₂")
+    name = "kepler"
+    title = "Kepler's problem"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.2."
+    t1 = 20.0
+    dt = 0.2
+    axes = ("q₁", "q₂")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -145,9 +143,6 @@ class Kepler(AbstractSystem):
             "negative. Integrate this orbit with `diffrax.diffeqsolve` instead.",
         )
         return -self.mu / (2 * energy)
-
-    def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
-        return {"orbit": ys[0]}
 
 
 Kepler.__init__.__doc__ = r"""**Arguments:**

@@ -1,6 +1,6 @@
 """The Korteweg-de Vries equation on a ring, in Fourier modes: a partial differential equation."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -47,14 +47,12 @@ class KortewegDeVries(AbstractIntegratedSystem):
     wave_number: Float[Array, ""] = eqx.field(converter=real, default=0.5)
     points: int = eqx.field(static=True, default=256, kw_only=True)
 
-    name: ClassVar[str] = "korteweg-de-vries"
-    title: ClassVar[str] = "Korteweg-de Vries equation, a soliton"
-    citation: ClassVar[str] = (
-        "P. G. Drazin and R. S. Johnson, Solitons: an Introduction, Cambridge 1989."
-    )
-    t1: ClassVar[float] = 16.0
-    dt: ClassVar[float] = 0.008
-    axes: ClassVar[tuple[str, ...]] = ("cosine of mode 1", "sine of mode 1")
+    name = "korteweg-de-vries"
+    title = "Korteweg-de Vries equation, a soliton"
+    citation = "P. G. Drazin and R. S. Johnson, Solitons: an Introduction, Cambridge 1989."
+    t1 = 16.0
+    dt = 0.008
+    axes = ("cosine of mode 1", "sine of mode 1")
 
     def __check_init__(self):
         if self.points < 4:

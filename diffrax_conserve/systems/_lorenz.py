@@ -1,6 +1,6 @@
 """The conservative part of the Lorenz-1963 model."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,16 +37,16 @@ class ConservativeLorenz(AbstractIntegratedSystem):
     sigma: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     rho: Float[Array, ""] = eqx.field(converter=real, default=0.5)
 
-    name: ClassVar[str] = "conservative-lorenz"
-    title: ClassVar[str] = "Conservative Lorenz-1963 model"
-    citation: ClassVar[str] = (
+    name = "conservative-lorenz"
+    title = "Conservative Lorenz-1963 model"
+    citation = (
         "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
         "E. N. Lorenz, J. Atmos. Sci. 20 (1963); "
         "P. Névir and R. Blender, Beitr. Phys. Atmosph. 67 (1994)."
     )
-    t1: ClassVar[float] = 125.0
-    dt: ClassVar[float] = 0.25
-    axes: ClassVar[tuple[str, ...]] = ("x", "y", "z")
+    t1 = 125.0
+    dt = 0.25
+    axes = ("x", "y", "z")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -75,9 +75,6 @@ class ConservativeLorenz(AbstractIntegratedSystem):
         plane_key, z_key = jr.split(key)
         z = jr.uniform(z_key, (1,), minval=0.5, maxval=1.5)
         return jnp.concatenate([annulus(plane_key, inner=0.5, outer=1.5), z])
-
-    def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
-        return {"state": ys}
 
 
 ConservativeLorenz.__init__.__doc__ = r"""**Arguments:**

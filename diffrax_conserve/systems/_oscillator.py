@@ -1,6 +1,6 @@
 """The harmonic oscillator."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,12 +28,12 @@ class HarmonicOscillator(AbstractSystem):
 
     omega: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "harmonic-oscillator"
-    title: ClassVar[str] = "Harmonic oscillator"
-    citation: ClassVar[str] = "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023)."
-    t1: ClassVar[float] = 30.0
-    dt: ClassVar[float] = 0.25
-    axes: ClassVar[tuple[str, ...]] = ("q", "p")
+    name = "harmonic-oscillator"
+    title = "Harmonic oscillator"
+    citation = "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023)."
+    t1 = 30.0
+    dt = 0.25
+    axes = ("q", "p")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -64,9 +64,6 @@ class HarmonicOscillator(AbstractSystem):
     def period(self, y0: State | None = None) -> Float[Array, ""]:
         del y0
         return 2 * jnp.pi / self.omega
-
-    def trajectories(self, ys: Float[Array, "times 2"]) -> dict[str, Float[Array, "times 2"]]:
-        return {"mass": ys}
 
 
 HarmonicOscillator.__init__.__doc__ = r"""**Arguments:**

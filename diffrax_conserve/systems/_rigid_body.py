@@ -1,6 +1,6 @@
 """The free rigid body in its own frame."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,15 +37,15 @@ class RigidBody(AbstractSystem):
 
     inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
 
-    name: ClassVar[str] = "rigid-body"
-    title: ClassVar[str] = "Free rigid body"
-    citation: ClassVar[str] = (
+    name = "rigid-body"
+    title = "Free rigid body"
+    citation = (
         "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
         "L. D. Landau and E. M. Lifshitz, Mechanics, §36-37."
     )
-    t1: ClassVar[float] = 1.75
-    dt: ClassVar[float] = 0.05
-    axes: ClassVar[tuple[str, ...]] = ("w₁", "w₂", "w₃")
+    t1 = 1.75
+    dt = 0.05
+    axes = ("w₁", "w₂", "w₃")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -84,11 +84,6 @@ class RigidBody(AbstractSystem):
     def period(self, y0: State | None = None) -> Float[Array, ""]:
         _, _, rate, m, _ = _elliptic_form(self.inertia, self.y0 if y0 is None else y0)
         return 4 * complete_elliptic(m) / rate
-
-    def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
-        # All three components, unlike in the paper: in two of them a closed orbit appears as an
-        # arc, traversed back and forth.
-        return {"angular momentum": ys}
 
 
 RigidBody.__init__.__doc__ = r"""**Arguments:**

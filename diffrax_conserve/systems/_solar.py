@@ -1,6 +1,6 @@
 """The outer solar system: the Sun and its five outer bodies."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -82,15 +82,13 @@ class OuterSolarSystem(AbstractIntegratedSystem):
     masses: Float[Array, " bodies"] = eqx.field(converter=real, default=_MASSES)
     gravity: Float[Array, ""] = eqx.field(converter=real, default=2.95912208286e-4)
 
-    name: ClassVar[str] = "outer-solar-system"
-    title: ClassVar[str] = "Outer solar system"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.4."
-    )
-    t1: ClassVar[float] = 200_000.0
-    dt: ClassVar[float] = 100.0
-    axes: ClassVar[tuple[str, ...]] = ("x [AU]", "y [AU]", "z [AU]")
-    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-18)  # the velocities are of size 1e-3
+    name = "outer-solar-system"
+    title = "Outer solar system"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.4."
+    t1 = 200_000.0
+    dt = 100.0
+    axes = ("x [AU]", "y [AU]", "z [AU]")
+    tolerances = (1e-15, 1e-18)  # the velocities are of size 1e-3
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args

@@ -1,6 +1,6 @@
 """The periodic Toda lattice."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,14 +46,12 @@ class TodaLattice(AbstractIntegratedSystem):
     b: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     particles: int = eqx.field(static=True, default=3, kw_only=True)
 
-    name: ClassVar[str] = "toda-lattice"
-    title: ClassVar[str] = "Periodic Toda lattice"
-    citation: ClassVar[str] = (
-        "M. Hénon, Phys. Rev. B 9 (1974) 1921-1923; H. Flaschka, Phys. Rev. B 9 (1974) 1924-1925."
-    )
-    t1: ClassVar[float] = 50.0
-    dt: ClassVar[float] = 0.1
-    axes: ClassVar[tuple[str, ...]] = ("q", "p")
+    name = "toda-lattice"
+    title = "Periodic Toda lattice"
+    citation = "M. Hénon, Phys. Rev. B 9 (1974) 1921; H. Flaschka, Phys. Rev. B 9 (1974) 1924."
+    t1 = 50.0
+    dt = 0.1
+    axes = ("q", "p")
 
     def __check_init__(self):
         if self.particles < 3:

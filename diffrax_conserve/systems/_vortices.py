@@ -1,6 +1,6 @@
 """Point vortices in the plane."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -42,15 +42,15 @@ class PointVortices(AbstractIntegratedSystem):
 
     strengths: Float[Array, " vortices"] = eqx.field(converter=real, default=(1.0, 1.0, 1.0))
 
-    name: ClassVar[str] = "point-vortices"
-    title: ClassVar[str] = "Point vortices"
-    citation: ClassVar[str] = (
+    name = "point-vortices"
+    title = "Point vortices"
+    citation = (
         "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
         "P. K. Newton, The N-Vortex Problem, Springer (2001)."
     )
-    t1: ClassVar[float] = 250.0
-    dt: ClassVar[float] = 0.5
-    axes: ClassVar[tuple[str, ...]] = ("x", "y")
+    t1 = 250.0
+    dt = 0.5
+    axes = ("x", "y")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
