@@ -66,15 +66,17 @@ class AbstractSystem(eqx.Module):
     dt: AbstractClassVar[float]
     # The labels of the two or three coordinates in `trajectories`.
     axes: AbstractClassVar[tuple[str, ...]]
+    # The methods that are the first integrals in `manifold`.
+    integrals: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def vector_field(self, t: RealScalarLike, y: Any, args: Args) -> Any:
         """The right-hand side $f(t, y, args)$; its dtype is that of `y`."""
 
     @property
-    @abc.abstractmethod
     def manifold(self) -> dict[str, FirstIntegral | Constraint]:
         """The functionally independent integrals and constraints of the exact solution, by name."""
+        return {x.replace("_", " "): FirstIntegral(getattr(self, x)) for x in self.integrals}
 
     @property
     @abc.abstractmethod

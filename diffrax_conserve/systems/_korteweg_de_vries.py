@@ -9,7 +9,6 @@ import jax.random as jr
 from jaxtyping import Array, Complex, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractIntegratedSystem, real
 
 Wave = Float[Array, " points"]
@@ -53,6 +52,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
     t1 = 16.0
     dt = 0.008
     axes = ("cosine of mode 1", "sine of mode 1")
+    integrals = ("mass", "momentum", "energy")
 
     def __check_init__(self):
         if self.points < 4:
@@ -97,14 +97,6 @@ class KortewegDeVries(AbstractIntegratedSystem):
         modes, d = self._modes(y)
         slope, wave = self._wave(d * modes), self._wave(modes)
         return self._integral(slope**2 / 2 - wave**3)
-
-    @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {
-            "mass": FirstIntegral(self.mass),
-            "momentum": FirstIntegral(self.momentum),
-            "energy": FirstIntegral(self.energy),
-        }
 
     @property
     def x(self) -> Wave:

@@ -8,7 +8,6 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractIntegratedSystem, real
 
 State = Float[Array, "2"]
@@ -41,6 +40,7 @@ class LotkaVolterra(AbstractIntegratedSystem):
     t1 = 50.0
     dt = 0.2
     axes = ("predators", "prey")
+    integrals = ("first_integral",)
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -53,10 +53,6 @@ class LotkaVolterra(AbstractIntegratedSystem):
         s = self.like(y)
         u, v = y
         return s.gamma * jnp.log(u) - s.delta * u + s.alpha * jnp.log(v) - s.beta * v
-
-    @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {"first integral": FirstIntegral(self.first_integral)}
 
     @property
     def y0(self) -> State:

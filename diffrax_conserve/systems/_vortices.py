@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractIntegratedSystem, Reduced, annulus, real
 
 State = Float[Array, "vortices 2"]
@@ -51,6 +50,7 @@ class PointVortices(AbstractIntegratedSystem):
     t1 = 250.0
     dt = 0.5
     axes = ("x", "y")
+    integrals = ("energy", "linear_impulse", "angular_impulse")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -72,14 +72,6 @@ class PointVortices(AbstractIntegratedSystem):
     def angular_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
         del t, args
         return jnp.sum(self.like(y).strengths[:, None] * y**2)
-
-    @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {
-            "energy": FirstIntegral(self.energy),
-            "linear impulse": FirstIntegral(self.linear_impulse),
-            "angular impulse": FirstIntegral(self.angular_impulse),
-        }
 
     @property
     def y0(self) -> State:

@@ -1,4 +1,4 @@
-"""Kepler's problem: one body about a fixed centre."""
+"""Bodies that attract each other: Kepler's problem and the outer solar system."""
 
 from typing import Any, final
 
@@ -9,8 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, Reduced, real
+from ._base import AbstractIntegratedSystem, AbstractSystem, Reduced, real
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]
@@ -44,6 +43,7 @@ class Kepler(AbstractSystem):
     t1 = 20.0
     dt = 0.2
     axes = ("q₁", "q₂")
+    integrals = ("energy", "angular_momentum")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -66,13 +66,6 @@ class Kepler(AbstractSystem):
         l = self.angular_momentum(t, y, args)
         rotated = jnp.stack([p[1], -p[0]])
         return l * rotated - self.like(y).mu * q / jnp.sqrt(jnp.sum(q**2))
-
-    @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {
-            "energy": FirstIntegral(self.energy),
-            "angular momentum": FirstIntegral(self.angular_momentum),
-        }
 
     @property
     def y0(self) -> State:
@@ -170,3 +163,146 @@ def _eccentric_anomaly(
         return x - (x - e * jnp.sin(x) - m) / (1 - e * jnp.cos(x))
 
     return jax.lax.fori_loop(0, 12, newton, m + 0.85 * e * jnp.sign(m))
+
+
+Vectors = Float[Array, "bodies 3"]
+Bodies = tuple[Vectors, Vectors]
+BodiesAtTimes = tuple[Float[Array, "times bodies 3"], Float[Array, "times bodies 3"]]
+
+# Relative to the Sun; the mass of the Sun includes the four inner planets.
+_MASSES = {
+    "Sun": 1.00000597682,
+    "Jupiter": 0.000954786104043,
+    "Saturn": 0.000285583733151,
+    "Uranus": 0.0000437273164546,
+    "Neptune": 0.0000517759138449,
+    "Pluto": 1 / 1.3e8,
+}
+# Heliocentric positions in AU and velocities in AU per day, at 0h00 on September 5, 1994.
+_STATES = (
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ((-3.5023653, -3.8169847, -1.5507963), (0.00565429, -0.00412490, -0.00190589)),
+    ((9.0755314, -3.0458353, -1.6483708), (0.00168318, 0.00483525, 0.00192462)),
+    ((8.3101420, -16.2901086, -7.2521278), (0.00354178, 0.00137102, 0.00055029)),
+    ((11.4707666, -25.7294829, -10.8169456), (0.00288930, 0.00114527, 0.00039677)),
+    ((-15.5387357, -25.2225594, -3.1902382), (0.00276725, -0.00170702, -0.00136504)),
+)
+# The inverse mean motion of Jupiter, in days, which makes the weights of positions and velocities
+# in the metric comparable.
+_TIME_SCALE = 4332.6 / 6.283185307179586
+
+
+@final
+class OuterSolarSystem(AbstractIntegratedSystem):
+    r"""Newton's equations of the Sun, Jupiter, Saturn, Uranus, Neptune and Pluto.
+
+    The state `y = (q, v)` consists of positions and velocities, each of shape `(6, 3)`, in
+    astronomical units and days, with masses in solar masses:
+
+    $$q_i' = v_i, \qquad v_i' = -G \sum_{j \ne i} m_j \frac{q_i - q_j}{|q_i - q_j|^3}.$$
+
+    **Manifold**: energy $\tfrac12 \sum m_i |v_i|^2 - G \sum_{i<j} m_i m_j / |q_i - q_j|$, linear
+    momentum $\sum m_i v_i$ and angular momentum $\sum m_i q_i \times v_i$. `centre_of_mass` is a
+    first integral that depends on time; it is not in the manifold because every Runge-Kutta method
+    conserves it.
+
+    A Euclidean projection on the energy alone does not conserve the linear momentum: the gradient
+    of the energy is $m_i v_i$, and $\sum m_i (m_i v_i) \ne 0$. In the mass metric (`metric`) the
+    correction of $v_i$ is proportional to $v_i$, and $\sum m_i v_i = 0$ in the barycentric frame,
+    so the default state is barycentric.
+
+    **Reference**: numerical. **Samples**: the real state, with a normal deviate of 1 % of each
+    body's heliocentric distance or speed added to each component of its position or velocity, then
+    converted to barycentric coordinates.
+
+    Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.4, Table 2.2, with
+    data from "Ahnerts Kalender für Sternfreunde 1994" for September 5, 1994.
+    """
+
+    masses: Float[Array, " bodies"] = eqx.field(converter=real, default=tuple(_MASSES.values()))
+    gravity: Float[Array, ""] = eqx.field(converter=real, default=2.95912208286e-4)
+
+    name = "outer-solar-system"
+    title = "Outer solar system"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.4."
+    t1 = 200_000.0
+    dt = 100.0
+    axes = ("x [AU]", "y [AU]", "z [AU]")
+    integrals = ("energy", "linear_momentum", "angular_momentum")
+    tolerances = (1e-15, 1e-18)  # the velocities are of size 1e-3
+
+    def vector_field(self, t: RealScalarLike, y: Bodies, args: Args) -> Bodies:
+        del t, args
+        q, v = y
+        system = self.like(y)
+        separation = q[:, None] - q[None]
+        pull = system.masses[None, :] / _distances(separation) ** 3
+        return v, -system.gravity * jnp.sum(pull[:, :, None] * separation, axis=1)
+
+    def energy(self, t: RealScalarLike, y: Bodies, args: Args) -> Float[Array, ""]:
+        del t, args
+        q, v = y
+        system = self.like(y)
+        inverse = 1 / _distances(q[:, None] - q[None]) - jnp.eye(q.shape[0], dtype=q.dtype)
+        pairs = jnp.sum(system.masses[:, None] * system.masses[None, :] * inverse) / 2
+        return jnp.sum(system.masses[:, None] * v**2) / 2 - system.gravity * pairs
+
+    def linear_momentum(self, t: RealScalarLike, y: Bodies, args: Args) -> Float[Array, "3"]:
+        del t, args
+        return jnp.sum(self.like(y).masses[:, None] * y[1], axis=0)
+
+    def angular_momentum(self, t: RealScalarLike, y: Bodies, args: Args) -> Float[Array, "3"]:
+        del t, args
+        q, v = y
+        return jnp.sum(self.like(y).masses[:, None] * jnp.cross(q, v), axis=0)
+
+    def centre_of_mass(self, t: RealScalarLike, y: Bodies, args: Args) -> Float[Array, "3"]:
+        r"""$\sum m_i (q_i - t v_i) / \sum m_i$, the centre of mass at time 0."""
+        del args
+        q, v = y
+        masses = self.like(y).masses
+        return jnp.sum(masses[:, None] * (q - t * v), axis=0) / jnp.sum(masses)
+
+    @property
+    def metric(self) -> Bodies:
+        r"""$m_i$ for velocities and $m_i / \tau^2$ for positions, $\tau$ = 690 days."""
+        weights = jnp.broadcast_to(self.masses[:, None], (self.masses.size, 3))
+        return weights / _TIME_SCALE**2, weights
+
+    @property
+    def y0(self) -> Bodies:
+        q, v = jnp.moveaxis(jnp.array(_STATES), 1, 0)
+        return self.barycentric((q, v))
+
+    def barycentric(self, y: Bodies) -> Bodies:
+        """The state `y` relative to the centre of mass, which is then at rest at the origin."""
+        q, v = y
+        weights = self.like(y).masses[:, None]
+        weights = weights / jnp.sum(weights)
+        centre = jnp.sum(weights * q, axis=0, keepdims=True)
+        velocity = jnp.sum(weights * v, axis=0, keepdims=True)
+        return q - centre, v - velocity
+
+    def sample(self, key: PRNGKeyArray) -> Bodies:
+        def perturbed(key: PRNGKeyArray, x: Vectors) -> Vectors:
+            size = jnp.linalg.norm(x, axis=1, keepdims=True)
+            return x + 0.01 * size * jr.normal(key, x.shape)
+
+        q, v = jax.vmap(perturbed, in_axes=(0, 1))(jr.split(key), jnp.array(_STATES))
+        return self.barycentric((q, v))
+
+    def trajectories(self, ys: BodiesAtTimes) -> dict[str, Float[Array, "times 3"]]:
+        return {name: ys[0][:, i] for i, name in enumerate(_MASSES)}
+
+
+OuterSolarSystem.__init__.__doc__ = r"""**Arguments:**
+
+- `masses`: the masses of the six bodies, the Sun first, in solar masses.
+- `gravity`: the gravitational constant $G$, in AU³ per day² and solar mass.
+"""
+
+
+def _distances(separation: Float[Array, "bodies bodies 3"]) -> Float[Array, "bodies bodies"]:
+    """Distances between bodies, with ones on the diagonal."""
+    own = jnp.eye(separation.shape[0], dtype=separation.dtype)
+    return jnp.sqrt(jnp.sum(separation**2, axis=2) + own)
