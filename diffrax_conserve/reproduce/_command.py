@@ -21,7 +21,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(argv)
     if options.command == "list":
-        _list()
+        width = max(map(len, systems.names()))
+        for name in systems.names():
+            print(f"{name:{width}}  {systems.get(name).title}")
         return 0
     # The references need float64, and drifts are compared with its roundoff.
     jax.config.update("jax_enable_x64", True)
@@ -39,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             anew=options.train,
             seed=options.seed or 0,
             epochs=5000 if options.epochs is None else options.epochs,
-            progress=lambda text: print(text, file=sys.stderr, flush=True),
         )
     except SetupError as error:
         parser.error(str(error))
@@ -59,12 +60,6 @@ def run() -> int:
             print(f"error: cannot write{place}: {error.strerror or error}", file=sys.stderr)
         return 1
     return status
-
-
-def _list() -> None:
-    width = max(map(len, systems.names()))
-    for name in systems.names():
-        print(f"{name:{width}}  {systems.get(name).title}")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -2,8 +2,8 @@
 
 import json
 import math
+import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,12 +55,11 @@ def reproduce(
     anew: bool = False,
     seed: int = 0,
     epochs: int = 5000,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> bool:
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
     With `anew` the networks of the paper's systems are trained first; otherwise the pretrained ones
-    are used. `progress` is called with each stage. Returns whether every solver succeeded. Raises
+    are used. Returns whether every solver succeeded. Raises
     `SetupError` before the work starts.
     """
     y0s = initial_states(system)
@@ -79,14 +78,14 @@ def reproduce(
     chosen = solvers(system, {kind: network for kind, (network, *_) in networks.items()})
     runs = {}
     for i, (name, solver) in enumerate(chosen.items(), start=1):
-        progress(f"[{i}/{len(chosen)}] {name}: compiles and solves")
+        _say(f"[{i}/{len(chosen)}] {name}: compiles and solves")
         runs[name] = run(system, solver, y0s, t1, dt)
-    progress("reference and figures")
+    _say("reference and figures")
     try:
         errors = state_errors(system, y0s, runs)
     except RuntimeError as error:  # raised by diffrax and `equinox.error_if`
         errors = {}
-        progress(f"the reference failed: {reason(error)}")
+        _say(f"the reference failed: {reason(error)}")
     numbers = metrics(system, runs, errors, t1, dt, states)
     if plot is not None:
         plot.draw(out, system, runs, errors, networks)
@@ -97,6 +96,10 @@ def reproduce(
         print("\nThe figures need matplotlib: pip install 'diffrax-conserve[plots]'")
     print(f"\nWhat is written is in {out}")
     return len(errors) == len(runs)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:

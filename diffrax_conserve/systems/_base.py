@@ -91,9 +91,9 @@ class AbstractSystem(eqx.Module):
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
         """The states in float64 at the times `ts` after `y0`; called by `reference`."""
 
-    @abc.abstractmethod
     def period(self, y0: Any = None) -> Float[Array, ""] | None:
         """The period of the solution through `y0`; `None` if no closed form is known."""
+        del y0
 
     @property
     def metric(self) -> Y | None:
@@ -119,9 +119,9 @@ class AbstractSystem(eqx.Module):
     ) -> Any:
         """The states at the times `ts`, as accurate as float64 allows.
 
-        They are computed from the exact solution if there is one in closed form, otherwise by an
-        eighth-order solve that steps exactly to `ts`; each system says which. Over the default time
-        span the error of the latter is 1e-13 to 1e-12 of the largest component.
+        By the exact solution if there is one in closed form, otherwise by an eighth-order solve,
+        with errors of 1e-13 to 1e-12 of the largest component over the default time span; each
+        system says which.
 
         **Arguments:**
 
@@ -174,13 +174,13 @@ class AbstractIntegratedSystem(AbstractSystem):
     """A system without a known solution in closed form: its reference is computed numerically.
 
     The solver steps exactly to the times, because dense output has errors of 1e-10 even at
-    tolerances near roundoff. The tolerances are at roundoff because local errors add up: over the
-    default time spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to
-    errors of 1e-13 to 4e-11, with 1.6 times the steps.
+    tolerances near roundoff.
     """
 
     solver: ClassVar[dfx.AbstractSolver] = dfx.Dopri8()
-    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)  # relative and absolute
+    # Relative and absolute. Local errors add up: over the default time spans 1e-13 leads to errors
+    # of 1e-12 to 5e-9, and 1e-15 to errors of 1e-13 to 4e-11, with 1.6 times the steps.
+    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
         controller = dfx.PIDController(*self.tolerances)
@@ -197,9 +197,6 @@ class AbstractIntegratedSystem(AbstractSystem):
             max_steps=10**7,
         )
         return sol.ys
-
-    def period(self, y0: Any = None) -> None:
-        del y0
 
 
 def annulus(

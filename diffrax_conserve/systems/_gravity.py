@@ -187,9 +187,6 @@ _STATES = (
     ((11.4707666, -25.7294829, -10.8169456), (0.00288930, 0.00114527, 0.00039677)),
     ((-15.5387357, -25.2225594, -3.1902382), (0.00276725, -0.00170702, -0.00136504)),
 )
-# The inverse mean motion of Jupiter, in days, which makes the weights of positions and velocities
-# in the metric comparable.
-_TIME_SCALE = 4332.6 / 6.283185307179586
 
 
 @final
@@ -265,9 +262,10 @@ class OuterSolarSystem(AbstractIntegratedSystem):
 
     @property
     def metric(self) -> Bodies:
-        r"""$m_i$ for velocities and $m_i / \tau^2$ for positions, $\tau$ = 690 days."""
+        r"""$m_i$ for velocities and $m_i / \tau^2$ for positions, where $\tau$ is the inverse mean
+        motion of Jupiter, 690 days."""
         weights = jnp.broadcast_to(self.masses[:, None], (self.masses.size, 3))
-        return weights / _TIME_SCALE**2, weights
+        return weights / (4332.6 / (2 * jnp.pi)) ** 2, weights
 
     @property
     def y0(self) -> Bodies:

@@ -89,16 +89,19 @@ class Mechanism(eqx.Module):
             )
 
     @property
+    def _tables(self) -> "_Tables":
+        return _tables(self.reactions, self.species)
+
+    @property
     def stoichiometry(self) -> np.ndarray:
         """The matrix $S$, species by reactions."""
-        return _tables(self.reactions, self.species).change
+        return self._tables.change
 
     @property
     def balances(self) -> dict[str, Balance]:
         """The conserved quantities, a basis of the left null space of $S$, each under its
         formula."""
-        weights = _tables(self.reactions, self.species).balances
-        return {_formula(w, self.species): Balance(w) for w in weights}
+        return {_formula(w, self.species): Balance(w) for w in self._tables.balances}
 
     @property
     def manifold(self) -> dict[str, FirstIntegral]:
@@ -115,11 +118,10 @@ class Mechanism(eqx.Module):
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         """The rates of change of the concentrations."""
         del t, args
-        tables = _tables(self.reactions, self.species)
         # The missing factors of reactions of lower order are one.
-        factors = jnp.append(y, jnp.ones((), y.dtype))[tables.factors]
+        factors = jnp.append(y, jnp.ones((), y.dtype))[self._tables.factors]
         rates = self.rates.astype(y.dtype) * jnp.prod(factors, axis=1)
-        return jnp.sum(jnp.asarray(tables.change, y.dtype) * rates[None, :], axis=1)
+        return jnp.sum(jnp.asarray(self.stoichiometry, y.dtype) * rates[None, :], axis=1)
 
     def positive_projection(self) -> ClosedForm:
         r"""A projection to the balances after which no concentration is negative.
@@ -132,7 +134,7 @@ class Mechanism(eqx.Module):
         Source: I. Csiszár, "I-divergence geometry of probability distributions and minimization
         problems", Ann. Probab. 3 (1975).
         """
-        rows = _tables(self.reactions, self.species).balances
+        rows = self._tables.balances
         if not rows or min(min(row) for row in rows) < 0:
             raise ValueError(
                 "Not every balance of this mechanism is a sum with positive weights, so that "

@@ -4,14 +4,13 @@ import difflib
 
 from ._base import AbstractSystem
 from ._chemistry import AbstractChemistry, Pollu, Robertson
+from ._fluids import ConservativeLorenz, PointVortices
 from ._gravity import Kepler, OuterSolarSystem
 from ._korteweg_de_vries import KortewegDeVries
-from ._lorenz import ConservativeLorenz
 from ._lotka_volterra import LotkaVolterra
 from ._oscillators import HarmonicOscillator, HenonHeiles, TodaLattice
 from ._pendulums import CartesianPendulum, DoublePendulum
 from ._rigid_body import RigidBody, RigidBodyAttitude
-from ._vortices import PointVortices
 
 # In the order of the list: the paper's five first. Explicit methods cannot solve the last two.
 CLASSES: tuple[type[AbstractSystem], ...] = (

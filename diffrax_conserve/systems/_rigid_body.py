@@ -157,7 +157,9 @@ class RigidBodyAttitude(AbstractIntegratedSystem):
         del t, args
         attitude, omega = y
         inertia = self.like(y).inertia
-        spin = _multiply(attitude, _pure(omega)) / 2
+        scalar, vector = attitude[0], attitude[1:]
+        real_part = -jnp.sum(vector * omega, keepdims=True)
+        spin = jnp.concatenate([real_part, scalar * omega + jnp.cross(vector, omega)]) / 2
         return spin, jnp.cross(inertia * omega, omega) / inertia
 
     def squared_norm_minus_one(self, t: RealScalarLike, y: Pose, args: Args) -> Float[Array, ""]:
@@ -204,17 +206,9 @@ RigidBodyAttitude.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-def _pure(v: Float[Array, "*s 3"]) -> Float[Array, "*s 4"]:
-    return jnp.concatenate([jnp.zeros_like(v[..., :1]), v], axis=-1)
-
-
-def _multiply(a: Float[Array, "*s 4"], b: Float[Array, "*s 4"]) -> Float[Array, "*s 4"]:
-    """Hamilton's product."""
-    a0, av, b0, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    scalar = a0 * b0 - jnp.sum(av * bv, axis=-1, keepdims=True)
-    return jnp.concatenate([scalar, a0 * bv + b0 * av + jnp.cross(av, bv)], axis=-1)
-
-
 def _rotate(attitude: Float[Array, "*s 4"], v: Float[Array, "*s 3"]) -> Float[Array, "*s 3"]:
-    conjugate = jnp.concatenate([attitude[..., :1], -attitude[..., 1:]], axis=-1)
-    return _multiply(_multiply(attitude, _pure(v)), conjugate)[..., 1:]
+    r"""$Q v \bar Q$, by Hamilton's product."""
+    scalar, vector = attitude[..., :1], attitude[..., 1:]
+    size = scalar**2 - jnp.sum(vector**2, axis=-1, keepdims=True)
+    along = jnp.sum(vector * v, axis=-1, keepdims=True)
+    return size * v + 2 * (along * vector + scalar * jnp.cross(vector, v))

@@ -20,8 +20,15 @@ from .._tree import ravel, tree_all_finite
 
 # Twice the default tolerance of a projection, because the residual is evaluated again here.
 _ULPS = 32
-# The largest number of constraints that a message shows.
+# The largest number of constraints that a message shows, and what it ends with.
 _SHOWN = 5
+_ADVICE = (
+    "To look at: is the solver wrapped, `ManifoldProjection(solver, manifold)`, with this "
+    "manifold? Does a single or initial state need `diffrax_conserve.project`? Are `t` and `args` "
+    "those of the solve? Is anything in a lower precision? Does the equation conserve it "
+    "(`diffrax_conserve.check_invariance`)? Where dense output is wrong and saved states hold, the "
+    "solver's interpolation is not projected; `SaveAt(ts=...)` and events use it too."
+)
 
 
 def assert_conserved(
@@ -93,13 +100,11 @@ def assert_conserved(
         start = jtu.tree_map(lambda x: jnp.take(x, 0, axes), (ts, ys))
     else:
         start = solution.t0, y0
-    samples = []
     for kind, ts, ys in sampled:
         rows, count = flat((ts, ys), axes + 1), ts.shape[-1]
         starts = jtu.tree_map(lambda x, n=count: jnp.repeat(x, n, axis=0), flat(start, axes))
         found = _measure(manifold, None, *rows, *starts, args)
-        samples.append(_Samples(kind, ts.shape, rtol, atol, *rows, *map(np.asarray, found)))
-    _report(samples, manifold, args)
+        _check(_Samples(kind, ts.shape, rtol, atol, *rows, *map(np.asarray, found)), manifold, args)
 
 
 def assert_on_manifold(
@@ -146,9 +151,7 @@ def assert_on_manifold(
     values = given_values(manifold, value, t, y, args)
     row = jtu.tree_map(lambda x: x[None], (t, y))
     found = _measure(manifold, values, *row, *row, args)
-    _report(
-        [_Samples("given state", (1,), rtol, atol, *row, *map(np.asarray, found))], manifold, args
-    )
+    _check(_Samples("given", (1,), rtol, atol, *row, *map(np.asarray, found)), manifold, args)
 
 
 # ---- Where to look ----
@@ -215,7 +218,7 @@ def _check_comparable(ts: Array, manifold: Manifold) -> None:
 class _Samples(NamedTuple):
     """The `m` scalar constraints at each time of each lane of a batch."""
 
-    kind: str  # "saved state", "dense output" or "given state"
+    kind: str  # "saved state", "dense output" or "given"
     shape: tuple[int, ...]  # of the batch, and the number of times; together the rows
     rtol: RealScalarLike | None
     atol: RealScalarLike
@@ -281,38 +284,25 @@ def _measure(
 # ---- What is wrong ----
 
 
-def _report(samples: list[_Samples], manifold: Manifold, args: Args) -> None:
+def _check(s: _Samples, manifold: Manifold, args: Args) -> None:
     """Raises an `AssertionError` unless every state is finite and satisfies every constraint."""
-    for s in samples:
-        if not np.all(s.finite):
-            row = int(np.argmin(s.finite))
-            raise AssertionError(
-                f"The state is not finite {s.place(row)}: {s.text(row)}.\n"
-                "To look at: a failed projection gives NaN in dense output; in saved states it "
-                "comes from the vector field or from the solver."
-            )
-    failed = [(s, int(i)) for s in samples for i in np.flatnonzero(s.violated.any(axis=0))]
-    if not failed:
+    if not np.all(s.finite):
+        row = int(np.argmin(s.finite))
+        raise AssertionError(
+            f"The state is not finite {s.place(row)}: {s.text(row)}.\n"
+            "To look at: a failed projection gives NaN in dense output; in saved states it comes "
+            "from the vector field or from the solver."
+        )
+    failed = np.flatnonzero(s.violated.any(axis=0))
+    if not failed.size:
         return
-    names = _names(manifold, samples[0].ts[0], samples[0].state(0), args)
+    names = _names(manifold, s.ts[0], s.state(0), args)
     lines = ["The state leaves the manifold."]
-    for s, i in failed[:_SHOWN]:
+    for i in failed[:_SHOWN]:
         lines += _description(s, i, names[i])
-    if len(failed) > _SHOWN:
-        lines.append(f"... and {len(failed) - _SHOWN} more scalar constraints.")
-    if len(samples) > 1 and all(s.kind == "dense output" for s, _ in failed):
-        lines.append(
-            "To look at: saved states hold and dense output does not: the solver's interpolation "
-            "is not projected. `SaveAt(ts=...)` and events use it too."
-        )
-    else:
-        lines.append(
-            "To look at: is the solver wrapped, `ManifoldProjection(solver, manifold)`, with this "
-            "manifold? Does a single or initial state need `diffrax_conserve.project`? Are `t` and "
-            "`args` those of the solve? Is anything in a lower precision? Does the equation "
-            "conserve it (`diffrax_conserve.check_invariance`)?"
-        )
-    raise AssertionError("\n".join(lines))
+    if failed.size > _SHOWN:
+        lines.append(f"... and {failed.size - _SHOWN} more scalar constraints.")
+    raise AssertionError("\n".join([*lines, _ADVICE]))
 
 
 def _names(manifold: Manifold, t: Array, y: Y, args: Args) -> list[str]:

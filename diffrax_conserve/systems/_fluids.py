@@ -1,4 +1,4 @@
-"""Point vortices in the plane."""
+"""Fluids in a few numbers: convection, and vortices in the plane."""
 
 from typing import final
 
@@ -11,9 +11,82 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
+from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractIntegratedSystem, Reduced, annulus, real
 
-State = Float[Array, "vortices 2"]
+State = Float[Array, "3"]
+
+
+@final
+class ConservativeLorenz(AbstractIntegratedSystem):
+    r"""The Lorenz-1963 model without dissipation, `y = [x, y, z]` of shape `(3,)`.
+
+    $$x' = \sigma y, \qquad y' = \rho x - x z, \qquad z' = x y.$$
+
+    It is Nambu's equation $y' = \nabla C \times \nabla H$ for the two first integrals
+
+    $$C = \tfrac12 x^2 - \sigma z, \qquad H = \tfrac12 (y^2 + z^2) - \rho z.$$
+
+    **Manifold**: Casimir $C$ and energy $H$. **Reference**: numerical. **Samples**: $(x, y)$
+    uniform in area on the annulus of radii $\tfrac12$ and $\tfrac32$, $z$ uniform on
+    $[\tfrac12, \tfrac32]$.
+
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
+    time span (500 steps of 0.25) are the defaults; E. N. Lorenz, "Deterministic nonperiodic flow",
+    J. Atmos. Sci. 20 (1963); P. Névir and R. Blender, "Hamiltonian and Nambu representation of the
+    non-dissipative Lorenz equations", Beitr. Phys. Atmosph. 67 (1994).
+    """
+
+    sigma: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+    rho: Float[Array, ""] = eqx.field(converter=real, default=0.5)
+
+    name = "conservative-lorenz"
+    title = "Conservative Lorenz-1963 model"
+    citation = (
+        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
+        "E. N. Lorenz, J. Atmos. Sci. 20 (1963); "
+        "P. Névir and R. Blender, Beitr. Phys. Atmosph. 67 (1994)."
+    )
+    t1 = 125.0
+    dt = 0.25
+    axes = ("x", "y", "z")
+
+    def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
+        del t, args
+        system = self.like(y)
+        x1, x2, x3 = y
+        return jnp.stack([system.sigma * x2, system.rho * x1 - x1 * x3, x1 * x2])
+
+    def casimir(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        return y[0] ** 2 / 2 - self.like(y).sigma * y[2]
+
+    def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+        del t, args
+        return (y[1] ** 2 + y[2] ** 2) / 2 - self.like(y).rho * y[2]
+
+    @property
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        return {"Casimir": FirstIntegral(self.casimir), "energy": FirstIntegral(self.energy)}
+
+    @property
+    def y0(self) -> State:
+        """A state inside the paper's sampling domain; the paper gives no initial state."""
+        return jnp.array([0.9, 0.3, 1.2])
+
+    def sample(self, key: PRNGKeyArray) -> State:
+        plane_key, z_key = jr.split(key)
+        z = jr.uniform(z_key, (1,), minval=0.5, maxval=1.5)
+        return jnp.concatenate([annulus(plane_key, inner=0.5, outer=1.5), z])
+
+
+ConservativeLorenz.__init__.__doc__ = r"""**Arguments:**
+
+- `sigma`, `rho`: the Prandtl number $\sigma$ and the reduced Rayleigh number $\rho$.
+"""
+
+
+Places = Float[Array, "vortices 2"]
 Pairs = Float[Array, "vortices vortices"]
 
 
@@ -52,51 +125,51 @@ class PointVortices(AbstractIntegratedSystem):
     axes = ("x", "y")
     integrals = ("energy", "linear_impulse", "angular_impulse")
 
-    def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
+    def vector_field(self, t: RealScalarLike, y: Places, args: Args) -> Places:
         del t, args
         dx, dy, r2 = _separations(y)
         rates = self.like(y).strengths[None, :] / (2 * jnp.pi * r2)
         return jnp.stack([-jnp.sum(rates * dy, axis=1), jnp.sum(rates * dx, axis=1)], axis=1)
 
-    def energy(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+    def energy(self, t: RealScalarLike, y: Places, args: Args) -> Float[Array, ""]:
         del t, args
         _, _, r2 = _separations(y)
         gamma = self.like(y).strengths
         # The distances on the diagonal are 1, so that the self-energy is zero.
         return -jnp.sum(gamma[:, None] * gamma[None, :] * jnp.log(r2)) / (8 * jnp.pi)
 
-    def linear_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, "2"]:
+    def linear_impulse(self, t: RealScalarLike, y: Places, args: Args) -> Float[Array, "2"]:
         del t, args
         return jnp.sum(self.like(y).strengths[:, None] * y, axis=0)
 
-    def angular_impulse(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
+    def angular_impulse(self, t: RealScalarLike, y: Places, args: Args) -> Float[Array, ""]:
         del t, args
         return jnp.sum(self.like(y).strengths[:, None] * y**2)
 
     @property
-    def y0(self) -> State:
+    def y0(self) -> Places:
         """An irregular polygon inside the paper's annulus; the paper gives no initial state."""
         k = jnp.arange(self.strengths.size, dtype=float)
         radius, angle = 1 + 0.4 * jnp.cos(k), 2 * jnp.pi * k / self.strengths.size
         return radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
-    def sample(self, key: PRNGKeyArray) -> State:
+    def sample(self, key: PRNGKeyArray) -> Places:
         shape = self.strengths.shape
 
-        def draw(key: PRNGKeyArray) -> State:
+        def draw(key: PRNGKeyArray) -> Places:
             return annulus(key, shape, inner=0.5, outer=1.5)
 
-        def is_too_close(carry: tuple[PRNGKeyArray, State]) -> Bool[Array, ""]:
+        def is_too_close(carry: tuple[PRNGKeyArray, Places]) -> Bool[Array, ""]:
             _, _, r2 = _separations(carry[1])
             return jnp.min(r2) < (0.3 / self.strengths.size) ** 2
 
-        def again(carry: tuple[PRNGKeyArray, State]) -> tuple[PRNGKeyArray, State]:
+        def again(carry: tuple[PRNGKeyArray, Places]) -> tuple[PRNGKeyArray, Places]:
             key, draw_key = jr.split(carry[0])
             return key, draw(draw_key)
 
         return jax.lax.while_loop(is_too_close, again, again((key, draw(key))))[1]
 
-    def frame(self, y: State) -> Reduced:
+    def frame(self, y: Places) -> Reduced:
         r"""The frame of three vortices of equal strengths, for a [`diffrax_conserve.DeepONet`][].
 
         Their flow commutes with translations, rotations, permutations, and changes of the length
@@ -112,7 +185,12 @@ class PointVortices(AbstractIntegratedSystem):
 
         `ValueError` unless there are three vortices of equal strengths.
         """
-        _check_three_equal(self.strengths)
+        known = not isinstance(self.strengths, jax.core.Tracer)
+        if self.strengths.size != 3 or (known and np.ptp(np.asarray(self.strengths)) > 0):
+            raise ValueError(
+                "`frame` is for three vortices of equal strengths, but these are "
+                f"{self.strengths}. For others leave the frame out."
+            )
         third = jnp.argmax(jnp.sum((y - jnp.mean(y, axis=0)) ** 2, axis=1))
         # The vortex that is farthest from the centre is opposite the closest pair.
         alone = jnp.arange(3) == third
@@ -147,16 +225,7 @@ def _quarter_turn(x: Float[Array, "2"]) -> Float[Array, "2"]:
     return jnp.stack([-x[1], x[0]])
 
 
-def _check_three_equal(strengths: Float[Array, " vortices"]) -> None:
-    known = not isinstance(strengths, jax.core.Tracer)
-    if strengths.size != 3 or (known and np.ptp(np.asarray(strengths)) > 0):
-        raise ValueError(
-            f"`frame` is for three vortices of equal strengths, but these are {strengths}. For "
-            "others leave the frame out."
-        )
-
-
-def _separations(y: State) -> tuple[Pairs, Pairs, Pairs]:
+def _separations(y: Places) -> tuple[Pairs, Pairs, Pairs]:
     """$x_i - x_j$, $y_i - y_j$ and $r_{ij}^2$, with ones on the diagonal of the last."""
     dx = y[:, None, 0] - y[None, :, 0]
     dy = y[:, None, 1] - y[None, :, 1]
