@@ -39,10 +39,7 @@ class SetupError(Exception):
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
     """The solvers to compare, in the order of the table and the legends."""
-    classical = {
-        "rk4": RK4(),
-        "projected rk4": ManifoldProjection(RK4(), system.manifold),
-    }
+    classical = {"rk4": RK4(), "projected rk4": ManifoldProjection(RK4(), system.manifold)}
     return classical | (learned_solvers(system, networks) if networks else {})
 
 
@@ -59,8 +56,7 @@ def reproduce(
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
     With `anew` the networks of the paper's systems are trained first; otherwise the pretrained ones
-    are used. Returns whether every solver succeeded. Raises
-    `SetupError` before the work starts.
+    are used. Returns whether every solver succeeded. Raises `SetupError` before the work starts.
     """
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]

@@ -49,6 +49,7 @@ _STYLE: dict[Any, Any] = {
 }
 
 _Curves = dict[str, np.ndarray]  # by solver, or by part of the system
+_Pairs = dict[str, tuple[np.ndarray, np.ndarray]]  # by solver, abscissae and ordinates
 
 
 @mpl.rc_context(_STYLE)
@@ -62,7 +63,8 @@ def draw(
     """Writes the figures for what there is, as `.png` and as `.pdf`."""
     figures = {}
     if networks:
-        figures["loss"] = _loss({kind: found[1:] for kind, found in networks.items()})
+        losses = {kind: (epochs, found) for kind, (_, epochs, found) in networks.items()}
+        figures["loss"] = _one_panel(losses, "epoch", "training loss")
     succeeded = {name: run for name, run in runs.items() if run.failure is None}
     if succeeded:
         ts = next(iter(succeeded.values())).ts
@@ -73,7 +75,9 @@ def draw(
         exact = None
         if errors:
             exact = _ways(system, system.reference(np.linspace(ts[0], ts[-1], COMPARED_MAX + 1)))
-            figures["state_error"] = _state_error(ts, errors)
+            # The initial state has neither error nor drift.
+            medians = {k: (ts[1:], np.median(v, axis=0)[1:]) for k, v in errors.items()}
+            figures["state_error"] = _one_panel(medians, "$t$", "state error")
         figures["trajectory"] = _trajectory(ways, exact, system.axes)
         figures["drift"] = _drift(ts, list(system.manifold), succeeded)
     for name, figure in figures.items():
@@ -98,9 +102,10 @@ def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure
     panels = figure.subplots(1, len(integrals), squeeze=False, sharey=True)[0]
     for ax, integral in zip(panels, integrals, strict=True):
         ax.axhline(_EPS, **_ROUNDOFF)
-        curves = {name: np.maximum(run.drift[integral], _FLOOR) for name, run in runs.items()}
-        _over_time(ax, ts, curves)
-        ax.set_title(integral)
+        _lines(
+            ax, {k: (ts[1:], np.maximum(v.drift[integral], _FLOOR)[1:]) for k, v in runs.items()}
+        )
+        ax.set(title=integral, xlabel="$t$")
     panels[0].set_ylabel("relative drift")
     _legend(figure, panels[0])
     note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
@@ -108,29 +113,13 @@ def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure
     return figure
 
 
-def _state_error(ts: np.ndarray, errors: _Curves) -> Figure:
-    """One curve for each solver: the median over the initial states."""
-    figure, ax = _single()
-    _over_time(ax, ts, {name: np.median(values, axis=0) for name, values in errors.items()})
-    ax.set_ylabel("state error")
-    _legend(figure, ax)
-    return figure
-
-
-def _loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """The training loss against the epoch, one curve for each network."""
-    figure, ax = _single()
-    for name, (epochs, losses) in curves.items():
-        label, colour, *_ = _LOOKS[name]
-        ax.semilogy(epochs, losses, label=label, color=colour)
-    ax.set(xlabel="epoch", ylabel="training loss")
-    _legend(figure, ax)
-    return figure
-
-
-def _single() -> tuple[Figure, Any]:
+def _one_panel(curves: _Pairs, x: str, y: str) -> Figure:
     figure = Figure(figsize=(3.5, 2.7), layout="constrained")
-    return figure, figure.subplots()
+    ax = figure.subplots()
+    _lines(ax, curves)
+    ax.set(xlabel=x, ylabel=y)
+    _legend(figure, ax)
+    return figure
 
 
 def _trajectory(
@@ -175,13 +164,11 @@ def _trajectory(
     return figure
 
 
-def _over_time(ax: Any, ts: np.ndarray, curves: _Curves) -> None:
-    for i, (name, values) in enumerate(curves.items()):
+def _lines(ax: Any, curves: _Pairs) -> None:
+    for i, (name, pair) in enumerate(curves.items()):
         label, colour, *_ = _LOOKS[name]
-        # The initial state has neither error nor drift.
-        ax.semilogy(ts[1:], values[1:], label=label, color=colour, zorder=2 + 0.1 * i)
+        ax.semilogy(*pair, label=label, color=colour, zorder=2 + 0.1 * i)
     ax.xaxis.set_major_locator(MaxNLocator(4))
-    ax.set_xlabel("$t$")
 
 
 def _legend(figure: Figure, ax: Any) -> None:

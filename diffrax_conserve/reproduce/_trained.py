@@ -123,16 +123,16 @@ def learned_solvers(
     A network can be far from the manifold, so the projection is `Newton`. The conservative network
     is projected too, because its layer makes only a few iterations.
     """
-    plain = {
-        kind: PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
-        for kind, network in networks.items()
-    }
-    projected = {
-        kind: ManifoldProjection(solver, system.manifold, projection=Newton())
-        for kind, solver in plain.items()
-    }
+    standard, conservative = (
+        PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
+        for network in (networks["standard"], networks["conservative"])
+    )
+
+    def projected(solver: dfx.AbstractSolver) -> ManifoldProjection:
+        return ManifoldProjection(solver, system.manifold, projection=Newton())
+
     return {
-        "standard": plain["standard"],
-        "conservative": projected["conservative"],
-        "standard projected": projected["standard"],
+        "standard": standard,
+        "conservative": projected(conservative),
+        "standard projected": projected(standard),
     }

@@ -102,8 +102,8 @@ class AbstractSystem(eqx.Module):
         return None
 
     def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
-        """Named curves in two or three coordinates, for a phase picture of the states `ys`: if the
-        system does not say otherwise, the first components of the (first leaf of the) state."""
+        """Named curves in two or three coordinates, for a phase picture of the states `ys`; by
+        default one of the first components of the state."""
         return {self.title: jtu.tree_leaves(ys)[0][:, : len(self.axes)]}
 
     @property

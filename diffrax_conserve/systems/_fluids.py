@@ -43,9 +43,8 @@ class ConservativeLorenz(AbstractIntegratedSystem):
     name = "conservative-lorenz"
     title = "Conservative Lorenz-1963 model"
     citation = (
-        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
-        "E. N. Lorenz, J. Atmos. Sci. 20 (1963); "
-        "P. Névir and R. Blender, Beitr. Phys. Atmosph. 67 (1994)."
+        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); E. N. Lorenz, J. Atmos. Sci. 20 "
+        "(1963); P. Névir and R. Blender, Beitr. Phys. Atmosph. 67 (1994)."
     )
     t1 = 125.0
     dt = 0.25
@@ -154,20 +153,15 @@ class PointVortices(AbstractIntegratedSystem):
         return radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
     def sample(self, key: PRNGKeyArray) -> Places:
-        shape = self.strengths.shape
-
-        def draw(key: PRNGKeyArray) -> Places:
-            return annulus(key, shape, inner=0.5, outer=1.5)
-
         def is_too_close(carry: tuple[PRNGKeyArray, Places]) -> Bool[Array, ""]:
             _, _, r2 = _separations(carry[1])
             return jnp.min(r2) < (0.3 / self.strengths.size) ** 2
 
         def again(carry: tuple[PRNGKeyArray, Places]) -> tuple[PRNGKeyArray, Places]:
             key, draw_key = jr.split(carry[0])
-            return key, draw(draw_key)
+            return key, annulus(draw_key, self.strengths.shape, inner=0.5, outer=1.5)
 
-        return jax.lax.while_loop(is_too_close, again, again((key, draw(key))))[1]
+        return jax.lax.while_loop(is_too_close, again, again((key, self.y0)))[1]
 
     def frame(self, y: Places) -> Reduced:
         r"""The frame of three vortices of equal strengths, for a [`diffrax_conserve.DeepONet`][].

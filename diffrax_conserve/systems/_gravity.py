@@ -23,10 +23,9 @@ class Kepler(AbstractSystem):
     $$q' = p, \qquad p' = -\mu\, q / |q|^3.$$
 
     **Manifold**: energy $H = \tfrac12 |p|^2 - \mu / |q|$ and angular momentum
-    $L = q_1 p_2 - q_2 p_1$. The Laplace-Runge-Lenz vector `laplace_runge_lenz`, of length
-    $\mu e$, is conserved too. It is not in the manifold, because $|A|^2 = \mu^2 + 2 H L^2$ makes it
-    redundant: any three of $H$, $L$, $A_1$ and $A_2$ determine the fourth, and three of them leave
-    only the position on the ellipse free. On a circular orbit $H$ and $L$ are dependent.
+    $L = q_1 p_2 - q_2 p_1$, which are dependent on a circular orbit. The Laplace-Runge-Lenz vector
+    `laplace_runge_lenz`, of length $\mu e$, is conserved too, but redundant:
+    $|A|^2 = \mu^2 + 2 H L^2$.
     **Reference**: exact, by Kepler's equation; bound orbits only ($H < 0$). **Samples**: ellipses
     of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, with any
     orientation, direction of motion and eccentric anomaly, all uniform.
@@ -107,10 +106,9 @@ class Kepler(AbstractSystem):
         the orbit and the place on it: $r |p|^2 / \mu - 1 = e \cos E$ and
         $q \cdot p / \sqrt{\mu r}$, with $r = |q|$, the eccentricity $e$ and the eccentric anomaly
         $E$. The third input is $e^2$, so that a domain that is a box ends with the eccentricity.
-        The basis stretches position and velocity along each other, as Lagrange's coefficients do;
-        it degenerates where the orbit becomes a line ($e \to 1$). The clock is
-        $\nu = \sqrt{\mu / r^3}$, the rate of a circular orbit through the same place: in its time a
-        passage of the perihelion is no faster than the rest.
+        The basis stretches position and velocity along each other, and degenerates where the orbit
+        becomes a line ($e \to 1$). The clock is $\nu = \sqrt{\mu / r^3}$, the rate of a circular
+        orbit through the same place: in its time a perihelion passes no faster than the rest.
         """
         q, p = y
         mu, r = self.like(y).mu, jnp.sqrt(jnp.sum(q**2))
@@ -203,14 +201,12 @@ class OuterSolarSystem(AbstractIntegratedSystem):
     first integral that depends on time; it is not in the manifold because every Runge-Kutta method
     conserves it.
 
-    A Euclidean projection on the energy alone does not conserve the linear momentum: the gradient
-    of the energy is $m_i v_i$, and $\sum m_i (m_i v_i) \ne 0$. In the mass metric (`metric`) the
-    correction of $v_i$ is proportional to $v_i$, and $\sum m_i v_i = 0$ in the barycentric frame,
-    so the default state is barycentric.
+    A projection on the energy alone corrects $v_i$ by multiples of $m_i v_i$, which changes the
+    linear momentum. In the mass metric (`metric`) it does so by multiples of $v_i$, and
+    $\sum m_i v_i = 0$ in the barycentric frame of the default state.
 
-    **Reference**: numerical. **Samples**: the real state, with a normal deviate of 1 % of each
-    body's heliocentric distance or speed added to each component of its position or velocity, then
-    converted to barycentric coordinates.
+    **Reference**: numerical. **Samples**: the real state, with normal deviates of 1 % of each
+    body's heliocentric distance or speed, in barycentric coordinates.
 
     Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.4, Table 2.2, with
     data from "Ahnerts Kalender für Sternfreunde 1994" for September 5, 1994.
