@@ -48,7 +48,6 @@ _STYLE: dict[Any, Any] = {
     "savefig.dpi": 300,
 }
 
-_Curves = dict[str, np.ndarray]  # by solver, or by part of the system
 _Pairs = dict[str, tuple[np.ndarray, np.ndarray]]  # by solver, abscissae and ordinates
 
 
@@ -57,7 +56,7 @@ def draw(
     out: Path,
     system: AbstractSystem,
     runs: dict[str, Run],
-    errors: _Curves,
+    errors: dict[str, np.ndarray],
     networks: dict[str, Learned],
 ) -> None:
     """Writes the figures for what there is, as `.png` and as `.pdf`."""
@@ -68,17 +67,17 @@ def draw(
     succeeded = {name: run for name, run in runs.items() if run.failure is None}
     if succeeded:
         ts = next(iter(succeeded.values())).ts
-        ways = {
-            name: _ways(system, jtu.tree_map(lambda y: y[0], run.ys))
-            for name, run in succeeded.items()
-        }
+        first = {k: jtu.tree_map(lambda y: jnp.asarray(y[0]), v.ys) for k, v in succeeded.items()}
+        paths = {name: system.trajectories(ys) for name, ys in first.items()}
         exact = None
         if errors:
-            exact = _ways(system, system.reference(np.linspace(ts[0], ts[-1], COMPARED_MAX + 1)))
+            exact = system.trajectories(
+                system.reference(np.linspace(ts[0], ts[-1], COMPARED_MAX + 1))
+            )
             # The initial state has neither error nor drift.
             medians = {k: (ts[1:], np.median(v, axis=0)[1:]) for k, v in errors.items()}
             figures["state_error"] = _one_panel(medians, "$t$", "state error")
-        figures["trajectory"] = _trajectory(ways, exact, system.axes)
+        figures["trajectory"] = _trajectory(paths, exact, system.axes)
         figures["drift"] = _drift(ts, list(system.manifold), succeeded)
     for name, figure in figures.items():
         for suffix in ("png", "pdf"):
@@ -89,11 +88,6 @@ def save(figure: Figure, path: Path) -> None:
     """Writes `figure` in the format given by the suffix of `path`."""
     # Without the date, equal figures give equal files.
     figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else {})
-
-
-def _ways(system: AbstractSystem, ys: Any) -> _Curves:
-    curves = system.trajectories(jtu.tree_map(jnp.asarray, ys))
-    return {name: np.asarray(curve) for name, curve in curves.items()}
 
 
 def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure:
@@ -123,7 +117,7 @@ def _one_panel(curves: _Pairs, x: str, y: str) -> Figure:
 
 
 def _trajectory(
-    paths: dict[str, _Curves], reference: _Curves | None, axis_labels: tuple[str, ...]
+    paths: dict[str, Any], reference: dict[str, Any] | None, axis_labels: tuple[str, ...]
 ) -> Figure:
     """One panel for each part of the system: the reference, and the last steps of each solver.
 

@@ -6,10 +6,10 @@ from ._chemistry import Robertson as Robertson
 from ._construct import hamiltonian_vector_field as hamiltonian_vector_field
 from ._construct import nambu_vector_field as nambu_vector_field
 from ._fluids import ConservativeLorenz as ConservativeLorenz
+from ._fluids import KortewegDeVries as KortewegDeVries
 from ._fluids import PointVortices as PointVortices
 from ._gravity import Kepler as Kepler
 from ._gravity import OuterSolarSystem as OuterSolarSystem
-from ._korteweg_de_vries import KortewegDeVries as KortewegDeVries
 from ._lotka_volterra import LotkaVolterra as LotkaVolterra
 from ._mechanism import Balance as Balance
 from ._mechanism import Mechanism as Mechanism

@@ -140,9 +140,8 @@ class AbstractSystem(eqx.Module):
         """
         if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             raise RuntimeError(
-                "`reference` needs float64, but `jax_enable_x64` is off. Set the environment "
-                "variable `JAX_ENABLE_X64=1`, or call `jax.config.update('jax_enable_x64', True)` "
-                "before any array is made."
+                "`reference` needs float64. Set the environment variable `JAX_ENABLE_X64=1`, or "
+                "call `jax.config.update('jax_enable_x64', True)` before any array is made."
             )
         ts = jnp.asarray(ts, jnp.float64)
         if ts.ndim != 1 or ts.size == 0:

@@ -224,11 +224,9 @@ class TodaLattice(AbstractIntegratedSystem):
         self, ys: tuple[Float[Array, "times particles"], Float[Array, "times particles"]]
     ) -> dict[str, Float[Array, "times 2"]]:
         """Each particle relative to the mean, which moves uniformly."""
-        q, p = (x - jnp.mean(x, axis=1, keepdims=True) for x in ys)
-        return {
-            f"particle {i + 1}": jnp.stack([q[:, i], p[:, i]], axis=1)
-            for i in range(self.particles)
-        }
+        points = jnp.stack(ys, axis=2)
+        points = points - jnp.mean(points, axis=1, keepdims=True)
+        return {f"particle {i + 1}": points[:, i] for i in range(self.particles)}
 
 
 TodaLattice.__init__.__doc__ = r"""**Arguments:**

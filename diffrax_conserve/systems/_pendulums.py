@@ -162,10 +162,9 @@ class DoublePendulum(AbstractIntegratedSystem):
     and lengths,
 
     $$H = \frac{p_1^2 + 2 p_2^2 - 2 p_1 p_2 \cos\Delta}{2 (1 + \sin^2\Delta)}
-    - 2 g \cos\theta_1 - g \cos\theta_2;$$
+    - 2 g \cos\theta_1 - g \cos\theta_2.$$
 
-    the paper lacks a bracket here. **Reference**: numerical. **Samples**: uniform on
-    $[-\pi/6, \pi/6]^4$.
+    **Reference**: numerical. **Samples**: uniform on $[-\pi/6, \pi/6]^4$.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
     time span (20 steps of 0.5) are the defaults; it gives no initial state, so `y0` is our choice.
@@ -221,7 +220,6 @@ class DoublePendulum(AbstractIntegratedSystem):
 
     @property
     def y0(self) -> Phase:
-        """A state inside the paper's sampling domain; the paper gives no initial state."""
         return jnp.array([0.5, -0.3, 0.2, 0.4])
 
     def sample(self, key: PRNGKeyArray) -> Phase:

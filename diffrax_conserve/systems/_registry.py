@@ -4,9 +4,8 @@ import difflib
 
 from ._base import AbstractSystem
 from ._chemistry import AbstractChemistry, Pollu, Robertson
-from ._fluids import ConservativeLorenz, PointVortices
+from ._fluids import ConservativeLorenz, KortewegDeVries, PointVortices
 from ._gravity import Kepler, OuterSolarSystem
-from ._korteweg_de_vries import KortewegDeVries
 from ._lotka_volterra import LotkaVolterra
 from ._oscillators import HarmonicOscillator, HenonHeiles, TodaLattice
 from ._pendulums import CartesianPendulum, DoublePendulum
@@ -23,8 +22,7 @@ _BY_NAME = {system.name: system for system in CLASSES}
 
 
 def names(*, stiff: bool = False) -> tuple[str, ...]:
-    """The names of the systems of the catalogue: the non-stiff ones, or with `stiff` the stiff
-    ones."""
+    """The names of the non-stiff systems of the catalogue, or with `stiff` of the stiff ones."""
     return tuple(k for k, v in _BY_NAME.items() if issubclass(v, AbstractChemistry) == stiff)
 
 

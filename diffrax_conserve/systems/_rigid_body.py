@@ -25,11 +25,10 @@ class RigidBody(AbstractSystem):
 
     $$H = \tfrac12 \sum_i w_i^2 / I_i, \qquad L = \tfrac12 \sum_i w_i^2.$$
 
-    **Manifold**: energy $H$ and half the squared angular momentum $L$ (the paper prints $w_3^3$ for
-    $w_3^2$ in $L$). The two are dependent in a steady rotation about a principal axis.
-    **Reference**: exact, by Jacobi's elliptic functions; needs at least two distinct moments, and
-    loses accuracy at the separatrix $L = H I_2$, where the motion itself is unstable. **Samples**:
-    uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
+    **Manifold**: energy $H$ and half the squared angular momentum $L$, which are dependent in a
+    steady rotation about a principal axis. **Reference**: exact, by Jacobi's elliptic functions;
+    needs at least two distinct moments, and loses accuracy at the separatrix $L = H I_2$, where the
+    motion itself is unstable. **Samples**: uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and time span
     (1.55 periods) are the defaults; the paper gives no step, so `dt` is our choice; Landau and

@@ -178,8 +178,7 @@ def _sampled(solution: dfx.Solution, num_dense: int) -> list[tuple[str, Array, A
         if not eqx.is_array(solution.ts):
             raise ValueError(
                 "`solution` has states saved by several `SubSaveAt`s. Check one of them at a time: "
-                "`equinox.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], "
-                "solution.ys[0]))`."
+                "`dataclasses.replace(solution, ts=solution.ts[0], ys=solution.ys[0])`."
             )
         kinds.append(("saved state", solution.ts, solution.ys))
     if solution.interpolation is not None:
