@@ -76,7 +76,6 @@ PROJECT = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").rea
 MODULE, FUNCTION = PROJECT["project"]["scripts"]["diffrax-conserve"].split(":")
 
 
-# One of the ways to start with each redirection.
 @pytest.mark.parametrize(
     ("start", "redirection"),
     [

@@ -63,28 +63,22 @@ def run() -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="diffrax-conserve",
-        description="Conservative solves of the systems in the catalogue.",
-    )
+    title = "Conservative solves of the systems in the catalogue."
+    parser = argparse.ArgumentParser(prog="diffrax-conserve", description=title)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     commands.add_parser("list", help="list the systems by name")
     reproduce = commands.add_parser(
         "reproduce",
-        help="compare solvers on one system: RK4 and learned ones, with and without projection",
-        description="Integrates a system with RK4 and with projected RK4, and the paper's five "
-        "systems with learned solvers too; prints a table of errors and drifts, and writes figures "
-        "and metrics.json.",
+        help="compare RK4, and for the paper's systems learned solvers, with projected ones",
+        description="Prints a table of errors and drifts, and writes figures and metrics.json.",
     )
     names = (*systems.names(), *systems.names(stiff=True))
     reproduce.add_argument("name", metavar="NAME", choices=names, help="a system, see `list`")
     reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
     reproduce.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
     reproduce.add_argument("--dt", type=float, metavar="H", help="length of a step")
-    reproduce.add_argument(
-        "--train", action="store_true", help="train the networks again, which takes minutes"
-    )
+    reproduce.add_argument("--train", action="store_true", help="train the networks again")
     reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
     reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
     return parser

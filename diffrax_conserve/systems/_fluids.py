@@ -287,8 +287,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
         kept = number <= (self.points - 1) // 3
         k = jnp.where(kept, 2 * jnp.pi * number.astype(y.dtype) / self.like(y).length, 0)
         modes = jnp.fft.rfft(y)
-        modes = jnp.where(kept, modes, jnp.zeros_like(modes))
-        return modes, jax.lax.complex(jnp.zeros_like(k), k)
+        return jnp.where(kept, modes, jnp.zeros_like(modes)), jax.lax.complex(jnp.zeros_like(k), k)
 
     def _wave(self, modes: Modes) -> Wave:
         return jnp.fft.irfft(modes, self.points)

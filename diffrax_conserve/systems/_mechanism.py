@@ -74,7 +74,7 @@ class Mechanism(eqx.Module):
         species: Sequence[str] | None = None,
     ):
         self.reactions = tuple(reactions)
-        self.rates = real(jnp.asarray(rates))
+        self.rates = real(rates)
         found = dict.fromkeys(name for r in self.reactions for side in _sides(r) for name in side)
         self.species = tuple(found) if species is None else tuple(species)
         if self.rates.shape != (len(self.reactions),):

@@ -166,8 +166,7 @@ def _refuse_unsuccessful(solution: dfx.Solution) -> None:
     message = dfx.RESULTS[jtu.tree_map(lambda x: x[lane], solution.result)].strip()
     raise AssertionError(
         f"The solve did not succeed{which}, so there is nothing to check:\n  {message}\n"
-        "To look at: `solution.result`, the step size and `max_steps`; where the failure is meant, "
-        "assert that `solution.result` is what it should be."
+        "To look at: the step size and `max_steps`. If it is meant to fail, look at its `result`."
     )
 
 
