@@ -81,18 +81,9 @@ def _solve(
     max_steps: int,
 ) -> dfx.Solution:
     def one(y0: Any) -> dfx.Solution:
-        return dfx.diffeqsolve(
-            dfx.ODETerm(system.vector_field),
-            solver,
-            t0=0.0,
-            t1=t1,
-            dt0=dt,
-            y0=y0,
-            args=system.args,
-            saveat=dfx.SaveAt(t0=True, steps=True),
-            max_steps=max_steps,
-            throw=False,
-        )
+        term, saveat = dfx.ODETerm(system.vector_field), dfx.SaveAt(t0=True, steps=True)
+        options: dict[str, Any] = dict(saveat=saveat, max_steps=max_steps, throw=False)
+        return dfx.diffeqsolve(term, solver, 0.0, t1, dt, y0, system.args, **options)
 
     return jax.vmap(one)(y0s)
 

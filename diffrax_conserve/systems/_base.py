@@ -182,19 +182,11 @@ class AbstractIntegratedSystem(AbstractSystem):
     tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        controller = dfx.PIDController(*self.tolerances)
+        controller = dfx.ClipStepSizeController(dfx.PIDController(*self.tolerances), step_ts=ts)
         sol = dfx.diffeqsolve(
-            dfx.ODETerm(self.vector_field),
-            self.solver,
-            t0=0.0,
-            t1=ts[-1],
-            dt0=None,
-            y0=y0,
-            args=self.args,
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.ClipStepSizeController(controller, step_ts=ts),
-            max_steps=10**7,
-        )
+            dfx.ODETerm(self.vector_field), self.solver, 0.0, ts[-1], None, y0, self.args,
+            saveat=dfx.SaveAt(ts=ts), stepsize_controller=controller, max_steps=10**7,
+        )  # fmt: skip
         return sol.ys
 
 

@@ -291,15 +291,15 @@ def _check(s: _Samples, manifold: Manifold, args: Args) -> None:
             "To look at: a failed projection gives NaN in dense output; in saved states it comes "
             "from the vector field or from the solver."
         )
-    failed = np.flatnonzero(s.violated.any(axis=0))
-    if not failed.size:
+    failed = np.flatnonzero(s.violated.any(axis=0)).tolist()
+    if not failed:
         return
     names = _names(manifold, s.ts[0], s.state(0), args)
     lines = ["The state leaves the manifold."]
     for i in failed[:_SHOWN]:
         lines += _description(s, i, names[i])
-    if failed.size > _SHOWN:
-        lines.append(f"... and {failed.size - _SHOWN} more scalar constraints.")
+    if len(failed) > _SHOWN:
+        lines.append(f"... and {len(failed) - _SHOWN} more scalar constraints.")
     raise AssertionError("\n".join([*lines, _ADVICE]))
 
 

@@ -26,7 +26,7 @@ def test_rigid_body_with_its_moments_in_any_order_or_some_equal():
         """By the formula, and by a solver."""
         system = systems.RigidBody(inertia)
         numerical = solve(system.vector_field, dfx.Dopri8(), y0, t1=8.0, dt0=1e-3, **options)
-        return system.solution(TS, y0), numerical.ys
+        return system.solution(jnp.array(TS), y0), numerical.ys
 
     orders = [*itertools.permutations((0.1, 0.2, 0.3)), (0.2, 0.2, 0.3), (0.1, 0.3, 0.3)]
     np.testing.assert_allclose(*both(jnp.array([*orders, (0.2, 0.5, 0.2)])), atol=1e-12)
