@@ -1,8 +1,9 @@
 """The main job: a system of the catalogue, solved with and without projection, and compared."""
 
 import json
+import math
+import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ import jax.tree_util as jtu
 from .._replace_file import replace_file
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
+from .._tree import tree_size
 from ..learned._files import save
 from ..systems import AbstractSystem
-from ._compare import compare
-from ._solve import run
-from ._tables import figures, metrics, table
+from ._solve import reason, run, state_errors
+from ._tables import metrics, table
 from ._trained import (
     KINDS,
     Learned,
@@ -38,10 +39,7 @@ class SetupError(Exception):
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
     """The solvers to compare, in the order of the table and the legends."""
-    classical = {
-        "rk4": RK4(),
-        "projected rk4": ManifoldProjection(RK4(), system.manifold),
-    }
+    classical = {"rk4": RK4(), "projected rk4": ManifoldProjection(RK4(), system.manifold)}
     return classical | (learned_solvers(system, networks) if networks else {})
 
 
@@ -54,13 +52,11 @@ def reproduce(
     anew: bool = False,
     seed: int = 0,
     epochs: int = 5000,
-    progress: Callable[[str], None] = lambda _: None,
 ) -> bool:
     """Compares the `solvers` on `system` from 0 to `t1`; writes a table, figures, `metrics.json`.
 
     With `anew` the networks of the paper's systems are trained first; otherwise the pretrained ones
-    are used. `progress` is called with each stage. Returns whether every solver succeeded. Raises
-    `SetupError` before the work starts.
+    are used. Returns whether every solver succeeded. Raises `SetupError` before the work starts.
     """
     y0s = initial_states(system)
     states = jtu.tree_leaves(y0s)[0].shape[0]
@@ -78,24 +74,28 @@ def reproduce(
     chosen = solvers(system, {kind: network for kind, (network, *_) in networks.items()})
     runs = {}
     for i, (name, solver) in enumerate(chosen.items(), start=1):
-        progress(f"[{i}/{len(chosen)}] {name}: compiles and solves")
+        _say(f"[{i}/{len(chosen)}] {name}: compiles and solves")
         runs[name] = run(system, solver, y0s, t1, dt)
-    progress("reference and figures")
-    comparison = compare(system, y0s, runs)
-    numbers = metrics(system, runs, comparison, t1, dt, states)
-    drawn = {} if plot is None else figures(plot, system, runs, comparison, networks)
-    for name, figure in drawn.items():
-        assert plot is not None
-        for suffix in ("png", "pdf"):
-            replace_file(out / f"{name}.{suffix}", lambda path, f=figure: plot.save(f, path))
+    _say("reference and figures")
+    try:
+        errors = state_errors(system, y0s, runs)
+    except RuntimeError as error:  # raised by diffrax and `equinox.error_if`
+        errors = {}
+        _say(f"the reference failed: {reason(error)}")
+    numbers = metrics(system, runs, errors, t1, dt, states)
+    if plot is not None:
+        plot.draw(out, system, runs, errors, networks)
     text = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
     replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
     print(table(system, numbers))
     if plot is None:
-        print("\nThere are no figures: they need matplotlib. Install it by")
-        print("    pip install 'diffrax-conserve[plots]'")
-    print(f"\n{'metrics.json is' if plot is None else 'The figures and metrics.json are'} in {out}")
-    return comparison.failure is None and all(run.failure is None for run in runs.values())
+        print("\nThe figures need matplotlib: pip install 'diffrax-conserve[plots]'")
+    print(f"\nWhat is written is in {out}")
+    return len(errors) == len(runs)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:
@@ -104,10 +104,6 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
     for kind in KINDS:
         print(f"Training the {kind} network: {epochs} epochs, seed {seed}")
         network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
-        print(
-            f"  {log.seconds:.0f} s after {log.compile_seconds:.0f} s of compilation; "
-            f"loss {log.best:.3g} at epoch {log.best_epoch}"
-        )
         info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
         save(out / f"{kind}.network", network, info=info)
         networks[kind] = network, *history(log)
@@ -119,11 +115,12 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
 
 def check_times(system: AbstractSystem, t1: float, dt: float, states: int) -> None:
     """Raises unless the solve from 0 to `t1` in steps of `dt` is valid and fits into memory."""
-    if dt > t1:
+    if not 0 < dt <= t1 < math.inf:
         raise SetupError(
-            f"dt = {dt:g} is longer than the whole solve, t1 = {t1:g}. Take at most dt = {t1:g}."
+            f"--t1 {t1:g} and --dt {dt:g} must be positive numbers, and dt at most t1. Choose "
+            "others."
         )
-    unknowns = states * sum(x.size for x in jtu.tree_leaves(system.y0))
+    unknowns = states * tree_size(system.y0)
     steps_max = _BYTES_MAX // (8 * unknowns)
     if t1 / dt > steps_max:
         raise SetupError(
@@ -144,8 +141,7 @@ def import_plot() -> Any | None:
 def make_writable(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise SetupError(
             f"cannot write to the folder {out}: {error.strerror}. Name another one by `--out DIR`."

@@ -3,11 +3,18 @@
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
+import jax.tree_util as jtu
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
+
+from .._replace_file import replace_file
+from ..systems import AbstractSystem
+from ._solve import COMPARED_MAX, Run
+from ._trained import Learned
 
 # From the palette of M. Okabe and K. Ito, which is distinguishable with colour blindness; and
 # markers that are distinguishable where they overlap.
@@ -21,55 +28,78 @@ _LOOKS = {
 _ROUNDOFF: dict[str, Any] = dict(color="black", linewidth=0.8, linestyle=":", zorder=3)
 
 _EPS = float(np.finfo(np.float64).eps)
-# The position of an exact 0 on a logarithmic axis.
+# The position of an exact 0 on the logarithmic axis of drifts.
 _FLOOR = _EPS / 10
 # The number of last steps of each solver that are marked: more markers would overlap.
 _MARKED_MAX = 100
 
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
-    "axes.labelsize": 9,
     "axes.titlesize": 9,
     "legend.fontsize": 8,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.color": "#E6E6E6",
-    "grid.linewidth": 0.5,
-    "axes.axisbelow": True,
-    "axes3d.grid": True,
     "lines.linewidth": 1.0,
-    "lines.markeredgewidth": 0.8,
     "legend.frameon": False,
     "legend.handlelength": 1.6,
-    "legend.columnspacing": 1.4,
     "pdf.fonttype": 42,  # embeds fonts, so that text remains text
     "savefig.dpi": 300,
 }
 
-_Curves = dict[str, np.ndarray]  # by solver, or by part of the system
+_Pairs = dict[str, tuple[np.ndarray, np.ndarray]]  # by solver, abscissae and ordinates
 
 
 @mpl.rc_context(_STYLE)
+def draw(
+    out: Path,
+    system: AbstractSystem,
+    runs: dict[str, Run],
+    errors: dict[str, np.ndarray],
+    networks: dict[str, Learned],
+) -> None:
+    """Writes the figures for what there is, as `.png` and as `.pdf`."""
+    figures = {}
+    if networks:
+        losses = {kind: (epochs, found) for kind, (_, epochs, found) in networks.items()}
+        figures["loss"] = _one_panel(losses, "epoch", "training loss")
+    succeeded = {name: run for name, run in runs.items() if run.failure is None}
+    if succeeded:
+        ts = next(iter(succeeded.values())).ts
+        first = {k: jtu.tree_map(lambda y: jnp.asarray(y[0]), v.ys) for k, v in succeeded.items()}
+        paths = {name: system.trajectories(ys) for name, ys in first.items()}
+        exact = None
+        if errors:
+            exact = system.trajectories(
+                system.reference(np.linspace(ts[0], ts[-1], COMPARED_MAX + 1))
+            )
+            # The initial state has neither error nor drift.
+            medians = {k: (ts[1:], np.median(v, axis=0)[1:]) for k, v in errors.items()}
+            figures["state_error"] = _one_panel(medians, "$t$", "state error")
+        figures["trajectory"] = _trajectory(paths, exact, system.axes)
+        figures["drift"] = _drift(ts, list(system.manifold), succeeded)
+    for name, figure in figures.items():
+        for suffix in ("png", "pdf"):
+            replace_file(out / f"{name}.{suffix}", lambda path, f=figure: save(f, path))
+
+
 def save(figure: Figure, path: Path) -> None:
     """Writes `figure` in the format given by the suffix of `path`."""
     # Without the date, equal figures give equal files.
-    metadata = {"CreationDate": None} if path.suffix == ".pdf" else {}
-    figure.savefig(path, metadata=metadata)
+    figure.savefig(path, metadata={"CreationDate": None} if path.suffix == ".pdf" else {})
 
 
-@mpl.rc_context(_STYLE)
-def drift(times: np.ndarray, drifts: dict[str, _Curves]) -> Figure:
+def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure:
     """One panel for each integral, one curve for each solver."""
-    figure = Figure(figsize=(max(3.5, 2.2 * len(drifts) + 0.4), 2.7), layout="constrained")
-    panels = figure.subplots(1, len(drifts), squeeze=False, sharey=True)[0]
-    for ax, (integral, curves) in zip(panels, drifts.items(), strict=True):
+    figure = Figure(figsize=(max(3.5, 2.2 * len(integrals) + 0.4), 2.7), layout="constrained")
+    panels = figure.subplots(1, len(integrals), squeeze=False, sharey=True)[0]
+    for ax, integral in zip(panels, integrals, strict=True):
         ax.axhline(_EPS, **_ROUNDOFF)
-        _over_time(ax, times, curves, _FLOOR)
-        ax.set_title(integral)
+        _lines(
+            ax, {k: (ts[1:], np.maximum(v.drift[integral], _FLOOR)[1:]) for k, v in runs.items()}
+        )
+        ax.set(title=integral, xlabel="$t$")
     panels[0].set_ylabel("relative drift")
     _legend(figure, panels[0])
     note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
@@ -77,37 +107,17 @@ def drift(times: np.ndarray, drifts: dict[str, _Curves]) -> Figure:
     return figure
 
 
-@mpl.rc_context(_STYLE)
-def state_error(times: np.ndarray, errors: _Curves) -> Figure:
-    """One curve for each solver."""
+def _one_panel(curves: _Pairs, x: str, y: str) -> Figure:
     figure = Figure(figsize=(3.5, 2.7), layout="constrained")
     ax = figure.subplots()
-    # An error of exactly 0 is drawn at the smallest positive one.
-    smallest = min(np.min(values, where=values > 0, initial=np.inf) for values in errors.values())
-    _over_time(ax, times, errors, smallest if np.isfinite(smallest) else _FLOOR)
-    ax.set_ylabel("state error")
+    _lines(ax, curves)
+    ax.set(xlabel=x, ylabel=y)
     _legend(figure, ax)
     return figure
 
 
-@mpl.rc_context(_STYLE)
-def loss(curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """The training loss against the epoch, one curve for each network."""
-    figure = Figure(figsize=(3.5, 2.7), layout="constrained")
-    ax = figure.subplots()
-    for name, (epochs, losses) in curves.items():
-        label, colour, *_ = _LOOKS[name]
-        ax.plot(epochs, losses, label=label, color=colour)
-    ax.set_yscale("log")
-    ax.set_xlabel("epoch")
-    ax.set_ylabel("training loss")
-    _legend(figure, ax)
-    return figure
-
-
-@mpl.rc_context(_STYLE)
-def trajectory(
-    paths: dict[str, _Curves], reference: _Curves | None, axis_labels: tuple[str, ...]
+def _trajectory(
+    paths: dict[str, Any], reference: dict[str, Any] | None, axis_labels: tuple[str, ...]
 ) -> Figure:
     """One panel for each part of the system: the reference, and the last steps of each solver.
 
@@ -131,8 +141,7 @@ def trajectory(
             look = dict(marker=marker, markersize=width, markerfacecolor="none", linestyle="none")
             last = curves[part][-_MARKED_MAX - 1 :].T[:dimension]
             ax.plot(*last, label=label, color=colour, zorder=2 + 0.1 * i, **look)
-        for axis, text in zip("xyz", axis_labels[:dimension], strict=False):
-            getattr(ax, f"set_{axis}label")(text)
+        ax.set(**dict(zip(("xlabel", "ylabel", "zlabel"), axis_labels[:dimension], strict=False)))
         if dimension == 3:
             ax.set_box_aspect((1, 1, 0.8), zoom=0.82)  # leaves room for the labels
         elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq"):
@@ -149,19 +158,11 @@ def trajectory(
     return figure
 
 
-def _over_time(ax: Any, times: np.ndarray, curves: _Curves, floor: float) -> None:
-    # Thinner lines for many values, because curves at roundoff level jump and would hide others.
-    width = 1.2 if len(times) <= 200 else 0.7
-    for i, (name, values) in enumerate(curves.items()):
+def _lines(ax: Any, curves: _Pairs) -> None:
+    for i, (name, pair) in enumerate(curves.items()):
         label, colour, *_ = _LOOKS[name]
-        values = np.maximum(values, floor)
-        ax.plot(times, values, label=label, color=colour, linewidth=width, zorder=2 + 0.1 * i)
-    ax.set_yscale("log")
-    lowest, highest = (np.log10(ax.get_ylim()[i]) for i in (0, 1))
-    ax.set_ylim(10 ** np.floor(lowest), 10 ** np.ceil(highest))
-    ax.yaxis.set_minor_formatter(NullFormatter())
+        ax.semilogy(*pair, label=label, color=colour, zorder=2 + 0.1 * i)
     ax.xaxis.set_major_locator(MaxNLocator(4))
-    ax.set_xlabel("$t$")
 
 
 def _legend(figure: Figure, ax: Any) -> None:

@@ -1,4 +1,4 @@
-"""The solves: one solver, from one or from many initial states."""
+"""The solves, each by one solver from one or from many initial states, and their errors."""
 
 import dataclasses
 import math
@@ -16,19 +16,23 @@ import numpy as np
 from .._diagnostics.drift import drift
 from ..systems import AbstractSystem
 
+# The largest number of steps that are compared and drawn.
+COMPARED_MAX = 2000
+
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The states of one solver at `ts`, which include the initial time, and their drifts, both with
-    a leading axis over the initial states; or the reason of a failure."""
+    """What one solver found; without a failure also at `ts`, evenly spread steps from the initial
+    time on."""
 
-    ts: np.ndarray
-    ys: Any
-    drift: dict[str, np.ndarray]  # by integral, at each of `ts`
-    steps: int
-    seconds: float
-    compile_seconds: float
-    failure: str | None = None
+    failure: str | None
+    steps: int = 0
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+    ts: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    ys: Any = None  # with a leading axis over the initial states
+    drift: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)  # by integral, at `ts`
+    largest_drift: dict[str, float] = dataclasses.field(default_factory=dict)  # of all steps
 
 
 def run(system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float, dt: float) -> Run:
@@ -37,14 +41,34 @@ def run(system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: float,
         return _timed(system, solver, y0s, t1, dt)
     except (RuntimeError, TypeError, ValueError) as error:
         # If one solver cannot start, the results of the others are kept.
-        nothing = np.zeros(0)
-        return Run(nothing, nothing, {}, 0, 0.0, 0.0, f"at the start: {_reason(error)}")
+        return Run(f"at the start: {reason(error)}")
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """The message of an error, without the lines that equinox and jax add."""
     found = re.search(r"EquinoxRuntimeError: (.*)", str(error))
     return str(error) if found is None else found[1]
+
+
+def state_errors(system: AbstractSystem, y0s: Any, runs: dict[str, Run]) -> dict[str, np.ndarray]:
+    """The distance from the reference of each solver that succeeded, `(states, times)`."""
+    succeeded = {name: run for name, run in runs.items() if run.failure is None}
+    if not succeeded:
+        return {}
+    # Every solver takes the same steps.
+    ts = next(iter(succeeded.values())).ts
+    exact = eqx.filter_vmap(lambda y0: system.reference(ts, y0))(y0s)
+
+    return {
+        name: np.linalg.norm(_components(run.ys) - _components(exact), axis=2)
+        for name, run in succeeded.items()
+    }
+
+
+def _components(values: Any) -> np.ndarray:
+    """`(states, times, components)`."""
+    leaves = [np.asarray(x) for x in jtu.tree_leaves(values)]
+    return np.concatenate([x.reshape(*x.shape[:2], -1) for x in leaves], axis=2)
 
 
 @eqx.filter_jit
@@ -57,19 +81,9 @@ def _solve(
     max_steps: int,
 ) -> dfx.Solution:
     def one(y0: Any) -> dfx.Solution:
-        return dfx.diffeqsolve(
-            dfx.ODETerm(system.vector_field),
-            solver,
-            t0=0.0,
-            t1=t1,
-            dt0=dt,
-            y0=y0,
-            args=system.args,
-            saveat=dfx.SaveAt(t0=True, steps=True),
-            stepsize_controller=dfx.ConstantStepSize(),
-            max_steps=max_steps,
-            throw=False,
-        )
+        term, saveat = dfx.ODETerm(system.vector_field), dfx.SaveAt(t0=True, steps=True)
+        options: dict[str, Any] = dict(saveat=saveat, max_steps=max_steps, throw=False)
+        return dfx.diffeqsolve(term, solver, 0.0, t1, dt, y0, system.args, **options)
 
     return jax.vmap(one)(y0s)
 
@@ -89,37 +103,37 @@ def _timed(
 
     batch_drift = jax.vmap(lambda sol: drift(sol, system.manifold, system.args))
     drifts = eqx.filter_jit(batch_drift)(solution)
-    largest = {name: _largest_component(drifts[name]) for name in system.manifold}
-    ts, ys = jtu.tree_map(np.asarray, (solution.ts, solution.ys))
-    counts = np.isfinite(ts).sum(axis=1)  # the rest is padding
-    failure = _failure(solution.result, counts, ts, [*jtu.tree_leaves(ys), *largest.values()])
-    # Without a failure all solves have as many steps.
-    ts, ys, largest = jtu.tree_map(lambda x: x[:, : counts[0]], (ts, ys, largest))
-    steps = int(np.max(solution.stats["num_steps"]))
-    return Run(ts[0], ys, largest, steps, seconds, compile_seconds, failure)
+    failure = _failure(solution, _components((solution.ys, drifts)))
+    found = Run(failure, int(np.max(solution.stats["num_steps"])), seconds, compile_seconds)
+    if failure is not None:
+        return found
+    ts = np.asarray(solution.ts)[0]
+    count = np.sum(np.isfinite(ts))  # the rest is padding, in all solves alike
+    index = np.unique(np.linspace(0, count - 1, COMPARED_MAX + 1).round().astype(int))
+    sizes = {k: np.max(np.abs(_components(drifts[k])), axis=(0, 2)) for k in system.manifold}
+    return dataclasses.replace(
+        found,
+        ts=ts[index],
+        ys=jtu.tree_map(lambda y: np.asarray(y)[:, index], solution.ys),
+        drift={name: size[index] for name, size in sizes.items()},
+        largest_drift={name: float(np.max(size)) for name, size in sizes.items()},
+    )
 
 
-def _largest_component(values: Any) -> np.ndarray:
-    leaves = [np.abs(np.asarray(x)) for x in jtu.tree_leaves(values)]
-    return np.max(np.concatenate([x.reshape(*x.shape[:2], -1) for x in leaves], axis=2), axis=2)
-
-
-def _failure(
-    result: dfx.RESULTS, counts: np.ndarray, ts: np.ndarray, values: list[np.ndarray]
-) -> str | None:
-    """The failure at the first initial state with one, and the number of initial states with a
-    failure."""
-    wrong = np.any([~np.isfinite(x).reshape(*x.shape[:2], -1).all(axis=2) for x in values], axis=0)
-    wrong &= np.isfinite(ts)
-    stopped = np.asarray(result != dfx.RESULTS.successful)
+def _failure(solution: dfx.Solution, values: np.ndarray) -> str | None:
+    """The failure at the first initial state with one, and how many of them have one."""
+    ts = np.asarray(solution.ts)
+    wrong = np.isfinite(ts) & ~np.isfinite(values).all(axis=2)
+    stopped = np.asarray(solution.result != dfx.RESULTS.successful)
     failed = stopped | wrong.any(axis=1)
     if not failed.any():
         return None
     first = int(np.argmax(failed))
     if stopped[first]:
-        message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], result)]
-        reason = f"after t = {ts[first, counts[first] - 1]:.6g}: {' '.join(message.split())}"
+        message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], solution.result)]
+        last = np.max(ts[first], where=np.isfinite(ts[first]), initial=0)
+        found = f"after t = {last:.6g}: {' '.join(message.split())}"
     else:
         t = ts[first, np.argmax(wrong[first])]
-        reason = f"at t = {t:.6g}: the state is not finite any more. Choose a smaller dt."
-    return reason if failed.size == 1 else f"for {failed.sum()} of {failed.size}: {reason}"
+        found = f"at t = {t:.6g}: the state is not finite any more. Choose a smaller dt."
+    return found if failed.size == 1 else f"for {failed.sum()} of {failed.size}: {found}"

@@ -1,4 +1,4 @@
-"""The output: the metrics, the table and the figures."""
+"""The metrics and their table."""
 
 import platform
 from collections.abc import Callable
@@ -6,24 +6,20 @@ from typing import Any
 
 import diffrax as dfx
 import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 
 from .. import __version__
 from ..systems import AbstractSystem
-from ._compare import COMPARED_MAX, Comparison, take
 from ._solve import Run
-from ._trained import Learned
 
-FOOTER = """\
+_FOOTER = """\
 state error: Euclidean norm of the solution minus the reference, over all components of the state.
 drift: the largest over all steps of |I(t, y) - I(t0, y0)|, relative to the scale of I at (t0, y0),
     |I| + sum_i |y_i dI/dy_i|; for a constraint g, of |g| relative to sum_i |y_i dg/dy_i|; for an
     array the largest of its components. Roundoff is 2.2e-16.
 run, compile: wall time of the second run of the compiled solve, and of its compilation."""
 
-_MANY = """\
+_MANY = """
 State errors are medians over {states} initial states, drifts the largest over all of them; the
     picture of the trajectory is that of the first one."""
 
@@ -31,27 +27,21 @@ State errors are medians over {states} initial states, drifts the largest over a
 def metrics(
     system: AbstractSystem,
     runs: dict[str, Run],
-    comparison: Comparison,
+    errors: dict[str, np.ndarray],
     t1: float,
     dt: float,
     states: int,
 ) -> dict[str, Any]:
     def row(name: str, run: Run) -> dict[str, Any]:
-        ok = run.failure is None
-        errors = comparison.errors.get(name)
+        error = errors.get(name)
         return {
-            "state_error": None if errors is None else float(np.median(errors[:, -1])),
-            "largest_state_error": (
-                None if errors is None else float(np.median(np.max(errors, axis=1)))
-            ),
-            "drift": {
-                integral: float(np.max(run.drift[integral])) if ok else None
-                for integral in system.manifold
-            },
+            "state_error": None if error is None else float(np.median(error[:, -1])),
+            "largest_state_error": None if error is None else float(np.median(error.max(axis=1))),
+            "drift": {integral: run.largest_drift.get(integral) for integral in system.manifold},
             "seconds": run.seconds,
             "compile_seconds": run.compile_seconds,
             "steps": run.steps,
-            **({} if ok else {"failure": run.failure}),
+            **({} if run.failure is None else {"failure": run.failure}),
         }
 
     return {
@@ -60,7 +50,6 @@ def metrics(
         "t1": t1,
         "dt": dt,
         "initial_states": states,
-        **({} if comparison.failure is None else {"failure": comparison.failure}),
         "versions": {
             "diffrax-conserve": __version__,
             "diffrax": dfx.__version__,
@@ -95,54 +84,11 @@ def table(system: AbstractSystem, metrics: dict[str, Any]) -> str:
         for x in lines
     ]
     failures = [f"{name} FAILED {r['failure']}" for name, r in rows.items() if "failure" in r]
-    if "failure" in metrics:
-        failures.append(metrics["failure"])
-    if failures:
-        failures.append("")
     heading = f"{system.title}: 0 <= t <= {metrics['t1']:g}, steps of {metrics['dt']:g}"
-    many = [_MANY.format(states=states)] if states > 1 else []
-    return "\n".join([heading, "", *text, "", *failures, FOOTER, *many])
+    footer = _FOOTER + (_MANY.format(states=states) if states > 1 else "")
+    paragraphs = [heading, "\n".join(text), "\n".join(failures), footer]
+    return "\n\n".join(filter(None, paragraphs))
 
 
 def _number(x: float | None) -> str:
     return "-" if x is None else f"{x:.2e}"
-
-
-def figures(
-    plot: Any,
-    system: AbstractSystem,
-    runs: dict[str, Run],
-    comparison: Comparison,
-    networks: dict[str, Learned],
-) -> dict[str, Any]:
-    out = {}
-    if networks:
-        out["loss"] = plot.loss({kind: found[1:] for kind, found in networks.items()})
-    index = comparison.index
-    succeeded = {name: run for name, run in runs.items() if run.failure is None}
-    if not succeeded:
-        return out
-    times = next(iter(succeeded.values())).ts[index]
-    paths = {name: _paths(system, take(take(r.ys, 0), index)) for name, r in succeeded.items()}
-    reference = None
-    if comparison.failure is None:
-        fine = np.linspace(times[0], times[-1], COMPARED_MAX + 1)
-        reference = _paths(system, system.reference(fine))
-    out["trajectory"] = plot.trajectory(paths, reference, system.axes)
-    # The initial state has neither error nor drift.
-    drifts = {
-        integral: {
-            name: np.max(run.drift[integral], axis=0)[index][1:] for name, run in succeeded.items()
-        }
-        for integral in system.manifold
-    }
-    out["drift"] = plot.drift(times[1:], drifts)
-    if comparison.errors:
-        errors = {name: np.median(values, axis=0)[1:] for name, values in comparison.errors.items()}
-        out["state_error"] = plot.state_error(times[1:], errors)
-    return out
-
-
-def _paths(system: AbstractSystem, ys: Any) -> dict[str, np.ndarray]:
-    paths = system.trajectories(jtu.tree_map(jnp.asarray, ys))
-    return {name: np.asarray(path) for name, path in paths.items()}

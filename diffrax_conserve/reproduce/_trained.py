@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from .._projection.newton import Newton
 from .._solver.manifold_projection import ManifoldProjection
@@ -25,16 +25,9 @@ Network = PINN | DeepONet
 Learned = tuple[Network, np.ndarray, np.ndarray]
 
 KINDS = ("standard", "conservative")
-# The iterations of the conservative layers. The paper learns one solution of each of the first two
-# systems, and the flow maps of the others.
-_ITERATIONS = {
-    "harmonic-oscillator": 5,
-    "rigid-body": 5,
-    "double-pendulum": 3,
-    "conservative-lorenz": 3,
-    "point-vortices": 3,
-}
+# The paper learns one solution of each of the first systems, and the flow maps of the others.
 _PINNS = ("harmonic-oscillator", "rigid-body")
+_FLOW_MAPS = ("double-pendulum", "conservative-lorenz", "point-vortices")
 
 # The number of initial states on which flow maps are compared.
 _STATES = 20
@@ -45,12 +38,12 @@ _SEPARATION = 0.3
 
 def is_learned(system: AbstractSystem) -> bool:
     """Whether the paper has a learned solver for this system."""
-    return system.name in _ITERATIONS
+    return system.name in (*_PINNS, *_FLOW_MAPS)
 
 
 def is_flow_map(system: AbstractSystem) -> bool:
     """Whether the paper learns a flow map of this system, for many initial states."""
-    return is_learned(system) and system.name not in _PINNS
+    return system.name in _FLOW_MAPS
 
 
 def initial_states(system: AbstractSystem) -> Any:
@@ -61,7 +54,9 @@ def initial_states(system: AbstractSystem) -> Any:
         return own
     drawn = jax.vmap(system.sample)(jr.split(jr.key(1234), 4 * _STATES))
     if system.name == "point-vortices":
-        drawn = drawn[_separations(drawn) >= _SEPARATION]
+        squares = jnp.sum((drawn[:, :, None] - drawn[:, None]) ** 2, axis=-1)
+        squares = squares + 1e9 * jnp.eye(drawn.shape[1])
+        drawn = drawn[jnp.sqrt(jnp.min(squares, axis=(1, 2))) >= _SEPARATION]
     return jnp.concatenate([own, drawn[: _STATES - 1]])
 
 
@@ -82,7 +77,7 @@ def build(
     """An untrained network of the paper's size."""
     layer = None
     if kind == "conservative":
-        layer = ConservativeLayer(system.manifold, steps=_ITERATIONS[system.name])
+        layer = ConservativeLayer(system.manifold, steps=3 if is_flow_map(system) else 5)
     if not is_flow_map(system):
         return paper.pinn(system.y0, 0.0, system.t1, key=net_key, layer=layer)
     states = jax.vmap(system.sample)(jr.split(states_key, 1000))
@@ -128,22 +123,16 @@ def learned_solvers(
     A network can be far from the manifold, so the projection is `Newton`. The conservative network
     is projected too, because its layer makes only a few iterations.
     """
-    plain = {
-        kind: PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
-        for kind, network in networks.items()
-    }
-    projected = {
-        kind: ManifoldProjection(solver, system.manifold, projection=Newton())
-        for kind, solver in plain.items()
-    }
+    standard, conservative = (
+        PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
+        for network in (networks["standard"], networks["conservative"])
+    )
+
+    def projected(solver: dfx.AbstractSolver) -> ManifoldProjection:
+        return ManifoldProjection(solver, system.manifold, projection=Newton())
+
     return {
-        "standard": plain["standard"],
-        "conservative": projected["conservative"],
-        "standard projected": projected["standard"],
+        "standard": standard,
+        "conservative": projected(conservative),
+        "standard projected": projected(standard),
     }
-
-
-def _separations(ys: Array) -> Array:
-    """The smallest distance between two vortices, for each state."""
-    squares = jnp.sum((ys[:, :, None] - ys[:, None, :]) ** 2, axis=-1)
-    return jnp.sqrt(jnp.min(squares + 1e9 * jnp.eye(ys.shape[1]), axis=(1, 2)))

@@ -66,15 +66,17 @@ class AbstractSystem(eqx.Module):
     dt: AbstractClassVar[float]
     # The labels of the two or three coordinates in `trajectories`.
     axes: AbstractClassVar[tuple[str, ...]]
+    # The methods that are the first integrals in `manifold`.
+    integrals: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def vector_field(self, t: RealScalarLike, y: Any, args: Args) -> Any:
         """The right-hand side $f(t, y, args)$; its dtype is that of `y`."""
 
     @property
-    @abc.abstractmethod
     def manifold(self) -> dict[str, FirstIntegral | Constraint]:
         """The functionally independent integrals and constraints of the exact solution, by name."""
+        return {x.replace("_", " "): FirstIntegral(getattr(self, x)) for x in self.integrals}
 
     @property
     @abc.abstractmethod
@@ -89,9 +91,9 @@ class AbstractSystem(eqx.Module):
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
         """The states in float64 at the times `ts` after `y0`; called by `reference`."""
 
-    @abc.abstractmethod
     def period(self, y0: Any = None) -> Float[Array, ""] | None:
         """The period of the solution through `y0`; `None` if no closed form is known."""
+        del y0
 
     @property
     def metric(self) -> Y | None:
@@ -99,9 +101,10 @@ class AbstractSystem(eqx.Module):
         integrals; `None` if the system does not need any."""
         return None
 
-    @abc.abstractmethod
     def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
-        """Named curves in two or three coordinates, for a phase picture of the states `ys`."""
+        """Named curves in two or three coordinates, for a phase picture of the states `ys`; by
+        default one of the first components of the state."""
+        return {self.title: jtu.tree_leaves(ys)[0][:, : len(self.axes)]}
 
     @property
     def args(self) -> None:
@@ -116,9 +119,9 @@ class AbstractSystem(eqx.Module):
     ) -> Any:
         """The states at the times `ts`, as accurate as float64 allows.
 
-        They are computed from the exact solution if there is one in closed form, otherwise by an
-        eighth-order solve that steps exactly to `ts`; each system says which. Over the default time
-        span the error of the latter is 1e-13 to 1e-12 of the largest component.
+        By the exact solution if there is one in closed form, otherwise by an eighth-order solve,
+        with errors of 1e-13 to 1e-12 of the largest component over the default time span; each
+        system says which.
 
         **Arguments:**
 
@@ -137,9 +140,8 @@ class AbstractSystem(eqx.Module):
         """
         if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
             raise RuntimeError(
-                "`reference` needs float64, but `jax_enable_x64` is off. Set the environment "
-                "variable `JAX_ENABLE_X64=1`, or call `jax.config.update('jax_enable_x64', True)` "
-                "before any array is made."
+                "`reference` needs float64. Set the environment variable `JAX_ENABLE_X64=1`, or "
+                "call `jax.config.update('jax_enable_x64', True)` before any array is made."
             )
         ts = jnp.asarray(ts, jnp.float64)
         if ts.ndim != 1 or ts.size == 0:
@@ -168,45 +170,24 @@ def _solution(system: AbstractSystem, ts: Float[Array, " times"], y0: Any) -> An
 
 
 class AbstractIntegratedSystem(AbstractSystem):
-    """A system without a known solution in closed form: its reference is computed numerically."""
+    """A system without a known solution in closed form: its reference is computed numerically.
+
+    The solver steps exactly to the times, because dense output has errors of 1e-10 even at
+    tolerances near roundoff.
+    """
 
     solver: ClassVar[dfx.AbstractSolver] = dfx.Dopri8()
-    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)  # relative and absolute
+    # Relative and absolute. Local errors add up: over the default time spans 1e-13 leads to errors
+    # of 1e-12 to 5e-9, and 1e-15 to errors of 1e-13 to 4e-11, with 1.6 times the steps.
+    tolerances: ClassVar[tuple[float, float]] = (1e-15, 1e-15)
 
     def solution(self, ts: Float[Array, " times"], y0: Any) -> Any:
-        return integrate(self, ts, y0, self.solver, self.tolerances)
-
-    def period(self, y0: Any = None) -> None:
-        del y0
-
-
-def integrate(
-    system: AbstractSystem,
-    ts: Float[Array, " times"],
-    y0: Any,
-    solver: dfx.AbstractSolver = AbstractIntegratedSystem.solver,
-    tolerances: tuple[float, float] = AbstractIntegratedSystem.tolerances,
-) -> Any:
-    """The states at `ts`, in float64.
-
-    The solver steps exactly to `ts`, because dense output has errors of 1e-10 even at tolerances
-    near roundoff. The tolerances are at roundoff because local errors add up: over the default time
-    spans, a tolerance of 1e-13 leads to errors of 1e-12 to 5e-9, and one of 1e-15 to errors of
-    1e-13 to 4e-11, with 1.6 times the steps.
-    """
-    sol = dfx.diffeqsolve(
-        dfx.ODETerm(system.vector_field),
-        solver,
-        t0=0.0,
-        t1=ts[-1],
-        dt0=None,
-        y0=y0,
-        args=system.args,
-        saveat=dfx.SaveAt(ts=ts),
-        stepsize_controller=dfx.ClipStepSizeController(dfx.PIDController(*tolerances), step_ts=ts),
-        max_steps=10**7,
-    )
-    return sol.ys
+        controller = dfx.ClipStepSizeController(dfx.PIDController(*self.tolerances), step_ts=ts)
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(self.vector_field), self.solver, 0.0, ts[-1], None, y0, self.args,
+            saveat=dfx.SaveAt(ts=ts), stepsize_controller=controller, max_steps=10**7,
+        )  # fmt: skip
+        return sol.ys
 
 
 def annulus(

@@ -1,7 +1,7 @@
 """Stiff chemistry: the problems of Robertson and of Verwer."""
 
 import abc
-from typing import ClassVar, final
+from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -20,8 +20,8 @@ State = Float[Array, " species"]
 class AbstractChemistry(AbstractIntegratedSystem):
     """Reactions with mass-action kinetics, and a reference solution for stiff equations."""
 
-    solver: ClassVar[dfx.AbstractSolver] = dfx.Kvaerno5()
-    tolerances: ClassVar[tuple[float, float]] = (1e-8, 1e-20)
+    solver = dfx.Kvaerno5()
+    tolerances = (1e-8, 1e-20)
 
     @property
     @abc.abstractmethod
@@ -38,6 +38,11 @@ class AbstractChemistry(AbstractIntegratedSystem):
     def sample(self, key: PRNGKeyArray) -> State:
         factors = jnp.exp(jr.uniform(key, self.y0.shape, self.y0.dtype, -1, 1) * jnp.log(2.0))
         return self.y0 * factors
+
+    def trajectories(self, ys: Float[Array, "times species"]) -> dict[str, Any]:
+        """The concentrations of the two species that `axes` names."""
+        places = [self.mechanism.species.index(name) for name in self.axes]
+        return {"concentrations": ys[:, jnp.array(places)]}
 
 
 @final
@@ -59,12 +64,12 @@ class Robertson(AbstractChemistry):
 
     rates: Float[Array, "3"] = eqx.field(converter=real, default=(0.04, 3e7, 1e4))
 
-    name: ClassVar[str] = "robertson"
-    title: ClassVar[str] = "Robertson's reaction"
-    citation: ClassVar[str] = "H. H. Robertson, Numerical Analysis: an Introduction (1966)."
-    t1: ClassVar[float] = 40.0
-    dt: ClassVar[float] = 0.1
-    axes: ClassVar[tuple[str, ...]] = ("A", "C")
+    name = "robertson"
+    title = "Robertson's reaction"
+    citation = "H. H. Robertson, Numerical Analysis: an Introduction (1966)."
+    t1 = 40.0
+    dt = 0.1
+    axes = ("A", "C")
 
     @property
     def mechanism(self) -> Mechanism:
@@ -73,9 +78,6 @@ class Robertson(AbstractChemistry):
     @property
     def y0(self) -> State:
         return self.mechanism.state({"A": 1.0})
-
-    def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 2"]]:
-        return {"concentrations": ys[:, ::2]}
 
 
 Robertson.__init__.__doc__ = """**Arguments:**
@@ -137,12 +139,12 @@ class Pollu(AbstractChemistry):
 
     rates: Float[Array, "25"] = eqx.field(converter=real, default=tuple(_POLLU.values()))
 
-    name: ClassVar[str] = "pollu"
-    title: ClassVar[str] = "Air pollution"
-    citation: ClassVar[str] = "J. G. Verwer, SIAM J. Sci. Comput. 15 (1994)."
-    t1: ClassVar[float] = 60.0
-    dt: ClassVar[float] = 2.0
-    axes: ClassVar[tuple[str, ...]] = ("NO2", "O3")
+    name = "pollu"
+    title = "Air pollution"
+    citation = "J. G. Verwer, SIAM J. Sci. Comput. 15 (1994)."
+    t1 = 60.0
+    dt = 2.0
+    axes = ("NO2", "O3")
 
     @property
     def mechanism(self) -> Mechanism:
@@ -151,10 +153,6 @@ class Pollu(AbstractChemistry):
     @property
     def y0(self) -> State:
         return self.mechanism.state(_INITIAL)
-
-    def trajectories(self, ys: Float[Array, "times 20"]) -> dict[str, Float[Array, "times 2"]]:
-        places = [_SPECIES.index(name) for name in self.axes]
-        return {"concentrations": ys[:, jnp.array(places)]}
 
 
 Pollu.__init__.__doc__ = """**Arguments:**

@@ -91,27 +91,18 @@ def nambu_vector_field(h: ScalarFn, l: ScalarFn) -> Callable[[RealScalarLike, An
 
 
 def _hamilton(hamiltonian: ScalarFn, t: RealScalarLike, y: Any, args: Args) -> Any:
-    _check_canonical(y)
-    gradient = jax.grad(hamiltonian, argnums=1)(t, y, args)
-    if eqx.is_array(y):
-        dq, dp = jnp.split(gradient, 2)
+    gradient = jax.grad(hamiltonian, argnums=1)
+    if eqx.is_array(y) and y.ndim > 0 and y.shape[0] % 2 == 0:
+        dq, dp = jnp.split(gradient(t, y, args), 2)
         return jnp.concatenate([dp, -dq])
-    dq, dp = gradient
-    return type(y)((dp, jtu.tree_map(jnp.negative, dq)))
-
-
-def _check_canonical(y: Any) -> None:
-    if eqx.is_array(y):
-        good = y.ndim > 0 and y.shape[0] % 2 == 0
-    else:
-        good = type(y) in (tuple, list) and len(y) == 2
-        good = good and jtu.tree_structure(y[0]) == jtu.tree_structure(y[1])
-    if not good:
-        raise TypeError(
-            "The state `y` of a `hamiltonian_vector_field` must be a pair `(q, p)` of PyTrees of "
-            "the same structure, or an array of even length along its first axis that stacks q on "
-            f"p, but it is {eqx.tree_pformat(y)}."
-        )
+    if type(y) in (tuple, list) and len(y) == 2 and len(set(map(jtu.tree_structure, y))) == 1:
+        dq, dp = gradient(t, y, args)
+        return type(y)((dp, jtu.tree_map(jnp.negative, dq)))
+    raise TypeError(
+        "The state `y` of a `hamiltonian_vector_field` must be a pair `(q, p)` of PyTrees of the "
+        "same structure, or an array of even length along its first axis that stacks q on p, but "
+        f"it is {eqx.tree_pformat(y)}."
+    )
 
 
 def _nambu(h: ScalarFn, l: ScalarFn, t: RealScalarLike, y: Any, args: Args) -> Float[Array, "3"]:

@@ -1,6 +1,6 @@
 """The predator-prey model of Lotka and Volterra."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +8,6 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import Constraint, FirstIntegral
 from ._base import AbstractIntegratedSystem, real
 
 State = Float[Array, "2"]
@@ -35,14 +34,13 @@ class LotkaVolterra(AbstractIntegratedSystem):
     gamma: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     delta: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "lotka-volterra"
-    title: ClassVar[str] = "Lotka-Volterra model"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.1.1."
-    )
-    t1: ClassVar[float] = 50.0
-    dt: ClassVar[float] = 0.2
-    axes: ClassVar[tuple[str, ...]] = ("predators", "prey")
+    name = "lotka-volterra"
+    title = "Lotka-Volterra model"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.1.1."
+    t1 = 50.0
+    dt = 0.2
+    axes = ("predators", "prey")
+    integrals = ("first_integral",)
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -57,18 +55,11 @@ class LotkaVolterra(AbstractIntegratedSystem):
         return s.gamma * jnp.log(u) - s.delta * u + s.alpha * jnp.log(v) - s.beta * v
 
     @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {"first integral": FirstIntegral(self.first_integral)}
-
-    @property
     def y0(self) -> State:
         return jnp.array([2.0, 2.0])
 
     def sample(self, key: PRNGKeyArray) -> State:
         return jr.uniform(key, (2,), minval=0.5, maxval=4.0)
-
-    def trajectories(self, ys: Float[Array, "times 2"]) -> dict[str, Float[Array, "times 2"]]:
-        return {"populations": ys}
 
 
 LotkaVolterra.__init__.__doc__ = r"""**Arguments:**

@@ -74,7 +74,7 @@ class Mechanism(eqx.Module):
         species: Sequence[str] | None = None,
     ):
         self.reactions = tuple(reactions)
-        self.rates = real(jnp.asarray(rates))
+        self.rates = real(rates)
         found = dict.fromkeys(name for r in self.reactions for side in _sides(r) for name in side)
         self.species = tuple(found) if species is None else tuple(species)
         if self.rates.shape != (len(self.reactions),):
@@ -89,16 +89,19 @@ class Mechanism(eqx.Module):
             )
 
     @property
+    def _tables(self) -> "_Tables":
+        return _tables(self.reactions, self.species)
+
+    @property
     def stoichiometry(self) -> np.ndarray:
         """The matrix $S$, species by reactions."""
-        return _tables(self.reactions, self.species).change
+        return self._tables.change
 
     @property
     def balances(self) -> dict[str, Balance]:
         """The conserved quantities, a basis of the left null space of $S$, each under its
         formula."""
-        weights = _tables(self.reactions, self.species).balances
-        return {_formula(w, self.species): Balance(w) for w in weights}
+        return {_formula(w, self.species): Balance(w) for w in self._tables.balances}
 
     @property
     def manifold(self) -> dict[str, FirstIntegral]:
@@ -115,11 +118,10 @@ class Mechanism(eqx.Module):
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         """The rates of change of the concentrations."""
         del t, args
-        tables = _tables(self.reactions, self.species)
         # The missing factors of reactions of lower order are one.
-        factors = jnp.append(y, jnp.ones((), y.dtype))[tables.factors]
+        factors = jnp.append(y, jnp.ones((), y.dtype))[self._tables.factors]
         rates = self.rates.astype(y.dtype) * jnp.prod(factors, axis=1)
-        return jnp.sum(jnp.asarray(tables.change, y.dtype) * rates[None, :], axis=1)
+        return jnp.sum(jnp.asarray(self.stoichiometry, y.dtype) * rates[None, :], axis=1)
 
     def positive_projection(self) -> ClosedForm:
         r"""A projection to the balances after which no concentration is negative.
@@ -132,7 +134,7 @@ class Mechanism(eqx.Module):
         Source: I. Csiszár, "I-divergence geometry of probability distributions and minimization
         problems", Ann. Probab. 3 (1975).
         """
-        rows = _tables(self.reactions, self.species).balances
+        rows = self._tables.balances
         if not rows or min(min(row) for row in rows) < 0:
             raise ValueError(
                 "Not every balance of this mechanism is a sum with positive weights, so that "
@@ -260,45 +262,40 @@ def _sides(reaction: str) -> tuple[dict[str, int], dict[str, int]]:
 def _left_null_space(matrix: np.ndarray) -> tuple[tuple[int, ...], ...]:
     """An integer basis of the `w` with `wᵀ matrix = 0`, without negative entries where these are
     easily removed."""
-    rows = [[Fraction(int(x)) for x in column] for column in matrix.T]
+    rows = matrix.T * Fraction(1)
     pivots: list[int] = []
     for column in range(len(matrix)):
-        index = next((i for i in range(len(pivots), len(rows)) if rows[i][column]), None)
-        if index is None:
-            continue
         k = len(pivots)
-        rows[k], rows[index] = rows[index], rows[k]
-        rows[k] = [x / rows[k][column] for x in rows[k]]
-        for i in range(len(rows)):
-            if i != k and rows[i][column]:
-                factor = rows[i][column]
-                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
-        pivots.append(column)
-    basis = []
-    for free in sorted(set(range(len(matrix))) - set(pivots)):
-        vector = [Fraction(int(i == free)) for i in range(len(matrix))]
-        for row, pivot in zip(rows, pivots, strict=False):
-            vector[pivot] = -row[free]
-        basis.append(_whole(vector))
-    return tuple(_without_negative(basis))
+        candidates = np.flatnonzero(rows[k:, column])
+        if candidates.size:
+            rows[[k, k + candidates[0]]] = rows[[k + candidates[0], k]]
+            rows[k] /= rows[k, column]
+            others = np.arange(len(rows)) != k
+            rows[others] -= np.outer(rows[others, column], rows[k])
+            pivots.append(column)
+    free = [i for i in range(len(matrix)) if i not in pivots]
+    basis = np.zeros((len(free), len(matrix)), int) * Fraction(1)
+    basis[:, free] = np.eye(len(free), dtype=int)
+    basis[:, pivots] = -rows[: len(pivots), free].T
+    vectors = _without_negative([_whole(vector) for vector in basis])
+    return tuple(tuple(_whole(vector).tolist()) for vector in vectors)
 
 
-def _whole(vector: list[Fraction]) -> tuple[int, ...]:
-    """The shortest integer vector in this direction."""
-    scaled = [int(x * np.lcm.reduce([x.denominator for x in vector])) for x in vector]
-    return tuple(int(x // np.gcd.reduce(scaled)) for x in scaled)
+def _whole(vector: np.ndarray) -> np.ndarray:
+    """The shortest vector of integers in the direction of one of integers or fractions."""
+    scaled = vector * np.lcm.reduce([x.denominator for x in vector])
+    return (scaled // np.gcd.reduce([int(x) for x in scaled])).astype(int)
 
 
-def _without_negative(basis: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+def _without_negative(vectors: list[np.ndarray]) -> list[np.ndarray]:
     """A basis of the same space, where multiples of other vectors are added to those with negative
     entries."""
-    vectors = [np.array(v) for v in basis]
     for i, vector in enumerate(vectors):
         for j, other in enumerate(vectors):
             if i != j and vector.min() < 0 and other.min() >= 0:
                 ratio = [-(v // o) for v, o in zip(vector, other, strict=True) if v < 0 < o]
                 vectors[i] = vector = vector + max(ratio, default=0) * other
-    return [_whole([Fraction(int(x)) for x in v]) for v in vectors]
+    return vectors
 
 
 def _formula(weights: tuple[int, ...], species: tuple[str, ...]) -> str:

@@ -2,51 +2,28 @@
 
 import difflib
 
-from ._attitude import RigidBodyAttitude
 from ._base import AbstractSystem
-from ._cartesian_pendulum import CartesianPendulum
-from ._chemistry import Pollu, Robertson
-from ._double_pendulum import DoublePendulum
-from ._henon_heiles import HenonHeiles
-from ._kepler import Kepler
-from ._korteweg_de_vries import KortewegDeVries
-from ._lorenz import ConservativeLorenz
+from ._chemistry import AbstractChemistry, Pollu, Robertson
+from ._fluids import ConservativeLorenz, KortewegDeVries, PointVortices
+from ._gravity import Kepler, OuterSolarSystem
 from ._lotka_volterra import LotkaVolterra
-from ._oscillator import HarmonicOscillator
-from ._rigid_body import RigidBody
-from ._solar import OuterSolarSystem
-from ._toda import TodaLattice
-from ._vortices import PointVortices
+from ._oscillators import HarmonicOscillator, HenonHeiles, TodaLattice
+from ._pendulums import CartesianPendulum, DoublePendulum
+from ._rigid_body import RigidBody, RigidBodyAttitude
 
-# In the order of the list: the paper's five first.
-_SYSTEMS: dict[str, type[AbstractSystem]] = {
-    system.name: system
-    for system in (
-        HarmonicOscillator,
-        RigidBody,
-        DoublePendulum,
-        ConservativeLorenz,
-        PointVortices,
-        Kepler,
-        OuterSolarSystem,
-        HenonHeiles,
-        LotkaVolterra,
-        TodaLattice,
-        KortewegDeVries,
-        CartesianPendulum,
-        RigidBodyAttitude,
-    )
-}
-# Explicit methods cannot solve these.
-_STIFF: dict[str, type[AbstractSystem]] = {system.name: system for system in (Robertson, Pollu)}
-_ALL = _SYSTEMS | _STIFF
-CLASSES = tuple(_ALL.values())
+# In the order of the list: the paper's five first. Explicit methods cannot solve the last two.
+CLASSES: tuple[type[AbstractSystem], ...] = (
+    *(HarmonicOscillator, RigidBody, DoublePendulum, ConservativeLorenz, PointVortices),
+    *(Kepler, OuterSolarSystem, HenonHeiles, LotkaVolterra, TodaLattice, KortewegDeVries),
+    *(CartesianPendulum, RigidBodyAttitude),
+    *(Robertson, Pollu),
+)
+_BY_NAME = {system.name: system for system in CLASSES}
 
 
 def names(*, stiff: bool = False) -> tuple[str, ...]:
-    """The names of the systems of the catalogue: the non-stiff ones, or with `stiff` the stiff
-    ones."""
-    return tuple(_STIFF if stiff else _SYSTEMS)
+    """The names of the non-stiff systems of the catalogue, or with `stiff` of the stiff ones."""
+    return tuple(k for k, v in _BY_NAME.items() if issubclass(v, AbstractChemistry) == stiff)
 
 
 def get(name: str) -> AbstractSystem:
@@ -73,10 +50,10 @@ def get(name: str) -> AbstractSystem:
         system = dfc.systems.get("rigid-body")
         ```
     """
-    if name not in _ALL:
-        close = difflib.get_close_matches(str(name).lower().replace("_", "-"), _ALL, cutoff=0.4)
+    if name not in _BY_NAME:
+        close = difflib.get_close_matches(str(name).lower().replace("_", "-"), _BY_NAME, cutoff=0.4)
         hint = f"Did you mean {' or '.join(map(repr, close))}? " if close else ""
         raise ValueError(
-            f"There is no system called {name!r}. {hint}The catalogue holds: {', '.join(_ALL)}."
+            f"There is no system called {name!r}. {hint}The catalogue holds: {', '.join(_BY_NAME)}."
         )
-    return _ALL[name]()
+    return _BY_NAME[name]()

@@ -1,14 +1,15 @@
-"""The free rigid body in its own frame."""
+"""The free rigid body: its angular momentum, and its attitude as a unit quaternion."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real, shell
+from ._base import AbstractIntegratedSystem, AbstractSystem, direction, real, shell
 from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
 
 State = Float[Array, "3"]
@@ -24,11 +25,10 @@ class RigidBody(AbstractSystem):
 
     $$H = \tfrac12 \sum_i w_i^2 / I_i, \qquad L = \tfrac12 \sum_i w_i^2.$$
 
-    **Manifold**: energy $H$ and half the squared angular momentum $L$ (the paper prints $w_3^3$ for
-    $w_3^2$ in $L$). The two are dependent in a steady rotation about a principal axis.
-    **Reference**: exact, by Jacobi's elliptic functions; needs at least two distinct moments, and
-    loses accuracy at the separatrix $L = H I_2$, where the motion itself is unstable. **Samples**:
-    uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
+    **Manifold**: energy $H$ and half the squared angular momentum $L$, which are dependent in a
+    steady rotation about a principal axis. **Reference**: exact, by Jacobi's elliptic functions;
+    needs at least two distinct moments, and loses accuracy at the separatrix $L = H I_2$, where the
+    motion itself is unstable. **Samples**: uniform direction, $\tfrac12 \le |w| \le 2$ uniform.
 
     Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose moments, initial state and time span
     (1.55 periods) are the defaults; the paper gives no step, so `dt` is our choice; Landau and
@@ -37,15 +37,16 @@ class RigidBody(AbstractSystem):
 
     inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
 
-    name: ClassVar[str] = "rigid-body"
-    title: ClassVar[str] = "Free rigid body"
-    citation: ClassVar[str] = (
+    name = "rigid-body"
+    title = "Free rigid body"
+    citation = (
         "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
         "L. D. Landau and E. M. Lifshitz, Mechanics, §36-37."
     )
-    t1: ClassVar[float] = 1.75
-    dt: ClassVar[float] = 0.05
-    axes: ClassVar[tuple[str, ...]] = ("w₁", "w₂", "w₃")
+    t1 = 1.75
+    dt = 0.05
+    axes = ("w₁", "w₂", "w₃")
+    integrals = ("energy", "squared_angular_momentum")
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -60,13 +61,6 @@ class RigidBody(AbstractSystem):
     def squared_angular_momentum(self, t: RealScalarLike, y: State, args: Args) -> Float[Array, ""]:
         del t, args
         return jnp.sum(y**2) / 2
-
-    @property
-    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {
-            "energy": FirstIntegral(self.energy),
-            "squared angular momentum": FirstIntegral(self.squared_angular_momentum),
-        }
 
     @property
     def y0(self) -> State:
@@ -84,11 +78,6 @@ class RigidBody(AbstractSystem):
     def period(self, y0: State | None = None) -> Float[Array, ""]:
         _, _, rate, m, _ = _elliptic_form(self.inertia, self.y0 if y0 is None else y0)
         return 4 * complete_elliptic(m) / rate
-
-    def trajectories(self, ys: Float[Array, "times 3"]) -> dict[str, Float[Array, "times 3"]]:
-        # All three components, unlike in the paper: in two of them a closed orbit appears as an
-        # arc, traversed back and forth.
-        return {"angular momentum": ys}
 
 
 RigidBody.__init__.__doc__ = r"""**Arguments:**
@@ -130,3 +119,95 @@ def _elliptic_form(
     u0 = incomplete_elliptic(jnp.arctan2(w_b / ratio, y0[c]), m)
     amplitudes = jnp.stack([amplitude_a, ratio * amplitude_c, amplitude_c])
     return axes, amplitudes, rate, m, u0
+
+
+Pose = tuple[Float[Array, "4"], Float[Array, "3"]]
+
+
+@final
+class RigidBodyAttitude(AbstractIntegratedSystem):
+    r"""A free rigid body in space, `y = (Q, ω)` of shapes `(4,)` and `(3,)`.
+
+    The quaternion $Q$, scalar part first, maps the frame of the body to that of space; $\omega$ is
+    the angular velocity in the frame of the body and $I$ the diagonal of the inertia tensor:
+
+    $$Q' = \tfrac12\, Q\, \omega, \qquad I \omega' = (I \omega) \times \omega.$$
+
+    **Manifold**: unit quaternion $Q \bar Q = 1$ (a constraint), energy
+    $\tfrac12\, \omega \cdot I \omega$ and the three components of the angular momentum in space,
+    $Q\, (I \omega)\, \bar Q$. They are dependent in a steady rotation about a principal axis.
+    **Reference**: numerical. **Samples**: $Q$ uniform, $\omega$ in a uniform direction with
+    $\tfrac12 \le |\omega| \le 2$ uniform.
+
+    Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", VII.5.
+    """
+
+    inertia: Float[Array, "3"] = eqx.field(converter=real, default=(0.1, 0.2, 0.3))
+
+    name = "rigid-body-attitude"
+    title = "Attitude of a free rigid body"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, VII.5."
+    t1 = 20.0
+    dt = 0.1
+    axes = ("x", "y", "z")
+    integrals = ("energy", "angular_momentum")
+
+    def vector_field(self, t: RealScalarLike, y: Pose, args: Args) -> Pose:
+        del t, args
+        attitude, omega = y
+        inertia = self.like(y).inertia
+        scalar, vector = attitude[0], attitude[1:]
+        real_part = -jnp.sum(vector * omega, keepdims=True)
+        spin = jnp.concatenate([real_part, scalar * omega + jnp.cross(vector, omega)]) / 2
+        return spin, jnp.cross(inertia * omega, omega) / inertia
+
+    def squared_norm_minus_one(self, t: RealScalarLike, y: Pose, args: Args) -> Float[Array, ""]:
+        del t, args
+        attitude, _ = y
+        return jnp.sum(attitude**2) - 1
+
+    def energy(self, t: RealScalarLike, y: Pose, args: Args) -> Float[Array, ""]:
+        del t, args
+        _, omega = y
+        return jnp.sum(self.like(y).inertia * omega**2) / 2
+
+    def angular_momentum(self, t: RealScalarLike, y: Pose, args: Args) -> Float[Array, "3"]:
+        del t, args
+        attitude, omega = y
+        return _rotate(attitude, self.like(y).inertia * omega)
+
+    @property
+    def manifold(self) -> dict[str, FirstIntegral | Constraint]:
+        return {
+            "unit quaternion": Constraint(self.squared_norm_minus_one),
+            **super().manifold,
+        }
+
+    @property
+    def y0(self) -> Pose:
+        return jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([1.0, 1.0, 1.0])
+
+    def sample(self, key: PRNGKeyArray) -> Pose:
+        attitude_key, omega_key = jr.split(key)
+        return direction(attitude_key, 4), shell(omega_key, inner=0.5, outer=2.0)
+
+    def trajectories(
+        self, ys: tuple[Float[Array, "times 4"], Float[Array, "times 3"]]
+    ) -> dict[str, Float[Array, "times 3"]]:
+        attitudes, _ = ys
+        third = jnp.zeros((attitudes.shape[0], 3), attitudes.dtype).at[:, 2].set(1)
+        return {"third axis of the body": _rotate(attitudes, third)}
+
+
+RigidBodyAttitude.__init__.__doc__ = r"""**Arguments:**
+
+- `inertia`: the principal moments of inertia $(I_1, I_2, I_3)$.
+"""
+
+
+def _rotate(attitude: Float[Array, "*s 4"], v: Float[Array, "*s 3"]) -> Float[Array, "*s 3"]:
+    r"""$Q v \bar Q$, by Hamilton's product."""
+    scalar, vector = attitude[..., :1], attitude[..., 1:]
+    size = scalar**2 - jnp.sum(vector**2, axis=-1, keepdims=True)
+    along = jnp.sum(vector * v, axis=-1, keepdims=True)
+    return size * v + 2 * (along * vector + scalar * jnp.cross(vector, v))

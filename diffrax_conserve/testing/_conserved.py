@@ -1,5 +1,6 @@
 """Assertions that a solution, or a state, lies on its manifold."""
 
+import functools as ft
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -8,28 +9,26 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Real
 
 from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import (
-    Constraint,
-    FirstIntegral,
-    check_manifold,
-    conserved_values,
-    evaluate,
-    is_entry,
-    named_entries,
-)
-from .._projection.equations import measure as residuals
+from .._manifold import check_manifold, conserved_values, evaluate, has_value, named_entries
+from .._projection.equations import measure
 from .._projection.project import given_values
-from .._tree import tree_all_finite
+from .._tree import ravel, tree_all_finite
 
 # Twice the default tolerance of a projection, because the residual is evaluated again here.
-ULPS = 32
-# The largest number of constraints that a message shows.
+_ULPS = 32
+# The largest number of constraints that a message shows, and what it ends with.
 _SHOWN = 5
+_ADVICE = (
+    "To look at: is the solver wrapped, `ManifoldProjection(solver, manifold)`, with this "
+    "manifold? Does a single or initial state need `diffrax_conserve.project`? Are `t` and `args` "
+    "those of the solve? Is anything in a lower precision? Does the equation conserve it "
+    "(`diffrax_conserve.check_invariance`)? Where dense output is wrong and saved states hold, the "
+    "solver's interpolation is not projected; `SaveAt(ts=...)` and events use it too."
+)
 
 
 def assert_conserved(
@@ -89,19 +88,23 @@ def assert_conserved(
     check_manifold(manifold)
     refuse_rates(manifold, "`assert_conserved`, unlike `diffrax_conserve.drift`,")
     _refuse_unsuccessful(solution)
-    lanes = jnp.shape(solution.t0)
-    reference = None if y0 is None else (solution.t0, jtu.tree_map(jnp.asarray, y0))
-    samples = []
-    for kind, ts, ys in _sampled(solution, num_dense):
-        if reference is None:
-            first = (slice(None),) * len(lanes) + (0,)
-            reference = jtu.tree_map(lambda x, first=first: x[first], (ts, ys))
-            _check_comparable(ts, manifold)
-        batch = jtu.tree_map(
-            lambda x: jnp.reshape(x, (-1, *x.shape[len(lanes) :])), (ts, ys, *reference)
-        )
-        samples.append(_measured(kind, lanes, manifold, None, batch, args, rtol, atol))
-    _report(samples)
+    sampled = _sampled(solution, num_dense)
+    axes = jnp.ndim(solution.t0)  # of the batch
+
+    def flat(tree: Any, axes: int) -> Any:
+        return jtu.tree_map(lambda x: jnp.reshape(x, (-1, *jnp.shape(x)[axes:])), tree)
+
+    if y0 is None:
+        _, ts, ys = sampled[0]
+        _check_comparable(ts, manifold)
+        start = jtu.tree_map(lambda x: jnp.take(x, 0, axes), (ts, ys))
+    else:
+        start = solution.t0, y0
+    for kind, ts, ys in sampled:
+        rows, count = flat((ts, ys), axes + 1), ts.shape[-1]
+        starts = jtu.tree_map(lambda x, n=count: jnp.repeat(x, n, axis=0), flat(start, axes))
+        found = _measure(manifold, None, *rows, *starts, args)
+        _check(_Samples(kind, ts.shape, rtol, atol, *rows, *map(np.asarray, found)), manifold, args)
 
 
 def assert_on_manifold(
@@ -146,9 +149,9 @@ def assert_on_manifold(
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float))
     values = given_values(manifold, value, t, y, args)
-    ts, ys = t[None], jtu.tree_map(lambda x: x[None], y)
-    batch = jtu.tree_map(lambda x: x[None], (ts, ys, t, y))
-    _report([_measured("given", (), manifold, values, batch, args, rtol, atol)])
+    row = jtu.tree_map(lambda x: x[None], (t, y))
+    found = _measure(manifold, values, *row, *row, args)
+    _check(_Samples("given", (1,), rtol, atol, *row, *map(np.asarray, found)), manifold, args)
 
 
 # ---- Where to look ----
@@ -163,8 +166,7 @@ def _refuse_unsuccessful(solution: dfx.Solution) -> None:
     message = dfx.RESULTS[jtu.tree_map(lambda x: x[lane], solution.result)].strip()
     raise AssertionError(
         f"The solve did not succeed{which}, so there is nothing to check:\n  {message}\n"
-        "To look at: `solution.result`, the step size and `max_steps`; where the failure is meant, "
-        "assert that `solution.result` is what it should be."
+        "To look at: the step size and `max_steps`. If it is meant to fail, look at its `result`."
     )
 
 
@@ -175,8 +177,7 @@ def _sampled(solution: dfx.Solution, num_dense: int) -> list[tuple[str, Array, A
         if not eqx.is_array(solution.ts):
             raise ValueError(
                 "`solution` has states saved by several `SubSaveAt`s. Check one of them at a time: "
-                "`equinox.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], "
-                "solution.ys[0]))`."
+                "`dataclasses.replace(solution, ts=solution.ts[0], ys=solution.ys[0])`."
             )
         kinds.append(("saved state", solution.ts, solution.ys))
     if solution.interpolation is not None:
@@ -202,7 +203,7 @@ def _dense(solution: dfx.Solution, num: int) -> tuple[Array, Any]:
 
 def _check_comparable(ts: Array, manifold: Manifold) -> None:
     for name, entry in named_entries(manifold):
-        if isinstance(entry, FirstIntegral) and entry.value is None and ts.shape[-1] == 1:
+        if ts.shape[-1] == 1 and not has_value(entry):
             raise ValueError(
                 f"`solution` holds one saved state, with nothing to compare `{name}` with. Pass "
                 "`y0=...`, or save the initial state too, as in `SaveAt(t0=True, t1=True)`."
@@ -213,169 +214,115 @@ def _check_comparable(ts: Array, manifold: Manifold) -> None:
 
 
 class _Samples(NamedTuple):
-    """The `m` scalar constraints at each time of each lane."""
+    """The `m` scalar constraints at each time of each lane of a batch."""
 
     kind: str  # "saved state", "dense output" or "given"
-    lanes: tuple[int, ...]  # the shape of the batch, whose lanes have one axis in the following
-    ts: Real[np.ndarray, "lanes times"]
+    shape: tuple[int, ...]  # of the batch, and the number of times; together the rows
+    rtol: RealScalarLike | None
+    atol: RealScalarLike
+    ts: Real[Array, " rows"]
     ys: Any
-    finite: Bool[np.ndarray, "lanes times"]  # whether the state is
-    labels: list[tuple[str, bool]]  # of each constraint: its name, and if it is a `Constraint`
-    residual: Real[np.ndarray, "lanes times m"]
-    scale: Real[np.ndarray, "lanes times m"]
-    found: Real[np.ndarray, "lanes times m"]
-    target: Real[np.ndarray, "lanes m"]
-    limit: Real[np.ndarray, "lanes times m"]
-    eps: float  # the unit of roundoff of the coarsest dtype
+    finite: Bool[np.ndarray, " rows"]  # whether the state is
+    residual: Real[np.ndarray, "rows m"]
+    scale: Real[np.ndarray, "rows m"]
+    found: Real[np.ndarray, "rows m"]
+    target: Real[np.ndarray, "rows m"]
 
     @property
-    def violated(self) -> Bool[np.ndarray, "lanes times m"]:
+    def precision(self) -> Any:
+        """That of the coarsest dtype in the state."""
+        infos = (jnp.finfo(x.dtype) for x in jtu.tree_leaves(self.ys))
+        return max(infos, key=lambda info: info.eps)
+
+    @property
+    def limit(self) -> Real[np.ndarray, "rows m"]:
+        rtol = _ULPS * float(self.precision.eps) if self.rtol is None else self.rtol
+        return np.asarray(rtol * self.scale.astype(np.float64) + self.atol)
+
+    @property
+    def violated(self) -> Bool[np.ndarray, "rows m"]:
         """NaN never satisfies a constraint."""
         return ~(np.isfinite(self.limit) & (np.abs(self.residual) <= self.limit))
 
-    def place(self, lane: int, k: int) -> str:
-        time = f"at time {self.ts[lane, k]:.9g}"
-        if self.kind == "given":
-            return time
-        index = tuple(int(i) for i in np.unravel_index(lane, self.lanes)) if self.lanes else ()
-        rows = np.sum(~np.isinf(self.ts[lane]))
-        return f"{time} ({self.kind}, row {k} of {rows}" + f", lane {index}" * bool(index) + ")"
+    def place(self, row: int) -> str:
+        *lane, k = map(int, np.unravel_index(row, self.shape))
+        rows = np.sum(~np.isinf(self.ts.reshape(self.shape)[tuple(lane)]))
+        of_batch = f", lane {tuple(lane)}" if lane else ""
+        return f"at time {self.ts[row]:.9g} ({self.kind}, row {k} of {rows}{of_batch})"
 
-    def state(self, lane: int, k: int) -> str:
+    def state(self, row: int) -> Any:
+        return jtu.tree_map(lambda y: np.asarray(y)[row], self.ys)
+
+    def text(self, row: int) -> str:
         with np.printoptions(precision=9, threshold=20):
-            return " ".join(str(jtu.tree_map(lambda y: np.asarray(y)[lane, k], self.ys)).split())
-
-
-def _measured(
-    kind: str,
-    lanes: tuple[int, ...],
-    manifold: Manifold,
-    values: Values | None,
-    batch: tuple[Array, Any, Array, Any],
-    args: Args,
-    rtol: RealScalarLike | None,
-    atol: RealScalarLike,
-) -> _Samples:
-    ts, ys = batch[:2]
-    t, y = jtu.tree_map(lambda x: x[0, 0], (ts, ys))
-    shapes = eqx.filter_eval_shape(evaluate, manifold, t, y, args)
-    eps = max(float(jnp.finfo(x.dtype).eps) for x in jtu.tree_leaves((y, shapes)))
-    found = map(np.asarray, _measure(manifold, values, batch, args))
-    finite, residual, scale, found, target = found
-    limit = np.asarray((ULPS * eps if rtol is None else rtol) * scale.astype(np.float64) + atol)
-    return _Samples(
-        kind, lanes, np.asarray(ts), ys, finite, _labels(manifold, shapes), residual, scale, found,
-        target, limit, eps,
-    )  # fmt: skip
+            return " ".join(str(self.state(row)).split())
 
 
 @eqx.filter_jit
+@ft.partial(eqx.filter_vmap, in_axes=(None, None, 0, 0, 0, 0, None))
 def _measure(
-    manifold: Manifold, values: Values | None, batch: tuple[Array, Any, Array, Any], args: Args
+    manifold: Manifold, values: Values | None, t: Array, y: Any, t0: Array, y0: Any, args: Args
 ) -> tuple[Array, ...]:
-    """In each lane `(ts, ys, t0, y0)` whether the states are finite, the residuals and their
-    scales, the values and what they must be. Padded rows are treated as the initial state."""
-
-    def of_lane(ts: Array, ys: Any, t0: Array, y0: Any) -> tuple[Array, ...]:
-        target = conserved_values(manifold, t0, y0, args) if values is None else values
-        _, initial_scale = residuals(manifold, target, t0, y0, args)
-
-        def at(t: Array, y: Y) -> tuple[Array, ...]:
-            padded = jnp.isinf(t)
-            t = jnp.where(padded, t0.astype(t.dtype), t)
-            y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), y, y0)
-            residual, scale = residuals(manifold, target, t, y, args)
-            residual = jnp.where(padded, 0, _vector(residual))
-            scale = jnp.maximum(_vector(scale), _vector(initial_scale))
-            found = _vector(evaluate(manifold, t, y, args))
-            return tree_all_finite((t, y)), residual, scale, found
-
-        return *jax.vmap(at)(ts, ys), _vector(target)
-
-    return jax.vmap(of_lane)(*batch)
-
-
-def _vector(values: Values) -> Real[Array, " m"]:
-    with jax.numpy_dtype_promotion("standard"):
-        return ravel_pytree(values)[0]
-
-
-def _labels(manifold: Manifold, values: Any) -> list[tuple[str, bool]]:
-    """The name of each scalar constraint, and whether it is one of a `Constraint`."""
-
-    def kinds(entry: FirstIntegral | Constraint, value: Any) -> Any:
-        return jtu.tree_map(lambda _: isinstance(entry, Constraint), value)
-
-    found = jtu.tree_leaves(jtu.tree_map(kinds, manifold, values, is_leaf=is_entry))
-    leaves = jtu.tree_flatten_with_path(values)[0]
-    return [
-        (f"manifold{jtu.keystr(path)}" + f"[{', '.join(map(str, index))}]" * bool(index), kind)
-        for (path, value), kind in zip(leaves, found, strict=True)
-        for index in np.ndindex(value.shape)
-    ]
+    """Of one row: whether the state is finite, the residuals and their scales, the values and what
+    they must be. A padded row is treated as the initial state."""
+    padded = jnp.isinf(t)
+    t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b.astype(a.dtype), a), (t, y), (t0, y0))
+    target = conserved_values(manifold, t0, y0, args) if values is None else values
+    _, initial_scale = measure(manifold, target, t0, y0, args)
+    residual, scale = map(ravel, measure(manifold, target, t, y, args))
+    return (
+        tree_all_finite((t, y)),
+        jnp.where(padded, 0, residual),
+        jnp.maximum(scale, ravel(initial_scale)),
+        ravel(evaluate(manifold, t, y, args)),
+        ravel(target),
+    )
 
 
 # ---- What is wrong ----
 
 
-def _report(samples: list[_Samples]) -> None:
+def _check(s: _Samples, manifold: Manifold, args: Args) -> None:
     """Raises an `AssertionError` unless every state is finite and satisfies every constraint."""
-    for s in samples:
-        if not np.all(s.finite):
-            lane, k = map(int, np.argwhere(~s.finite)[0])
-            raise AssertionError(
-                f"The state is not finite {s.place(lane, k)}: {s.state(lane, k)}.\n"
-                "To look at: a failed projection gives NaN in dense output; in saved states it "
-                "comes from the vector field or from the solver."
-            )
-    violated = [(s, i) for s in samples for i in np.flatnonzero(s.violated.any(axis=(0, 1)))]
-    failed = [(s, int(i)) for s, i in violated]
+    if not np.all(s.finite):
+        row = int(np.argmin(s.finite))
+        raise AssertionError(
+            f"The state is not finite {s.place(row)}: {s.text(row)}.\n"
+            "To look at: a failed projection gives NaN in dense output; in saved states it comes "
+            "from the vector field or from the solver."
+        )
+    failed = np.flatnonzero(s.violated.any(axis=0)).tolist()
     if not failed:
         return
+    names = _names(manifold, s.ts[0], s.state(0), args)
     lines = ["The state leaves the manifold."]
-    for s, i in failed[:_SHOWN]:
-        lines += _description(s, i)
+    for i in failed[:_SHOWN]:
+        lines += _description(s, i, names[i])
     if len(failed) > _SHOWN:
         lines.append(f"... and {len(failed) - _SHOWN} more scalar constraints.")
-    raise AssertionError("\n".join([*lines, f"To look at: {_advice(samples, failed)}"]))
+    raise AssertionError("\n".join([*lines, _ADVICE]))
 
 
-def _description(s: _Samples, i: int) -> list[str]:
-    name, is_constraint = s.labels[i]
-    lane, k = map(int, np.argwhere(s.violated[..., i])[0])
-    residual, scale = (float(x[lane, k, i]) for x in (s.residual, s.scale))
-    units = abs(residual) / (s.eps * (scale if scale > 0 else 1))
-    precision = "float64" if s.eps < 1e-10 else f"a unit of roundoff of {s.eps:.1e}"
-    must = "must be 0" if is_constraint else f"must stay {float(s.target[lane, i])!r}"
-    lines = [
-        f"`{name}` first {s.place(lane, k)}:",
-        f"    it is {float(s.found[lane, k, i])!r}, but {must}",
-        f"    residual {residual:.3e} = {units:.3g} units of roundoff ({precision}) of its scale "
-        f"{scale:.3g}; tolerance {s.limit[lane, k, i]:.3e}",
-        f"    state {s.state(lane, k)}",
+def _names(manifold: Manifold, t: Array, y: Y, args: Args) -> list[str]:
+    """The name of each scalar constraint."""
+    return [
+        name + jtu.keystr(path) + (str(list(index)) if index else "")
+        for name, entry in named_entries(manifold)
+        for path, leaf in jtu.tree_leaves_with_path(eqx.filter_eval_shape(entry.fn, t, y, args))
+        for index in np.ndindex(leaf.shape)
     ]
-    if s.kind != "given":
-        rows = np.sum(~np.isinf(s.ts))
-        lines.append(f"    violated in {np.sum(s.violated[..., i])} of {rows} rows")
-    return lines
 
 
-def _advice(samples: list[_Samples], failed: list[tuple[_Samples, int]]) -> str:
-    kinds = {s.kind for s, _ in failed}
-    if kinds == {"given"}:
-        return "was the state projected (`diffrax_conserve.project`), and with this `t` and `args`?"
-    if kinds == {"dense output"} and len(samples) > 1:
-        return (
-            "saved states hold and dense output does not: the solver's interpolation is not "
-            "projected. `SaveAt(ts=...)` and events use it too."
-        )
-    if all(s.labels[i][1] and s.violated[:, 0, i].any() for s, i in failed):
-        return (
-            "the first state violates the constraint. Project it: "
-            "`y0, info = diffrax_conserve.project(manifold, y0)`."
-        )
-    return (
-        "is the solver wrapped, `ManifoldProjection(solver, manifold)`, with this manifold? Are "
-        "`args` those of the solve? Is anything in a lower precision? Does the equation conserve "
-        "it (`diffrax_conserve.check_invariance`)?"
-    )
+def _description(s: _Samples, i: int, name: str) -> list[str]:
+    row = int(np.argmax(s.violated[:, i]))
+    residual, scale, target = (float(x[row, i]) for x in (s.residual, s.scale, s.target))
+    units = abs(residual) / (float(s.precision.eps) * (scale if scale > 0 else 1))
+    must = f"stay {target!r}" if target else "be 0"
+    return [
+        f"`{name}` first {s.place(row)}:",
+        f"    it is {float(s.found[row, i])!r}, but must {must}",
+        f"    residual {residual:.3e} = {units:.3g} units of roundoff ({s.precision.dtype}) of its "
+        f"scale {scale:.3g}; tolerance {s.limit[row, i]:.3e}",
+        f"    state {s.text(row)}",
+        f"    violated in {np.sum(s.violated[:, i])} of {np.sum(~np.isinf(s.ts))} rows",
+    ]

@@ -39,8 +39,8 @@ def assert_gradients(
     - `rtol`: relative to the sum of the absolute terms of $w^\top J v$. Default: the square root of
         the machine epsilon, 1.5e-8 in float64.
     - `atol`: absolute. Default: `rtol` times the largest output, the resolution of the differences.
-    - `forward`, `reverse`: whether to check these modes. `diffrax.RecursiveCheckpointAdjoint`, the
-        default of `diffeqsolve`, has no forward mode, and `diffrax.ForwardMode` no reverse mode.
+    - `forward`, `reverse`: whether to check these modes. The default adjoint of `diffeqsolve` has
+        no forward mode, and `diffrax.ForwardMode` no reverse mode.
     - `seed`: the seed of the directions.
 
     **Raises:**

@@ -75,48 +75,15 @@ def assert_order(
         )
     span = jnp.asarray(t1, float) - t0
     count = int(np.ceil(float(jnp.abs(span / dt0)) - 1e-6))
-    counts = count * _REFINEMENTS
     problem = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
-    finals = [_final(solver, problem, n, max_steps=int(counts[-1]) + 2) for n in counts]
-    exact = _reference(solver, problem, count) if reference is None else reference
-    errors = np.array([float(tree_max(tree_sub(y, exact))) for y in finals])
-    _check_slope(errors, float(span) / counts, float(order), float(margin), _roundoff(exact))
-
-
-@eqx.filter_jit
-def _final(
-    solver: dfx.AbstractSolver,
-    problem: tuple[PyTree[dfx.AbstractTerm], Array, Array, Y, Args],
-    count: Any,
-    *,
-    max_steps: int,
-) -> Y:
-    terms, t0, span, y0, args = problem
-    sol = dfx.diffeqsolve(
-        terms, solver, t0, t0 + span, span / count, y0, args, max_steps=max_steps, throw=False
-    )
-    # NaN in the table marks the solves that failed.
-    okay = dfx.is_okay(sol.result)
-    return jtu.tree_map(lambda y: jnp.where(okay, y[-1], jnp.nan), sol.ys)
-
-
-def _reference(solver: dfx.AbstractSolver, problem: tuple[Any, ...], count: int) -> Y:
-    if isinstance(problem[0], dfx.ODETerm):
-        n = 10 * count * int(_REFINEMENTS[-1])
-        return _final(dfx.Dopri8(), problem, n, max_steps=n + 2)
-    n = 8 * count * int(_REFINEMENTS[-1])
-    return _final(solver, problem, n, max_steps=n + 2)
-
-
-def _roundoff(exact: Y) -> float:
-    """One unit of roundoff of the largest component."""
-    eps = max(float(jnp.finfo(jnp.result_type(x)).eps) for x in jtu.tree_leaves(exact))
-    return eps * float(tree_max(exact))
-
-
-def _check_slope(
-    errors: np.ndarray, steps: np.ndarray, order: float, margin: float, roundoff: float
-) -> None:
+    counts = count * _REFINEMENTS
+    finals = [_final(solver, problem, n, int(counts[-1])) for n in counts]
+    if reference is None:
+        is_ode = isinstance(terms, dfx.ODETerm)
+        best, n = (dfx.Dopri8(), 10 * int(counts[-1])) if is_ode else (solver, 48 * count)
+        reference = _final(best, problem, n, n)
+    errors = np.array([float(tree_max(tree_sub(y, reference))) for y in finals])
+    steps = float(span) / counts
     table = "\n".join(f"    {abs(h):<12.6g} {e:.3e}" for h, e in zip(steps, errors, strict=True))
     table = f"    step         error\n{table}"
     if not np.all(np.isfinite(errors)):
@@ -124,7 +91,8 @@ def _check_slope(
             f"A solve did not succeed (its error is NaN):\n{table}\n"
             "To look at: a smaller `dt0`; whether the solver works with fixed steps."
         )
-    used = errors > _FLOOR * roundoff
+    eps = max(float(jnp.finfo(jnp.result_type(x)).eps) for x in jtu.tree_leaves(reference))
+    used = errors > _FLOOR * eps * float(tree_max(reference))
     if np.sum(used) < 2:
         raise ValueError(
             f"The order cannot be measured: all errors but {int(np.sum(used))} are lost in "
@@ -137,3 +105,19 @@ def _check_slope(
             "To look at: is `dt0` small enough for the method to be asymptotic? Is the state at "
             "the end of a step moved by more than the local error?"
         )
+
+
+@eqx.filter_jit
+def _final(
+    solver: dfx.AbstractSolver,
+    problem: tuple[PyTree[dfx.AbstractTerm], Array, Array, Y, Args],
+    count: Any,
+    count_max: int,
+) -> Y:
+    terms, t0, span, y0, args = problem
+    sol = dfx.diffeqsolve(
+        terms, solver, t0, t0 + span, span / count, y0, args, max_steps=count_max + 2, throw=False
+    )
+    # NaN in the table marks the solves that failed.
+    okay = dfx.is_okay(sol.result)
+    return jtu.tree_map(lambda y: jnp.where(okay, y[-1], jnp.nan), sol.ys)

@@ -104,14 +104,14 @@ def quadratic_systems(dimension: int, *, integrals: int = 1) -> st.SearchStrateg
             f"dimension={dimension} and integrals={integrals}."
         )
     n, degree = dimension, integrals + 1
+    forms = hnp.arrays(np.float64, (integrals, n, n), elements=rounded(0.5))
     coefficients = hnp.arrays(np.float64, math.comb(n, degree), elements=rounded(1.0))
-    perturbations = hnp.arrays(np.float64, (integrals, n, n), elements=rounded(0.5))
-    y0s = hnp.arrays(np.float64, n, elements=rounded(2.0)).map(_nonzero)
+    y0s = hnp.arrays(np.float64, n, elements=rounded(2.0))
     return st.builds(
-        lambda b, a, y0: QuadraticSystem(_definite(b), _alternating(a, n, degree), y0),
-        perturbations,
-        coefficients,
-        y0s,
+        QuadraticSystem,
+        forms.map(_definite),
+        coefficients.map(lambda a: _alternating(a, n, degree)),
+        y0s.map(lambda y: y if np.max(np.abs(y)) >= 0.1 else np.eye(n)[0]),
     )
 
 
@@ -131,10 +131,3 @@ def _alternating(coefficients: np.ndarray, n: int, degree: int) -> np.ndarray:
             sign = round(np.linalg.det(np.eye(degree)[list(order)]))
             out[tuple(indices[i] for i in order)] = sign * a
     return out
-
-
-def _nonzero(y: np.ndarray) -> np.ndarray:
-    if np.max(np.abs(y)) < 0.1:
-        y = y.copy()
-        y[0] = 1.0
-    return y

@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -22,15 +21,9 @@ _TABLE_SIZE = 256
 
 
 def rounded(magnitude: RealScalarLike) -> st.SearchStrategy[float]:
-    """Numbers in `[-magnitude, magnitude]` to six significant digits of `magnitude`.
-
-    Rounding avoids underflow in products, and makes counterexamples readable.
-    """
-    magnitude = float(magnitude)
-    digits = 6 - math.floor(math.log10(magnitude))
-    return st.floats(-magnitude, magnitude).map(
-        lambda x: min(max(round(x, digits), -magnitude), magnitude)
-    )
+    """Multiples of a millionth of `magnitude`, at most as large: they do not underflow in products,
+    and are readable."""
+    return st.integers(-(10**6), 10**6).map(lambda k: float(magnitude) * (k / 10**6))
 
 
 def step_sizes(
@@ -45,9 +38,8 @@ def step_sizes(
 
     **Returns:**
 
-    A strategy of positive numbers with three significant digits, as NumPy `float64`, because
-    [`equinox.filter_jit`][] compiles again for each Python float. It shrinks to `largest`, with
-    which counterexamples have the fewest steps.
+    A strategy of positive NumPy `float64`s, because [`equinox.filter_jit`][] compiles again for
+    each Python float. It shrinks to `largest`, with which counterexamples have the fewest steps.
 
     **Raises:**
 
@@ -73,13 +65,7 @@ def step_sizes(
             f"`step_sizes` needs 0 < smallest <= largest, but got smallest={smallest} and "
             f"largest={largest}. Steps are positive also in a solve backwards in time."
         )
-    ratio = smallest / largest
-
-    def step(k: int) -> float:
-        return min(max(float(f"{largest * ratio ** (k / 1000):.3g}"), smallest), largest)
-
-    # Two maps, because hypothesis shows the call of a named function instead of its value.
-    return st.integers(0, 1000).map(step).map(lambda h: np.asarray(h)[()])
+    return st.sampled_from(list(np.geomspace(largest, smallest, 1001)))
 
 
 def times(
@@ -120,10 +106,9 @@ def times(
         raise ValueError(
             f"`times` needs finite ends and a positive size, but got t0={t0}, t1={t1}, size={size}."
         )
-    parts = st.lists(st.integers(0, 1000), min_size=size, max_size=size)
-    # Clipped to the exact ends, because a solution is not defined beyond them.
-    low, high = min(t0, t1), max(t0, t1)
-    return parts.map(lambda k: np.clip(t0 + (t1 - t0) * np.sort(k) / 1000, low, high))
+    grid = np.linspace(t0, t1, 1001)
+    places = st.lists(st.integers(0, 1000), min_size=size, max_size=size)
+    return places.map(lambda k: grid[np.sort(k)])
 
 
 def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.SearchStrategy[Any]:
@@ -166,14 +151,13 @@ def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.Se
                 f"`like` has a leaf of dtype {jnp.result_type(leaf)}. States are floating-point: "
                 "write for example `np.zeros(3)`."
             )
-    elements = rounded(magnitude)
     # Drawn in float64 and then rounded, so that a float32 component is at most the rounded bound.
-    arrays = [
-        hnp.arrays(np.float64, jnp.shape(x), elements=elements).map(
+    arrays = (
+        hnp.arrays(np.float64, jnp.shape(x), elements=rounded(magnitude)).map(
             lambda a, dtype=jnp.result_type(x): a.astype(dtype)
         )
         for x in leaves
-    ]
+    )
     return st.tuples(*arrays).map(lambda drawn: jtu.tree_unflatten(treedef, drawn))
 
 
@@ -209,20 +193,12 @@ def system_states(
         test()
         ```
     """
-
-    table = jtu.tree_map(
-        lambda x: np.asarray(x, x.dtype if dtype is None else dtype), _table(system)
-    )
-    # Copies, so that a test that modifies its input does not affect other draws.
+    samples = eqx.filter_jit(eqx.filter_vmap(system.sample))(jr.split(jr.key(0), _TABLE_SIZE - 1))
+    table = jtu.tree_map(lambda x, xs: np.concatenate([x[None], xs]), system.y0, samples)
+    # `astype` copies, so that a test that modifies its input does not affect other draws.
     return st.integers(0, _TABLE_SIZE - 1).map(
-        lambda index: jtu.tree_map(lambda x: x[index].copy(), table)
+        lambda index: jtu.tree_map(lambda x: x[index].astype(dtype or x.dtype), table)
     )
-
-
-@eqx.filter_jit
-def _table(system: AbstractSystem) -> Any:
-    samples = jax.vmap(system.sample)(jr.split(jr.key(0), _TABLE_SIZE - 1))
-    return jtu.tree_map(lambda x, xs: jnp.concatenate([x[None], xs]), system.y0, samples)
 
 
 def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[AbstractSystem]:

@@ -21,7 +21,7 @@ class Restructuring(eqx.Module):
     """The components of a state in another PyTree, with other nesting and shapes and the same
     numbers.
 
-    Code that handles any PyTree must give the same numbers for a state and the repacked one.
+    Code that handles any PyTree must give the same numbers for both.
 
     !!! example
 
@@ -43,9 +43,9 @@ class Restructuring(eqx.Module):
         ```
     """
 
+    # PyTrees of `jax.ShapeDtypeStruct`.
     shapes: Any = eqx.field(static=True)
     like: Any = eqx.field(static=True)
-    # Both are PyTrees of `jax.ShapeDtypeStruct`.
 
     def pack(self, y: Any) -> Any:
         """`y` in the new structure."""

@@ -27,21 +27,15 @@ POLLU_60 = [
     0.2087162882798630e-03, 0.1396921016840158e-04, 0.8964884856898295e-02, 0.4352846369330103e-17,
     0.6899219696263405e-02, 0.1007803037365946e-03, 0.1772146513969984e-05, 0.5682943292316392e-04,
 ]  # fmt: skip
-ROBERTSON = {40.0: [0.7158270688, 9.185534765e-6, 0.2841637457]}
+ROBERTSON_40 = [0.7158270688, 9.185534765e-6, 0.2841637457]
+WEIGHTS = np.array([b.weights for b in STIFF["pollu"].mechanism.balances.values()])
 
 
-def test_pollu_is_that_of_the_test_set():
+def test_references_are_those_of_the_test_set():
     found = STIFF["pollu"].reference([60.0])[0]
     np.testing.assert_allclose(found, POLLU_60, rtol=1e-9)
-
-
-def test_robertson_is_that_of_the_books():
-    system = STIFF["robertson"]
-    ts = list(ROBERTSON)
-    np.testing.assert_allclose(system.reference(ts), list(ROBERTSON.values()), rtol=1e-7)
-    rates = system.vector_field(0.0, jnp.array([1.0, 2e-5, 0.5]), None)
-    a, b = -0.04 + 1e4 * 2e-5 * 0.5, 3e7 * 2e-5**2
-    np.testing.assert_allclose(rates, [a, -a - b, b], rtol=1e-13)
+    found = STIFF["robertson"].reference([40.0])[0]
+    np.testing.assert_allclose(found, ROBERTSON_40, rtol=1e-7)
 
 
 @both
@@ -137,9 +131,7 @@ def test_no_concentration_is_negative_and_the_balances_hold():
     good = info.result == optx.RESULTS.successful
     assert float(jnp.mean(good)) > 0.95
     assert bool(jnp.all(good | jnp.any(noise < 0, axis=1)))
-    weights = np.array([b.weights for b in STIFF["pollu"].mechanism.balances.values()])
-    expected = y @ weights.T
-    off = jnp.max(jnp.abs(found @ weights.T / expected - 1), axis=1)
+    off = jnp.max(jnp.abs(found @ WEIGHTS.T / (y @ WEIGHTS.T) - 1), axis=1)
     positive = jnp.all(noise > 0, axis=1)
     assert float(jnp.max(jnp.where(positive, off, 0))) < 4e-15
     assert float(jnp.max(jnp.where(good, off, 0))) < 2e-14
@@ -151,9 +143,8 @@ def test_it_is_the_nearest_state_in_relative_entropy():
     noise = jnp.exp(0.2 * jr.normal(jr.key(5), (1, 20)))
     found, _ = moved_back(y[None], noise)
     gradient = jnp.log(found[0] / (y * noise[0]))
-    weights = np.array([b.weights for b in STIFF["pollu"].mechanism.balances.values()], float)
-    coefficients, *_ = np.linalg.lstsq(weights.T, gradient)
-    np.testing.assert_allclose(weights.T @ coefficients, gradient, atol=1e-12)
+    coefficients, *_ = np.linalg.lstsq(WEIGHTS.T, gradient)
+    np.testing.assert_allclose(WEIGHTS.T @ coefficients, gradient, atol=1e-12)
 
 
 def test_its_derivatives_are_those_of_what_it_computes():
@@ -174,5 +165,4 @@ def test_a_stiff_solve_keeps_signs_and_balances():
     sol = solve(system.vector_field, solver, system.y0, t1=10.0, dt0=None, **options)
     ys = sol.ys[: int(sol.stats["num_accepted_steps"])]
     assert float(jnp.min(ys)) >= 0
-    weights = np.array([b.weights for b in system.mechanism.balances.values()])
-    np.testing.assert_allclose(ys @ weights.T, (ys @ weights.T)[:1].repeat(len(ys), 0), rtol=4e-15)
+    np.testing.assert_allclose(ys @ WEIGHTS.T, (ys @ WEIGHTS.T)[:1].repeat(len(ys), 0), rtol=4e-15)

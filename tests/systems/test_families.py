@@ -61,21 +61,14 @@ def test_what_is_too_small_is_refused():
         systems.KortewegDeVries(points=3)
 
 
-def test_every_system_is_found_by_its_own_name():
-    for name in (*systems.names(), *systems.names(stiff=True)):
-        assert systems.get(name).name == name
-
-
-def test_every_exported_system_is_listed():
+def test_every_exported_system_is_listed_and_found_by_its_own_name():
+    classes = [x for name, x in vars(systems).items() if not name.startswith(("_", "Abstract"))]
     exported = {
-        x.name
-        for x in vars(systems).values()
-        if isinstance(x, type)
-        and issubclass(x, systems.AbstractSystem)
-        and not x.__name__.startswith("Abstract")
+        x.name for x in classes if isinstance(x, type) and issubclass(x, systems.AbstractSystem)
     }
     assert exported == {*systems.names(), *systems.names(stiff=True)}
     assert len(exported) == 15
+    assert all(systems.get(name).name == name for name in exported)
 
 
 @pytest.mark.parametrize(

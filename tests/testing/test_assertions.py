@@ -57,11 +57,8 @@ def test_a_projected_solution_is_conserved_and_a_plain_one_not():
     dct.assert_conserved(plain, RIGID_BODY, rtol=0, atol=1e-6)
     # The nodes lie on the manifold; this is the defect of a naive wrapper.
     dense = solve(dfx.Tsit5(), DENSE).interpolation
-    text = fails(
-        dct.assert_conserved, eqx.tree_at(lambda s: s.interpolation, sol, dense), RIGID_BODY
-    )
-    assert "dense output, row" in text
-    assert "the solver's interpolation is not projected" in text
+    mixed = eqx.tree_at(lambda s: s.interpolation, sol, dense)
+    assert "dense output, row" in fails(dct.assert_conserved, mixed, RIGID_BODY)
     end = solve(dfx.Tsit5(), dfx.SaveAt(t1=True))
     assert "first at time 2" in fails(dct.assert_conserved, end, RIGID_BODY, y0=OMEGA0)
 
@@ -83,8 +80,7 @@ def test_a_state_that_is_not_finite_never_passes(bad):
 
 def test_an_unsuccessful_solve_is_reported_as_that():
     text = fails(dct.assert_conserved, solve(PROJECTED, STEPS, t1=10.0), RIGID_BODY)
-    assert "did not succeed" in text
-    assert "maximum number of solver steps" in text
+    assert re.search("did not succeed.*maximum number of solver steps", text, re.DOTALL)
 
 
 def test_lanes_of_a_batch_are_all_checked():
@@ -116,8 +112,7 @@ def test_a_state_on_the_manifold():
 def test_order():
     dct.assert_order(dfx.Heun(), TERM, OMEGA0, t1=2.0, dt0=0.1)
     text = fails(dct.assert_order, dfx.Heun(), TERM, OMEGA0, t1=2.0, dt0=0.1, order=3)
-    assert "measured order is 1.9" in text or "measured order is 2.0" in text
-    assert "but 3 is claimed" in text
+    assert re.search(r"measured order is (1\.9|2\.0)., but 3 is claimed", text)
 
 
 def test_gradients():

@@ -1,6 +1,6 @@
-"""The pendulum in Cartesian coordinates, with its constraints."""
+"""The pendulum with its constraints, and the double pendulum in angles and momenta."""
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractSystem, real
+from ._base import AbstractIntegratedSystem, AbstractSystem, real
 from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
 
 Pair = Float[Array, "2"]
@@ -41,14 +41,13 @@ class CartesianPendulum(AbstractSystem):
     length: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     gravity: Float[Array, ""] = eqx.field(converter=real, default=1.0)
 
-    name: ClassVar[str] = "cartesian-pendulum"
-    title: ClassVar[str] = "Pendulum in Cartesian coordinates"
-    citation: ClassVar[str] = (
-        "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, IV.4 and VII.1."
-    )
-    t1: ClassVar[float] = 30.0
-    dt: ClassVar[float] = 0.1
-    axes: ClassVar[tuple[str, ...]] = ("q₁", "q₂")
+    name = "cartesian-pendulum"
+    title = "Pendulum in Cartesian coordinates"
+    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, IV.4, VII.1."
+    t1 = 30.0
+    dt = 0.1
+    axes = ("q₁", "q₂")
+    integrals = ("energy",)
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         del t, args
@@ -76,7 +75,7 @@ class CartesianPendulum(AbstractSystem):
         return {
             "rod length": Constraint(self.length_constraint),
             "velocity constraint": Constraint(self.velocity_constraint),
-            "energy": FirstIntegral(self.energy),
+            **super().manifold,
         }
 
     @property
@@ -132,12 +131,104 @@ class CartesianPendulum(AbstractSystem):
         signed = jnp.where(swings, modulus, jnp.copysign(modulus, half_rate))
         return swings, signed, m, incomplete_elliptic(phi, m)
 
-    def trajectories(self, ys: States) -> dict[str, Float[Array, "times 2"]]:
-        return {"mass": ys[0]}
-
 
 CartesianPendulum.__init__.__doc__ = r"""**Arguments:**
 
 - `length`: the length $l$ of the rod.
+- `gravity`: the acceleration $g$.
+"""
+
+
+Phase = Float[Array, "4"]
+
+
+@final
+class DoublePendulum(AbstractIntegratedSystem):
+    r"""Two point masses on two massless rods, `y = [θ₁, θ₂, p₁, p₂]` of shape `(4,)`.
+
+    Both angles are measured from the downward vertical, and $\Delta = \theta_1 - \theta_2$. With
+    the angular velocities $\theta' = M(\Delta)^{-1} p$, where
+
+    $$M = \begin{pmatrix} (m_1 + m_2) l_1^2 & m_2 l_1 l_2 \cos\Delta \\
+    m_2 l_1 l_2 \cos\Delta & m_2 l_2^2 \end{pmatrix},$$
+
+    the momenta obey
+
+    $$p_{1,2}' = \mp m_2 l_1 l_2\, \theta_1' \theta_2' \sin\Delta
+    - \partial V / \partial \theta_{1,2}, \qquad
+    V = -(m_1 + m_2) g l_1 \cos\theta_1 - m_2 g l_2 \cos\theta_2.$$
+
+    **Manifold**: energy, the Hamiltonian $H = \tfrac12\, p \cdot M^{-1} p + V$. For unit masses
+    and lengths,
+
+    $$H = \frac{p_1^2 + 2 p_2^2 - 2 p_1 p_2 \cos\Delta}{2 (1 + \sin^2\Delta)}
+    - 2 g \cos\theta_1 - g \cos\theta_2.$$
+
+    **Reference**: numerical. **Samples**: uniform on $[-\pi/6, \pi/6]^4$.
+
+    Source: Cardoso-Bihlo and Bihlo, arXiv:2311.14131, whose parameters, sampling domain and
+    time span (20 steps of 0.5) are the defaults; it gives no initial state, so `y0` is our choice.
+    Landau and Lifshitz, "Mechanics", §5.
+    """
+
+    masses: Pair = eqx.field(converter=real, default=(1.0, 1.0))
+    lengths: Pair = eqx.field(converter=real, default=(1.0, 1.0))
+    gravity: Float[Array, ""] = eqx.field(converter=real, default=9.81)
+
+    name = "double-pendulum"
+    title = "Double pendulum"
+    citation = (
+        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
+        "L. D. Landau and E. M. Lifshitz, Mechanics, §5."
+    )
+    t1 = 10.0
+    dt = 0.5
+    axes = ("θ₁", "θ₂")
+    integrals = ("energy",)
+
+    def vector_field(self, t: RealScalarLike, y: Phase, args: Args) -> Phase:
+        del t, args
+        theta, p = y[:2], y[2:]
+        system = self.like(y)
+        m2, (l1, l2) = system.masses[1], system.lengths
+        rates = system._angular_velocities(theta, p)
+        coupling = m2 * l1 * l2 * rates[0] * rates[1] * jnp.sin(theta[0] - theta[1])
+        force = -system._weights() * jnp.sin(theta)
+        return jnp.concatenate([rates, force + jnp.stack([-coupling, coupling])])
+
+    def energy(self, t: RealScalarLike, y: Phase, args: Args) -> Float[Array, ""]:
+        del t, args
+        theta, p = y[:2], y[2:]
+        system = self.like(y)
+        kinetic = jnp.sum(p * system._angular_velocities(theta, p)) / 2
+        return kinetic - jnp.sum(system._weights() * jnp.cos(theta))
+
+    def _angular_velocities(self, theta: Pair, p: Pair) -> Pair:
+        m1, m2 = self.masses
+        l1, l2 = self.lengths
+        p1, p2 = p
+        c, s = jnp.cos(theta[0] - theta[1]), jnp.sin(theta[0] - theta[1])
+        determinant = m1 + m2 * s**2
+        rate1 = (l2 * p1 - l1 * p2 * c) / (l1**2 * l2 * determinant)
+        rate2 = ((m1 + m2) * l1 * p2 - m2 * l2 * p1 * c) / (m2 * l1 * l2**2 * determinant)
+        return jnp.stack([rate1, rate2])
+
+    def _weights(self) -> Pair:
+        """The factors of -cos θ in the potential energy."""
+        m1, m2 = self.masses
+        return self.gravity * self.lengths * jnp.stack([m1 + m2, m2])
+
+    @property
+    def y0(self) -> Phase:
+        return jnp.array([0.5, -0.3, 0.2, 0.4])
+
+    def sample(self, key: PRNGKeyArray) -> Phase:
+        return jr.uniform(key, (4,), minval=-jnp.pi / 6, maxval=jnp.pi / 6)
+
+
+DoublePendulum.__init__.__doc__ = r"""**Arguments:**
+
+- `masses`: the masses $(m_1, m_2)$, upper first.
+- `lengths`: the lengths $(l_1, l_2)$ of the rods.
 - `gravity`: the acceleration $g$.
 """
