@@ -74,13 +74,17 @@ projection is used, the bounds are not shaped like the state.
 
 def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
     """`metric`, checked now if its values are known, and at run time if they are tracers."""
-    check_number("metric", metric, above=0.0)
+    message = (
+        "`metric` has a weight that is not positive. There is one for each component, not a matrix."
+    )
 
     def check(weight: ArrayLike) -> ArrayLike:
-        if not isinstance(weight, jax.core.Tracer):
-            return weight
-        message = "`metric` has a weight that is not positive. It has one for each component."
-        return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+        check_number("metric", weight)
+        if isinstance(weight, jax.core.Tracer):
+            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
+        if not jnp.all(jnp.asarray(weight) > 0):
+            raise ValueError(message)
+        return weight
 
     return jtu.tree_map(check, metric)
 

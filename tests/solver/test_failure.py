@@ -72,7 +72,7 @@ def test_the_list_of_messages_is_the_same_whatever_was_solved():
     ("manifold", "message"),
     [
         (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), CANNOT_START),
-        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan), NOT_FINITE),
+        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan), CANNOT_START),
         (dfc.FirstIntegral(square, value=-1.0), NOT_REACHED),
     ],
     ids=["violated", "not-finite", "out-of-reach"],
