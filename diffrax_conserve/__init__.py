@@ -45,7 +45,7 @@ from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
 from ._solver.rk4 import RK4 as RK4
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
-from ._solver.statistics import statistics as statistics
+from ._solver.state import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
 from .learned._files import load as load
 from .learned._files import load_pretrained as load_pretrained

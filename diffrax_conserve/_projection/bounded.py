@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from .._printing import is_traced
 from .equations import Equations
 from .loop import Solved, project_along
-from .options import check_like, spread
+from .options import spread
 
 # A component beyond its bound has this derivative: with zero, a constraint all of whose components
 # are at bounds would never change.
@@ -68,8 +68,7 @@ def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]
     if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
         bound = jtu.tree_map(lambda _: bound, like)
     remedy = "Give one number, or one bound (or an array) for each leaf of the state."
-    check_like(name, bound, like, remedy)
-    return spread(bound, like)
+    return spread(name, bound, like, remedy)
 
 
 def project_within(

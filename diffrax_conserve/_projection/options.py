@@ -20,21 +20,6 @@ def option(default: Any, **kwargs: Any) -> Any:
     return eqx.field(default=default, kw_only=True, **kwargs)
 
 
-def check_like(name: str, option: PyTree[ArrayLike], y: Y, remedy: str) -> None:
-    """Raises unless `option` is structured like the state, with scalars or arrays as leaves."""
-    if jtu.tree_structure(option) != jtu.tree_structure(y):
-        raise ValueError(
-            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
-            f"{jtu.tree_structure(y)}. {remedy}"
-        )
-    for given, leaf in zip(jtu.tree_leaves(option), jtu.tree_leaves(y), strict=True):
-        if jnp.shape(given) not in ((), jnp.shape(leaf)):
-            raise ValueError(
-                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
-                f"{jnp.shape(leaf)}. Give a scalar or an array of the same shape."
-            )
-
-
 def check_options(projection: Any) -> None:
     """Raises unless the options common to the projections are valid."""
     for name in ("rtol", "atol"):
@@ -91,19 +76,27 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
 
 def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
     """`M⁻¹` as a vector; an infinite weight freezes its component."""
-    if metric is None:
-        return None
     remedy = "Give one weight (or an array of weights) for each leaf of the state."
-    check_like("metric", metric, like, remedy)
-    return 1 / spread(metric, like)
+    return None if metric is None else 1 / spread("metric", metric, like, remedy)
 
 
-def spread(tree: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
-    """Scalars or arrays for the leaves of a state, as a vector like the state."""
-    view = jax.eval_shape(real_view, like)
-    return ravel(
-        jtu.tree_map(lambda a, x: jnp.broadcast_to(jnp.asarray(a, x.dtype), x.shape), tree, view)
-    )
+def spread(name: str, option: PyTree[ArrayLike], like: Any, remedy: str) -> Float[Array, " n"]:
+    """An option of scalars or arrays for the leaves of a state, as a vector like the state."""
+    if jtu.tree_structure(option) != jtu.tree_structure(like):
+        raise ValueError(
+            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
+            f"{jtu.tree_structure(like)}. {remedy}"
+        )
+
+    def spread_leaf(given: ArrayLike, leaf: Any, view: Any) -> Array:
+        if jnp.shape(given) not in ((), leaf.shape):
+            raise ValueError(
+                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
+                f"{leaf.shape}. Give a scalar or an array of the same shape."
+            )
+        return jnp.broadcast_to(jnp.asarray(given, view.dtype), view.shape)
+
+    return ravel(jtu.tree_map(spread_leaf, option, like, jax.eval_shape(real_view, like)))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:
