@@ -253,12 +253,12 @@ def conserved_values(
             ) from error
     found = []
     for (name, entry), value in zip(named_entries(manifold), values, strict=True):
-        output = eqx.filter_eval_shape(entry.fn, t, y, args)
+        output = entry.fn(t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
-            value = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), output)
+            value = jtu.tree_map(jnp.zeros_like, output)
         elif given is None and value is None:
-            value = entry.fn(t, y, args)
+            value = output
         else:
             check_number("value", value)
             _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
