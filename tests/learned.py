@@ -61,9 +61,6 @@ class Still(eqx.Module):
         return jax.tree.map(lambda x: x + 0 * h, y0)
 
 
-SWEEPS = {"picard": unchecked(Still()).sweep, "newton": dfc.learned.NewtonSweep()}
-
-
 class Within(eqx.Module):
     """A flow map that knows its domain."""
 

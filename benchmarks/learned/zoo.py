@@ -260,7 +260,11 @@ def train_flow_map(system, spec, seed, key):
 
 def reaching(network, states):
     """The same network, with these states in its domain."""
-    return eqx.tree_at(lambda m: m.domain, network, network.domain.extended(states))
+    seen = jax.vmap(lambda y: network.frame(y)[0])(states)
+    corners = lambda m: (m.domain.box.lower[0], m.domain.box.upper[0])  # noqa: E731
+    lower, upper = corners(network)
+    wider = jnp.minimum(lower, seen.min(axis=0)), jnp.maximum(upper, seen.max(axis=0))
+    return eqx.tree_at(corners, network, wider)
 
 
 def scaled(network, system):

@@ -20,11 +20,9 @@ from ._solvers.flow_map_solver import FlowMapSolver as FlowMapSolver
 from ._solvers.policies import Refuse as Refuse
 from ._solvers.policies import Report as Report
 from ._solvers.policies import domain_statistics as domain_statistics
-from ._solvers.sweeps import NewtonSweep as NewtonSweep
 from ._training.data import reachable_states as reachable_states
 from ._training.data import trajectories as trajectories
 from ._training.loop import FitLog as FitLog
-from ._training.pool import Pool as Pool
 from ._training.recipe import Recipe as Recipe
 from ._training.recipe import second_order as second_order
 from ._training.second_order import SPRING as SPRING

@@ -127,7 +127,6 @@ OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)
         (lambda: family(layer=LAYER), "cannot have a `layer`"),
         (lambda: family(taylor=OWN_ARGS), "`taylor` has `args` of its own"),
         (lambda: fit(args=ARGS), "draws them from its `args_domain`"),
-        (lambda: fit(sample=dfc.learned.Pool(sample)), "`Pool` is for a flow map of one vector"),
     ],
 )
 def test_mistakes_are_named(make, match):

@@ -165,7 +165,6 @@ NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
         (lambda: unchecked(KNOWS, outside=dfx.SemiImplicitEuler()), ValueError, "several terms"),
         (lambda: unchecked(KNOWS, outside=dfx.Kvaerno5()), ValueError, "takes its tolerances from"),
         (lambda: unchecked(KNOWS, outside="report"), TypeError, "`outside` is 'report'"),
-        (lambda: unchecked(KNOWS, sweep="newton"), TypeError, "`sweep` is 'newton'"),
         (lambda: unchecked(Within(Still(), 1.0), outside=REPORT), TypeError, "no method `contains"),
     ],
 )

@@ -55,14 +55,6 @@ class Box(eqx.Module):
         lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
         return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
 
-    def extended(self, states: Y) -> "Box":
-        """The smallest box around this one and `states`, which are stacked along a leading axis."""
-        other = Box.around(states)
-        larger = lambda x, y: jnp.maximum(x, y.astype(x.dtype))  # noqa: E731
-        smaller = lambda x, y: jnp.minimum(x, y.astype(x.dtype))  # noqa: E731
-        lower = jtu.tree_map(smaller, self.lower, other.lower)
-        return Box(lower, jtu.tree_map(larger, self.upper, other.upper))
-
     def contains(self, y: Y) -> Bool[Array, ""]:
         """Whether `y` is in the box, its boundary included. NaN is not."""
         if jtu.tree_structure(y) != jtu.tree_structure(self.lower):
@@ -216,15 +208,6 @@ class FramedBox(eqx.Module):
         upper = (box.upper[0] + slack[0], box.upper[1] + slack[1])
         example = jtu.tree_map(lambda x: x[0], as_state(states))
         return cls(make, Box(lower, upper), example)
-
-    def extended(self, states: Y) -> "FramedBox":
-        """The set extended by the inputs of `states`; the network scales time by the largest clock,
-        which is not changed."""
-        seen = FramedBox.around(self.make, states).box
-        inputs = self.box.lower[0], self.box.upper[0]
-        around = Box(*inputs).extended(jnp.stack([seen.lower[0], seen.upper[0]]))
-        box = Box((around.lower, self.box.lower[1]), (around.upper, self.box.upper[1]))
-        return FramedBox(self.make, box, self.example)
 
     @property
     def fastest(self) -> Array:

@@ -207,12 +207,5 @@ def checked_args(domain: Box, args: Args) -> Args:
 
 
 def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
-    """The inverse of `as_flow_map`: a module of the kind of `model`, with the domain of
-    `flow_map`."""
-    if isinstance(model, AbstractFlowMap):
-        return flow_map
-    assert isinstance(flow_map, FlowMap)
-    if flow_map.domain is None:
-        return flow_map.function
-    is_missing = lambda x: x is None  # noqa: E731
-    return eqx.tree_at(lambda m: m.domain, flow_map.function, flow_map.domain, is_leaf=is_missing)
+    """The inverse of `as_flow_map`: a module of the kind of `model`."""
+    return flow_map if isinstance(model, AbstractFlowMap) else flow_map.weights()

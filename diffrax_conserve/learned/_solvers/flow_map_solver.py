@@ -25,7 +25,7 @@ from .checks import (
     refused_from_start,
 )
 from .policies import DomainStatistics, Policy, StepResult, check_policy, outcome, step_of
-from .sweeps import Increment, Picard, Sweep, correct, estimate, increment
+from .sweeps import Increment, correct, estimate, increment
 
 
 class _State(NamedTuple):
@@ -42,13 +42,12 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     backwards in time.
 
     **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
-    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
+    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` Picard sweeps
 
-    $$u \leftarrow y_n + h \int f(t, u, args) \quad \text{(Picard)}$$
+    $$u \leftarrow y_n + h \int f(t, u, args)$$
 
-    with the vector field of the term, at all points in parallel, or by `k` Newton iterations for
-    the fixed point. The $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$; a
-    Newton iteration squares it.
+    with the vector field of the term, at all points in parallel. The $j$-th sweep multiplies the
+    error by about $h \|\partial f\| / j$.
 
     **Error estimate.** Without sweeps it is the solution of the differential equation of the error,
     driven by the defect $u' - f(u)$, for 12 states of the flow map and 28 evaluations of $f$; with
@@ -92,7 +91,6 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
     nodes: int = option(12, static=True)
     corrections: int = option(0, static=True)
-    sweep: Sweep = option(Picard())
     outside: Policy | None = option(None)
     max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
@@ -112,11 +110,6 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
                 f"`corrections` is {self.corrections!r}, but it must be a number of sweeps: zero "
                 "or a positive integer."
             )
-        if not isinstance(self.sweep, Sweep):
-            raise TypeError(
-                f"`sweep` is {self.sweep!r}, but it must be "
-                "`diffrax_conserve.learned.NewtonSweep()`, or left out for Picard's."
-            )
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         del terms
@@ -130,9 +123,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
 
     def _local_order(self, sweeps: int) -> int:
         """The power of the step size in the error of one step after this many sweeps."""
-        power = self.flow_map.order + 1
-        for _ in range(sweeps):
-            power = self.sweep.power(power)
+        # Each sweep raises it by one.
+        power = self.flow_map.order + 1 + sweeps
         # The error of the collocation polynomial has this power.
         return min(power, self.nodes + 1) if sweeps else power
 
@@ -202,7 +194,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
             y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), y1, y0)
             error = estimate(increment, path)
         else:
-            path, error = correct(self.sweep, increment, path, self.corrections)
+            path, error = correct(increment, path, self.corrections)
             y1 = unravel(path[-1])
         states = jax.vmap(unravel)(path)
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
@@ -215,7 +207,6 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
     has an attribute `max_step`, and optionally `order` and `domain`.
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
-- `sweep`: [`diffrax_conserve.learned.NewtonSweep`][]`()`. Default: Picard's.
 - `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
     counts them, for [`diffrax_conserve.learned.domain_statistics`][];
     [`diffrax_conserve.learned.Refuse`][]`()` fails at the first; a diffrax solver takes them itself

@@ -12,9 +12,8 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
-from ..._manifold import check_manifold, check_outputs
+from ..._manifold import check_manifold
 from ..._options import check_number
-from ..._projection.options import check_state
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
@@ -26,7 +25,6 @@ from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
 from .objective import Problem, VectorField
-from .pool import Pool
 from .recipe import Recipe, second_order
 from .state import FitState
 
@@ -101,15 +99,17 @@ def _of_flow_map(
             )
         sample = flow_map.domain.sample
     if domain is not None:
-        _check_family(sample, args)
+        if args is not None:
+            raise ValueError(
+                "`args` were given, but this flow map takes them as inputs: a training draws them "
+                "from its `args_domain`. Leave `args` out."
+            )
         flow_map = OfPairs(flow_map)
         field = None if field is None else eqx.Partial(field_of_pairs, field)
         sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
     if found is not None and field is not None and sample is None:
         sample = found.sample
-    if isinstance(sample, Pool):
-        _check_pool(sample, flow_map, args, recipe)
     return flow_map, Problem(field, args, sample, found, recipe)
 
 
@@ -170,20 +170,6 @@ def _check_precision(model: Any) -> None:
         )
 
 
-def _check_family(sample: Any, args: Args) -> None:
-    """Raises unless states and `args` can be drawn for a flow map that takes `args`."""
-    if args is not None:
-        raise ValueError(
-            "`args` were given, but this flow map takes them as inputs: a training draws them "
-            "from its `args_domain`. Leave `args` out."
-        )
-    if isinstance(sample, Pool):
-        raise ValueError(
-            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Pass "
-            "`sample=diffrax_conserve.learned.reachable_states(...)`."
-        )
-
-
 def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
     """Raises unless the vector field fits the states, is finite, and for a flow map is
     autonomous."""
@@ -212,18 +198,3 @@ def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
 @eqx.filter_jit
 def _rates(problem: Problem, ts: Array, y0s: Y) -> Array:
     return stacked_vectors(jax.vmap(problem.field)(ts, y0s))
-
-
-def _check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:
-    """Raises unless a pool can grow and its states fit the model and the manifold."""
-    if recipe.refresh is None or recipe.refresh >= recipe.epochs:
-        raise ValueError(
-            "A `Pool` grows when new points are drawn, but with "
-            f"`refresh={recipe.refresh}` in a recipe of {recipe.epochs} epochs that is never. "
-            "Write for example `recipe=dataclasses.replace(recipe, refresh=1)`."
-        )
-    y0 = jtu.tree_map(jnp.asarray, pool.sample(jr.key(0)))
-    check_state(y0, "a `Pool`")
-    check_output(flow_map, (y0, float(flow_map.max_step)), y0, "model")
-    if pool.manifold is not None:
-        check_outputs(pool.manifold, 0.0, y0, args)

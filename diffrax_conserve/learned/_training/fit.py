@@ -78,9 +78,9 @@ def fit(
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time; with `data` it is
         optional.
     - `key`: a random key. The same key gives the same result.
-    - `sample`: for a flow map, initial states, stacked along a leading axis, a function from a
-        random key to one of them, or a [`diffrax_conserve.learned.Pool`][]. Default: the states of
-        `data`, or else all of the `domain`, if that is a [`diffrax_conserve.learned.Box`][].
+    - `sample`: for a flow map, initial states, stacked along a leading axis, or a function from a
+        random key to one of them. Default: the states of `data`, or else all of the `domain`, if
+        that is a [`diffrax_conserve.learned.Box`][].
     - `data`: for a flow map, trajectories `(ts, ys)`: increasing times of shape `(n, k)`, and
         states with leading axes `(n, k)`. [`diffrax_conserve.learned.trajectories`][] computes
         some.

@@ -35,9 +35,8 @@ class FitLog(eqx.Module):
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points (with a
-        [`diffrax_conserve.learned.Pool`][] on its states for the next epoch) with all iterations of
-        the conservative layer.
+        the compared values: the loss on the first collocation points with all iterations of the
+        conservative layer.
     - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
         those of the worst.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the

@@ -131,4 +131,4 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
             ) from error
 
 
-_FORMAT = 3
+_FORMAT = 4
