@@ -12,7 +12,18 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from .learned import EAST, LORENZ, RADIUS, SMALL, flow_map, oscillator, solution, states
+from .learned import (
+    EAST,
+    LORENZ,
+    RADIUS,
+    SMALL,
+    Still,
+    flow_map,
+    in_single,
+    oscillator,
+    solution,
+    states,
+)
 from .thinned import some_of
 
 VORTICES = dfc.systems.PointVortices()
@@ -46,7 +57,7 @@ NETWORKS = {
     "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
     "transformed": dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.125)),
     "family": flow_map(args_domain=dfc.learned.Box({"a": 0.5}, {"a": jnp.array(1.5)})),
-    "single": dfc.learned.single_precision(flow_map()),
+    "single": in_single(flow_map()),
     "both": dfc.learned.Repeated(dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.0)), 2),
 }
 
@@ -145,7 +156,7 @@ class State(eqx.Module):
     x: jax.Array
 
 
-REPEATED = dfc.learned.Repeated(dfc.learned.FlowMap(lambda y0, h: y0, 1.0), 2)
+REPEATED = dfc.learned.Repeated(Still(), 2)
 
 
 @pytest.mark.parametrize(

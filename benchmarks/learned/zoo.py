@@ -254,7 +254,8 @@ def train_flow_map(system, spec, seed, key):
     if spec.extremes is not None:
         network = reaching(network, spec.extremes())
     if spec.single:
-        network = dfc.learned.single_precision(network)
+        single = jax.tree.map(lambda x: x.astype(jnp.float32), network.core)
+        network = eqx.tree_at(lambda m: m.core, network, single)
     return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
 
 

@@ -9,13 +9,11 @@ from ._networks.cores import Product as Product
 from ._networks.domain import Box as Box
 from ._networks.domain import Frame as Frame
 from ._networks.flow_map import AbstractFlowMap as AbstractFlowMap
-from ._networks.flow_map import FlowMap as FlowMap
 from ._networks.layer import ConservativeLayer as ConservativeLayer
 from ._networks.taylor import Taylor as Taylor
 from ._networks.wrappers import BoxCox as BoxCox
 from ._networks.wrappers import Repeated as Repeated
 from ._networks.wrappers import Transformed as Transformed
-from ._networks.wrappers import single_precision as single_precision
 from ._solvers.flow_map_solver import FlowMapSolver as FlowMapSolver
 from ._solvers.policies import Refuse as Refuse
 from ._solvers.policies import Report as Report

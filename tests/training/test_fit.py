@@ -11,7 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, RADIUS, SMALL, Within, flow_map, oscillator
+from ..learned import EAST, LORENZ, RADIUS, SMALL, Still, Within, flow_map, in_single, oscillator
 
 # Most of these trainings are too short, and say so.
 pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
@@ -127,8 +127,7 @@ def test_the_losses():
     np.testing.assert_allclose(bounded, np.mean([0, 1 / (1 + 1 / 3), 3 / 2, 3.0]), rtol=1e-10)
 
 
-RECIPE, WITHOUT_WEIGHTS = dfc.learned.Recipe, dfc.learned.FlowMap(lambda y0, h: y0, 1.0)
-SINGLE = dfc.learned.single_precision(flow_map())
+RECIPE, WITHOUT_WEIGHTS, SINGLE = dfc.learned.Recipe, Still(), in_single(flow_map())
 NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_field)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_sub, unflatten
-from .cores import AbstractCore, check_sizes
+from .cores import check_sizes
 from .domain import Box
 from .flat import flatten, stacked_vectors
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
@@ -297,45 +297,3 @@ def pair(sample: Sampler, domain: Box, key: PRNGKeyArray) -> tuple[Any, Any]:
     """A random state, and random `args` from their domain."""
     state_key, args_key = jr.split(key)
     return sample(state_key), domain.sample(args_key)
-
-
-def single_precision(flow_map: _Model) -> _Model:
-    r"""The same flow map, whose network is evaluated in float32.
-
-    In $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$ only $N$ is rounded to float32, about $10^{-7}
-    S$; if the network's own error is larger, nothing is lost. On a CPU evaluation takes about half
-    as long, and a file about half the space. Convert a network after its training.
-
-    !!! example
-
-        ```python
-        import diffrax_conserve as dfc
-
-        flow_map = dfc.load_pretrained("conservative-lorenz")
-        faster = dfc.learned.single_precision(flow_map)
-        solver = dfc.DeepONetSolver(faster)
-        ```
-
-    **Arguments:**
-
-    - `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that contains some, such as a
-        [`diffrax_conserve.learned.Repeated`][] or a solver.
-
-    **Raises:**
-
-    `TypeError` if it contains no `DeepONet`.
-    """
-
-    def is_core(x: Any) -> bool:
-        return isinstance(x, AbstractCore)
-
-    def single(x: Any) -> Any:
-        return x.astype(jnp.float32) if eqx.is_array(x) and x.dtype == jnp.float64 else x
-
-    if not any(map(is_core, jtu.tree_leaves(flow_map, is_leaf=is_core))):
-        raise TypeError(
-            f"`flow_map` is {flow_map!r}, which contains no `DeepONet`, whose network alone can be "
-            "evaluated in another precision than that of the state."
-        )
-    rounded = lambda x: jtu.tree_map(single, x) if is_core(x) else x  # noqa: E731
-    return jtu.tree_map(rounded, flow_map, is_leaf=is_core)

@@ -166,7 +166,7 @@ def _check_precision(model: Any) -> None:
     if any(network.precision != network.scale.dtype for network in networks):
         raise TypeError(
             "The weights of the model are float32, but its states are float64. Train it in double "
-            "precision, and pass the result to `diffrax_conserve.learned.single_precision`."
+            "precision, and convert its `core` afterwards."
         )
 
 
