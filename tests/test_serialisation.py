@@ -46,7 +46,7 @@ NETWORKS = {
     "raw pinn": solution(normalise=False),
     "deeponet": flow_map(depth=3),
     "conservative pinn": solution(layer=CONSERVING),
-    "windows": solution(windows=[0.3, 1.2], slope=2.0),
+    "windows": solution(windows=3, slope=2.0),
     "gated": flow_map(core=dfc.learned.Gated, taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)),
     "concatenated": flow_map(
         core=dfc.learned.Concatenated,

@@ -435,7 +435,7 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
         "seed": seed,
         "weights": sum(x.size for x in jax.tree.leaves(weights_of(network))),
         "epochs": len(log.losses) + (spec.epochs if spec.polish else 0),
-        "best_loss": trained.number(log.best),
+        "best_loss": trained.number(log.criteria.min()),
         "skipped_updates": log.skipped,
         "seconds": round(seconds, 1),
         "cpu_seconds": round(cpu_seconds, 1),

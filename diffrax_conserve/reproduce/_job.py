@@ -106,7 +106,7 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
         network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
         print(
             f"  {log.seconds:.0f} s after {log.compile_seconds:.0f} s of compilation; "
-            f"loss {log.best:.3g} at epoch {log.best_epoch}"
+            f"loss {log.criteria.min():.3g} at epoch {log.checked[log.criteria.argmin()]}"
         )
         info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
         save(out / f"{kind}.network", network, info=info)

@@ -1,6 +1,5 @@
 """A physics-informed network: one solution, as a function of time."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -124,7 +123,7 @@ class PINN(eqx.Module):
         t1: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        windows: int | Sequence[float] = 1,
+        windows: int = 1,
         width: int = 30,
         depth: int = 1,
         activation: str | Activation = "tanh",
@@ -132,13 +131,14 @@ class PINN(eqx.Module):
         normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):
-        check_sizes(width=width, depth=depth)
+        check_sizes(width=width, depth=depth, windows=windows)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         if slope is not None and not slope > 0:
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
-        y0, self.edges = as_state(y0), _edges(float(t0), float(t1), windows)
-        dtype, n, count = working_dtype(y0), flatten(y0).size, self.windows
+        y0, length = as_state(y0), float(t1) - float(t0)
+        self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
+        dtype, n, count = working_dtype(y0), flatten(y0).size, windows
 
         def net(key: PRNGKeyArray) -> MLP:
             return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
@@ -208,8 +208,7 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `y0`: the initial state $u_0$, any PyTree of real arrays.
 - `t0`, `t1`: the interval of time.
 - `key`: a random key, for the initial weights.
-- `windows`: the number of equal intervals, each with its own network; or the times between `t0` and
-    `t1` that separate the intervals.
+- `windows`: the number of equal intervals, each with its own network.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
@@ -224,20 +223,6 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 
 `ValueError` or `TypeError` if a size or the interval is invalid.
 """
-
-
-def _edges(t0: float, t1: float, windows: int | Sequence[float]) -> tuple[float, ...]:
-    """The times at which windows start, and the end of the last one."""
-    if not isinstance(windows, Sequence):
-        check_sizes(windows=windows)
-        return (*(t0 + (t1 - t0) / windows * k for k in range(windows)), t1)
-    edges = (t0, *map(float, windows), t1)
-    if not all(a < b for a, b in itertools.pairwise(edges)):
-        raise ValueError(
-            f"`windows` is {windows!r}, but the times at which the interval is cut must increase "
-            f"and lie between {t0} and {t1}."
-        )
-    return edges
 
 
 def _magnitude(leaf: Array) -> Array:

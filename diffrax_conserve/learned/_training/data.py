@@ -32,8 +32,8 @@ def reachable_states(
 ) -> PyTree[Array]:
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
-    In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
-    such states. Pass the result as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
+    In a solve, each step of a flow map starts at the end of the last one, so train it on such
+    states: pass them as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
     [`diffrax_conserve.fit`][].
 
     **Arguments:**
@@ -72,7 +72,9 @@ def reachable_states(
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    _, ys = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
+    _, ys = trajectories(
+        vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6, atol=1e-6
+    )
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
     return ys if keep is None else _the_good(ys, eqx.filter_jit(jax.vmap(keep))(ys))
 
@@ -123,22 +125,8 @@ def trajectories(
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jnp.asarray(ts, float)
     times = jnp.broadcast_to(times, (count, times.shape[-1]))
-    size = max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
-    atol = rtol * size if atol is None else atol
-    return _solutions(vector_field, y0s, times, args, solver, dt0, rtol, atol)
-
-
-def _solutions(
-    vector_field: Any,
-    y0s: Any,
-    ts: Array,
-    args: Args,
-    solver: dfx.AbstractSolver | None,
-    dt0: RealScalarLike | None,
-    rtol: float,
-    atol: float,
-) -> tuple[Array, Any]:
-    """The times and states of the solves that succeeded."""
+    if atol is None:
+        atol = rtol * max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
 
     def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
         adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
@@ -158,8 +146,8 @@ def _solutions(
         )
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, ts)
-    return _the_good((ts, ys), good)
+    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)
+    return _the_good((times, ys), good)
 
 
 def _the_good(ys: Any, good: Array) -> Any:

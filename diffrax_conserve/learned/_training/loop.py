@@ -37,8 +37,6 @@ class FitLog(eqx.Module):
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
         the compared values: the loss on the first collocation points with all iterations of the
         conservative layer.
-    - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
-        those of the worst.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
@@ -52,8 +50,6 @@ class FitLog(eqx.Module):
     losses: np.ndarray
     checked: np.ndarray
     criteria: np.ndarray
-    best_epoch: int
-    best: float
     skipped: int
     ended: str
     seconds: float
@@ -195,8 +191,6 @@ class Loop:
             losses=found.losses,
             checked=found.checked,
             criteria=found.criteria,
-            best_epoch=found.worst_epoch,
-            best=found.worst,
             skipped=found.skipped,
             ended=ended,
             seconds=self.elapsed,
@@ -218,7 +212,7 @@ class Loop:
         self.compile_seconds = time.perf_counter() - self.created
 
     def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
-        """Calls the function `progress`, or prints a line."""
+        """Calls the function `progress`, or prints a line for each tenth of the epochs."""
         if self.progress is False:
             return
         rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
@@ -229,9 +223,7 @@ class Loop:
         if self.progress is not True:
             self.progress(done, total, float(loss), best)
             return
-        # On a terminal one line is overwritten; a file gets one for each tenth of the epochs.
-        terminal = sys.stderr.isatty()
-        if not (terminal or done == total or done % max(total // 10, 1) == 0):
+        if not (done == total or done % max(total // 10, 1) == 0):
             return
         parts = [f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"]
         if done and (error := estimate()):
@@ -240,5 +232,4 @@ class Loop:
         if done > self.first:
             left = self.elapsed / (done - self.first) * (total - done)
             parts.append(f"{min(left, self.seconds - self.elapsed):.0f} s left")
-        ending = "\r" if terminal and done < total else "\n"
-        print(", ".join(parts), end=ending, file=sys.stderr, flush=True)
+        print(", ".join(parts), file=sys.stderr, flush=True)

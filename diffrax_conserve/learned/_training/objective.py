@@ -76,7 +76,6 @@ class Carry(NamedTuple):
     points: Points
     best_weights: Any
     best: Float[Array, ""]
-    best_epoch: Int[Array, ""]
     skipped: Int[Array, ""]
     losses: Float[Array, " epochs"]
 
@@ -149,7 +148,6 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
         points=points,
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
-        best_epoch=jnp.asarray(0),
         skipped=jnp.asarray(0),
         losses=jnp.full(problem.recipe.epochs, jnp.nan, dtype),
     )
@@ -185,7 +183,6 @@ def advance(
     carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
         best=jnp.where(better, criterion, carry.best),
-        best_epoch=jnp.where(better, stop, carry.best_epoch),
     )
     return carry, criterion
 

@@ -34,12 +34,10 @@ class FitState(eqx.Module):
     finished: int = 0
     passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
     tightening: float = 1.0  # by which the limit of a window's error is divided
-    # The records of all networks, and of those before the present one the values of the worst.
-    losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))  # without the present ones
+    # The records of all networks; in `losses` and `skipped` without the present one.
+    losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
     checked: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0, int))
     criteria: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
-    worst: float = -1.0
-    worst_epoch: int = 0
     skipped: int = 0
 
     def compared(self, criterion: float) -> "FitState":
@@ -50,13 +48,9 @@ class FitState(eqx.Module):
 
     def closed(self) -> "FitState":
         """This state with all of its present network in the records."""
-        best, before = float(self.carry.best), self.losses.size
-        worse = best > self.worst
         return dataclasses.replace(
             self,
             losses=np.concatenate([self.losses, np.asarray(self.carry.losses)]),
-            worst=best if worse else self.worst,
-            worst_epoch=before + int(self.carry.best_epoch) if worse else self.worst_epoch,
             skipped=self.skipped + int(self.carry.skipped),
             done=-1,
             trained=self.trained + 1,
