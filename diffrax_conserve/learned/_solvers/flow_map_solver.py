@@ -129,12 +129,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         return min(power, self.nodes + 1) if sweeps else power
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> _State:
         check_learned_terms(terms, "FlowMapSolver")
         known = known_args(self.flow_map, args)

@@ -83,12 +83,7 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         del terms
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> Refused:
         """Zero, or why the solve cannot start: it is not on the solution of the network."""
         del t1, args
