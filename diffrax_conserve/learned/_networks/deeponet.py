@@ -32,11 +32,6 @@ class DeepONet(AbstractFlowMap):
     manifold of the conserved values at $u_0$. With a `frame` it commutes with the symmetries of the
     equations: see [`diffrax_conserve.learned.Frame`][].
 
-    The `core` $N$ is one fully connected network of the state and the step,
-    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
-    feeds the input into each of its layers; or as in the literature, and less accurate at the same
-    size, [`diffrax_conserve.learned.Product`][].
-
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
     !!! example
@@ -46,8 +41,7 @@ class DeepONet(AbstractFlowMap):
         import jax
 
         system = dfc.systems.get("conservative-lorenz")
-        keys = jax.random.split(jax.random.key(0), 100)
-        states = jax.vmap(system.sample)(keys)
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
         deeponet = dfc.DeepONet(states, 0.25, key=jax.random.key(1))
         deeponet(system.y0, 0.1)
         ```
@@ -89,8 +83,8 @@ class DeepONet(AbstractFlowMap):
         _check_parts(layer, frame, taylor, checked_box(args_domain))
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
-                f"`core` is {core!r}, but it must be a class, such as "
-                "`diffrax_conserve.learned.Product`, `Concatenated` or `Gated`."
+                f"`core` is {core!r}, but it must be `diffrax_conserve.learned.Concatenated`, "
+                "`Gated` or `Product`."
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
@@ -117,22 +111,15 @@ class DeepONet(AbstractFlowMap):
             self.scale = jnp.where(deviation > 0, deviation, 1)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state at time `h` after the state `y0`.
-
-        Called as `(y0, h)`, or with an `args_domain` as `(y0, args, h)`.
-        """
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
-            raise TypeError(
-                f"This `DeepONet` is called as `{expected}`, but was given {len(step) + 1} "
-                "arguments."
-            )
+            raise TypeError(f"This `DeepONet` is called as `{expected}`.")
         candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate
-        h = step[-1]
         values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
-        return self.layer(candidate, values, h, self.radius(), schedule)
+        return self.layer(candidate, values, step[-1], self.radius(), schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
         """The output before the conservative layer."""
@@ -144,7 +131,7 @@ class DeepONet(AbstractFlowMap):
                 f"{start.size}."
             )
         h = jnp.asarray(h).astype(start.dtype)
-        known = self._known(args, start.dtype)
+        known = self._known(args)
         if isinstance(self.domain, Box):
             fraction = h / self.max_step
             learned = self.scale * self._network(start, known, h, fraction)
@@ -159,20 +146,15 @@ class DeepONet(AbstractFlowMap):
             start = flatten(taylor(y0, h)).astype(start.dtype)
         return unflatten(start + fraction ** (self.order + 1) * learned, y0)
 
-    def _known(self, args: list[Args], dtype: Any) -> Float[Array, " p"]:
+    def _known(self, args: list[Args]) -> Float[Array, " p"]:
         """The `args` as inputs of the network."""
         if self.args_domain is None:
-            return jnp.zeros(0, dtype)
+            return jnp.zeros(0, self.scale.dtype)
         found = checked_args(self.args_domain, args[0])
-        return flatten(self.args_domain.centred(found) if self.normalise else found).astype(dtype)
+        found = flatten(self.args_domain.centred(found) if self.normalise else found)
+        return found.astype(self.scale.dtype)
 
-    def _network(
-        self,
-        inputs: Float[Array, " k"],
-        known: Float[Array, " p"],
-        step: Float[Array, ""],
-        fraction: Float[Array, ""],
-    ) -> Float[Array, " m"]:
+    def _network(self, inputs: Array, known: Array, step: Array, fraction: Array) -> Array:
         inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
         time = 2 * fraction - 1 if self.normalise else step
         output = self.core(inputs.astype(self.precision), time.astype(self.precision))
@@ -212,8 +194,7 @@ class DeepONet(AbstractFlowMap):
         return net.weights[-1], net.biases[-1]
 
     def radius(self) -> Float[Array, ""]:
-        """The largest distance by which the conservative layer may move a state in one
-        iteration."""
+        """The largest distance by which an iteration of the layer may move a state."""
         return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
 
@@ -225,20 +206,22 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `latent`: the number $L$ of products in each component, for a `Product`.
-- `core`: the architecture of the network, one of the three classes above.
+- `core`: $N$, one fully connected network of the state and the step,
+    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
+    feeds the input into each of its layers; or as in the literature, and less accurate at the same
+    size, [`diffrax_conserve.learned.Product`][].
+- `latent`: the number $L$ of products in each component of a `Product`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `normalise`: whether the network gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
-    $S$ of `states`, and $h$ scaled to $[-1, 1]$. Otherwise it gets $u_0$ and $h$, and $S = 1$.
+- `normalise`: whether $N$ gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation $S$ of
+    `states`, and $h$ scaled to $[-1, 1]$. Otherwise it gets $u_0$ and $h$, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
-- `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then
-    gets the inputs of the frame, to which `normalise` applies; the domain consists of all states
-    whose inputs are in the box around those of `states` and whose clock is not faster than theirs.
+- `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][], whose inputs $N$
+    then gets. The domain consists of all states whose inputs are in the box around those of
+    `states` and whose clock is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 - `args_domain`: the smallest and the largest `args` of the vector field, as a
-    [`diffrax_conserve.learned.Box`][]. The network takes `args` as inputs, and so does the
-    polynomial of `taylor`. Default: a network for fixed `args`.
+    [`diffrax_conserve.learned.Box`][]. The network and its polynomial then take `args` as inputs.
 
 **Raises:**
 
@@ -252,9 +235,8 @@ def _check_parts(
 ) -> None:
     if layer is not None and (frame is not None or domain is not None):
         raise ValueError(
-            "A flow map with a `frame` or an `args_domain` cannot have a `layer`, whose largest "
-            "correction is in the units of a whole state, and whose manifold has its own `args`. "
-            "Leave it out, and wrap the solver in `diffrax_conserve.ManifoldProjection`."
+            "A flow map with a `frame` or an `args_domain` cannot have a `layer`. Leave it out, "
+            "and wrap the solver in `diffrax_conserve.ManifoldProjection`."
         )
     if domain is not None and taylor is not None and taylor.args is not None:
         raise ValueError(

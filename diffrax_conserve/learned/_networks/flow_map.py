@@ -101,7 +101,6 @@ class FlowMap(AbstractFlowMap):
     domain: Any
     args_domain: Box | None
 
-    # Written out, because type checkers treat the abstract fields of the base class as arguments.
     def __init__(self, function: Any):
         self.function, self.max_step = function, function.max_step
         self.order, self.domain = getattr(function, "order", 0), getattr(function, "domain", None)
@@ -146,8 +145,7 @@ def checked_box(args_domain: Any) -> Box | None:
     """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
     if not isinstance(args_domain, Box | None):
         raise TypeError(
-            f"`args_domain` is {args_domain!r}, but it must be the smallest and the largest "
-            "`args`: `diffrax_conserve.learned.Box(lower, upper)`."
+            f"`args_domain` is {args_domain!r}, but it must be a `diffrax_conserve.learned.Box`."
         )
     return args_domain
 
@@ -163,8 +161,7 @@ def checked_args(domain: Box, args: Args) -> Args:
     expected, got = (tree_shapes(x) for x in (domain.lower, args))
     if got != expected:
         raise ValueError(
-            f"This flow map takes `args` of the structure {expected}, but was given {got}. Pass "
-            "those of its `args_domain`, to `diffeqsolve` as `args=...`."
+            f"This flow map takes `args` of the structure {expected}, but was given {got}."
         )
     return jtu.tree_map(lambda x, a: jnp.asarray(x, a.dtype), args, domain.lower)
 

@@ -45,8 +45,7 @@ class Window(AbstractTrainable):
         return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
 
     def radius(self) -> Float[Array, ""]:
-        """The largest distance by which the conservative layer may move a state in one
-        iteration."""
+        """The largest distance by which an iteration of the layer may move a state."""
         return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
@@ -87,9 +86,9 @@ class PINN(eqx.Module):
     output is projected to the manifold of the conserved values at $(t_0, u_0)$.
 
     A long interval is divided into `windows`, each with its own network that starts where the last
-    one ends: small networks on short intervals are far easier to train than a large one on a long
-    interval. Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step
-    it by [`diffrax_conserve.PINNSolver`][].
+    one ends: small networks on short intervals are far easier to train. Train it by
+    [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
+    [`diffrax_conserve.PINNSolver`][].
 
     !!! example
 
@@ -181,10 +180,9 @@ class PINN(eqx.Module):
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
         """A window with the options of this network."""
         start, length = (jnp.asarray(t, self.scale.dtype) for t in (start, end - start))
-        scale, normalise = self.scale, self.normalise
         return Window(
-            net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale,
-            normalise=normalise,
+            net=net, layer=self.layer, y0=y0, start=start, length=length,
+            scale=self.scale, normalise=self.normalise,
         )  # fmt: skip
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
@@ -213,8 +211,8 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
-    spread over the interval. `None` for Glorot initialisation, with which all units are nearly the
-    same function of time; Levenberg-Marquardt needs about 2.
+    spread over the interval. `None` for Glorot initialisation, with which they are nearly the same
+    function of time; Levenberg-Marquardt needs about 2.
 - `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
     leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].

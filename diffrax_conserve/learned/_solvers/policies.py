@@ -114,7 +114,7 @@ def step_of(
     return StepResult(y1, error, coefficients, result)
 
 
-def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
+def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
     """Raises unless `policy` is one, and goes with the domain and the error bound."""
     check_number("max_error", max_error, above=0.0)
     choices = (
@@ -130,7 +130,7 @@ def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
         return
     if not isinstance(policy, Policy):
         raise TypeError(f"`outside` is {policy!r}, but it must be {choices}.")
-    if max_error is None and domain is None:
+    if max_error is None and not has_domain:
         raise ValueError(
             f"`outside` is {policy!r}, but the flow map does not know what that is: it has no "
             "`domain`. Give it `diffrax_conserve.learned.Box.around(states)`, with the states that "

@@ -1,11 +1,7 @@
 r"""Collocation on the Chebyshev points of a step, by correction sweeps, and the error of a path.
 
-A path $u$ through a step of length $h$ is stored as its states at the fractions $c_i$, one row
-each. The collocation solution satisfies
-
-$$u(c_i) = y_0 + h \int_0^{c_i} f(u(c))\,dc,$$
-
-at all points, where the integral is that of the polynomial through the increments $h f$.
+A path $u$ through a step is stored as its states at the fractions $c_i$, one row each. Integrals
+are those of the polynomial through the increments $h f$.
 """
 
 from collections.abc import Callable
@@ -68,9 +64,9 @@ def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
 
     $$d' = h \left(f(p + \rho + d) - F\right), \qquad d(0) = 0,$$
 
-    which is exact. $\rho$ is the change by a Picard sweep; by itself it underestimates the error by
-    a large factor where $h \|\partial f\|$ is large. Nothing is differentiated, so the roundoff is
-    that of the states.
+    which is exact. $\rho$ is the change by a sweep; alone it underestimates the error by a large
+    factor where $h \|\partial f\|$ is large. Nothing is differentiated, so the roundoff is that of
+    the states.
     """
     values = jax.vmap(increment)(_fractions(path), path)
     rho = path[0] + integrals(values) - path

@@ -53,22 +53,18 @@ def fit(
     $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
-    estimates the error of its solution.
-
-    A `DeepONet` without a [`diffrax_conserve.learned.Taylor`][] polynomial gets that of first order
-    of the vector field, unless this changes too fast: see `taylor` of
-    [`diffrax_conserve.learned.Recipe`][].
+    estimates the error of its solution. A `DeepONet` gets the Taylor polynomial that its recipe
+    prescribes.
 
     A `PINN` is trained window by window; each starts at the end of the previous one, projected to
     the manifold if one is given. A window whose estimated error is too large is cut in halves, as
-    often as the recipe's `retries` allow. Errors add up along the solution and may grow: if it
-    misses the `target`, the windows are trained again, to smaller errors. If the solution is still
-    wrong, a warning names the window and the error.
+    often as the recipe's `retries` allow. If the whole solution misses the `target`, the windows
+    are trained again, to smaller errors. If it is still wrong, a warning names the window and the
+    error.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
-    same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
-    continued with a recipe of more epochs. The result is that of all epochs at once unless the
-    optimiser depends on their number, as SPRING does.
+    same arguments, or with a recipe of more epochs; the result is the same, bit for bit, as without
+    the stop, unless the optimiser depends on the number of epochs, as SPRING does.
 
     **Arguments:**
 
@@ -129,7 +125,7 @@ def fit(
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
     created = time.perf_counter()
-    check_types(vector_field, key, recipe, state, progress, target=target, seconds=seconds)
+    check_types(key, recipe, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     loop = Loop(
         problem,

@@ -29,9 +29,8 @@ class FitLog(eqx.Module):
 
     - `error`: the estimated error of the solution, for each leaf of the state relative to its
         largest component: for a `PINN` the largest in the whole interval, for a flow map the root
-        mean square for its longest step, over states from `sample`. The estimate solves the
-        differential equation of the error, driven by the defect. Infinity if there is none, or a
-        window was not trained.
+        mean square for its longest step, over states from `sample`. Infinity if there is no
+        estimate, or a window was not trained.
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
@@ -40,8 +39,8 @@ class FitLog(eqx.Module):
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
-    - `seconds`, `compile_seconds`: the wall times of the training, and of all that comes before its
-        first epoch, which is mostly compilation.
+    - `seconds`, `compile_seconds`: the wall times of the training, and of all before its first
+        epoch.
     - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
     """
 
@@ -103,11 +102,9 @@ class Loop:
         close_enough: Callable[[Carry], bool],
         estimate: Callable[[Any], float],
     ) -> tuple[FitState, Carry, str]:
-        """Trains one network to its last epoch, or until the training ends earlier.
-
-        Returns the state to go on from, and the carry with the best model. They differ if the time
-        is over between two comparisons: a training that goes on must not make one more.
-        """
+        """Trains one network. Returns the state to go on from, the carry with the best model, and
+        why it ended. The first two differ if the time is over between two comparisons: a training
+        that goes on must not make one more."""
         recipe, ended = self.problem.recipe, ""
         self._compile(objective, state, estimate)
         try:
@@ -136,9 +133,8 @@ class Loop:
         skipped = int(state.carry.skipped)
         if skipped and skipped == state.done:
             raise FloatingPointError(
-                f"None of the {skipped} updates was finite, so nothing was learned, although the "
-                "vector field is finite at the initial states. It may not be finite where the "
-                "network leads, or the updates are too long: lower the learning rate."
+                f"None of the {skipped} updates was finite. The vector field may not be finite "
+                "where the network leads, or the updates are too long: lower the learning rate."
             )
         shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
         return state, shown.carry, ended
@@ -167,12 +163,11 @@ class Loop:
 
     @property
     def elapsed(self) -> float:
-        """The time since the end of the compilation, which takes `compile_seconds`."""
+        """The time since the end of the compilation."""
         return time.perf_counter() - self.created - self.compile_seconds if self.compiled else 0.0
 
     def save(self, state: FitState, always: bool = False) -> None:
-        """Writes a checkpoint, unless the time since the last one is short compared with its
-        duration."""
+        """Writes a checkpoint, unless the last took a twentieth of the time since then."""
         begun = time.perf_counter()
         if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
             return

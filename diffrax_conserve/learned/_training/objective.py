@@ -1,7 +1,7 @@
 """The compiled part of a training: the loss, and the epochs that minimise it.
 
-The defect `du/dt - f(t, u)` is computed at a batch of collocation points by one forward-mode pass.
-A `vmap` of forward passes takes twice as long, and reverse mode six times as long.
+The defect `du/dt - f(t, u)` is computed at all points by one forward-mode pass. A `vmap` of forward
+passes takes twice as long, and reverse mode six times as long.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,6 @@ class Problem(eqx.Module):
     recipe: Recipe
 
     def field(self, t: Any, y: Any) -> Any:
-        """The vector field with its `args`."""
         assert self.vector_field is not None
         return self.vector_field(t, y, self.args)
 
@@ -129,7 +128,6 @@ class Objective(eqx.Module):
         return self.problem.draw(self.static, jr.fold_in(self.key, epoch))
 
     def best(self, carry: Carry) -> Any:
-        """The best model so far."""
         return eqx.combine(carry.best_weights, self.static)
 
 
@@ -173,10 +171,7 @@ def advance(
     stop: Int[Array, ""],
     compare: Bool[Array, ""],
 ) -> tuple[Carry, Float[Array, ""]]:
-    """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far.
-
-    The last three may be traced, so that all calls share one compilation.
-    """
+    """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far."""
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
     criterion = objective.criterion(carry.weights, objective.first_points)
     better = compare & (criterion < carry.best)
