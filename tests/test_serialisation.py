@@ -43,7 +43,6 @@ NETWORKS = {
     "system with parameters": dfc.DeepONet(
         states(4, FOUR), 0.5, key=jr.key(0), layer=dfc.learned.ConservativeLayer(FOUR.manifold)
     ),
-    "raw pinn": solution(normalise=False),
     "deeponet": flow_map(depth=3),
     "conservative pinn": solution(layer=CONSERVING),
     "windows": solution(windows=3, slope=2.0),

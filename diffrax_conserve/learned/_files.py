@@ -359,7 +359,8 @@ def _array(body: io.BytesIO, name: str, *shape: int) -> jax.Array:
 
 
 def _module(kind: Any, fields: dict[str, Any]) -> Any:
-    if list(fields) != _fields(kind):
+    # Files of earlier versions tell that the inputs are normalised, as they always are.
+    if fields.pop("normalise", True) is not True or list(fields) != _fields(kind):
         raise ValueError(f"a {kind.__name__} has other fields")
     module = object.__new__(kind)
     for name, value in fields.items():

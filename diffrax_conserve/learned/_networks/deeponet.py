@@ -57,7 +57,6 @@ class DeepONet(AbstractFlowMap):
     max_step: float = eqx.field(static=True)
     shift: Float[Array, " k"]
     scale: Float[Array, " k"]
-    normalise: bool = eqx.field(static=True)
     taylor: Taylor | None
     domain: Box | FramedBox
     args_domain: Box | None
@@ -73,7 +72,6 @@ class DeepONet(AbstractFlowMap):
         latent: int = 20,
         core: type[AbstractCore] = Concatenated,
         activation: str | Activation = "tanh",
-        normalise: bool = True,
         taylor: Taylor | None = None,
         frame: MakeFrame | None = None,
         layer: ConservativeLayer | None = None,
@@ -98,17 +96,12 @@ class DeepONet(AbstractFlowMap):
             frames = jax.vmap(lambda y: frame_at(frame, y))(states)
             self.domain = FramedBox.around(frame, states)
             seen, m = frames.inputs, frames.basis.shape[-1]
-        n = seen.shape[1]
         sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core(n + known, m, sizes, dtype, key)
+        self.core = core(seen.shape[1] + known, m, sizes, dtype, key)
         self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
-        self.max_step, self.normalise = float(max_step), normalise
-        self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
-        if normalise:
-            deviation = jnp.std(seen, axis=0)
-            self.shift = jnp.mean(seen, axis=0)
-            self.scale = jnp.where(deviation > 0, deviation, 1)
+        self.max_step, deviation = float(max_step), jnp.std(seen, axis=0)
+        self.shift, self.scale = jnp.mean(seen, axis=0), jnp.where(deviation > 0, deviation, 1)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
@@ -134,13 +127,13 @@ class DeepONet(AbstractFlowMap):
         known = self._known(args)
         if isinstance(self.domain, Box):
             fraction = h / self.max_step
-            learned = self.scale * self._network(start, known, h, fraction)
+            learned = self.scale * self._network(start, known, fraction)
         else:
             frame = self.domain.frame(y0)
             own = (h * frame.clock).astype(start.dtype)
             fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
             inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
-            learned = basis @ self._network(inputs, known, own, fraction)
+            learned = basis @ self._network(inputs, known, fraction)
         if self.taylor is not None:
             taylor = dataclasses.replace(self.taylor, args=args[0]) if args else self.taylor
             start = flatten(taylor(y0, h)).astype(start.dtype)
@@ -150,13 +143,12 @@ class DeepONet(AbstractFlowMap):
         """The `args` as inputs of the network."""
         if self.args_domain is None:
             return jnp.zeros(0, self.scale.dtype)
-        found = checked_args(self.args_domain, args[0])
-        found = flatten(self.args_domain.centred(found) if self.normalise else found)
-        return found.astype(self.scale.dtype)
+        found = self.args_domain.centred(checked_args(self.args_domain, args[0]))
+        return flatten(found).astype(self.scale.dtype)
 
-    def _network(self, inputs: Array, known: Array, step: Array, fraction: Array) -> Array:
+    def _network(self, inputs: Array, known: Array, fraction: Array) -> Array:
         inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
-        time = 2 * fraction - 1 if self.normalise else step
+        time = 2 * fraction - 1
         output = self.core(inputs.astype(self.precision), time.astype(self.precision))
         return output.astype(inputs.dtype)
 
@@ -201,8 +193,8 @@ class DeepONet(AbstractFlowMap):
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 - `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
-    Their mean and standard deviation normalise the inputs, and the box around them is the `domain`
-    of the flow map.
+    $N$ gets $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to
+    $[-1, 1]$. The box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
@@ -213,8 +205,6 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `latent`: the number $L$ of products in each component of a `Product`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `normalise`: whether $N$ gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation $S$ of
-    `states`, and $h$ scaled to $[-1, 1]$. Otherwise it gets $u_0$ and $h$, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][], whose inputs $N$
     then gets. The domain consists of all states whose inputs are in the box around those of

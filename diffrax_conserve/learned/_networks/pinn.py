@@ -28,7 +28,6 @@ class Window(AbstractTrainable):
     start: Float[Array, ""]
     length: Float[Array, ""]
     scale: Float[Array, " n"]
-    normalise: bool = eqx.field(static=True)
 
     def __call__(self, t: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
         candidate = self.candidate(t)
@@ -41,7 +40,7 @@ class Window(AbstractTrainable):
         """The state at time `t` before the conservative layer."""
         t = jnp.asarray(t).astype(self.scale.dtype)
         fraction = (t - self.start) / self.length
-        out = self.net((2 * fraction - 1 if self.normalise else t)[None])
+        out = self.net((2 * fraction - 1)[None])
         return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
 
     def radius(self) -> Float[Array, ""]:
@@ -82,7 +81,8 @@ class PINN(eqx.Module):
 
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
-    with a fully connected network $N$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
+    with a fully connected network $N$ of time scaled to $[-1, 1]$, and the largest component $S$ of
+    each leaf of $u_0$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
     output is projected to the manifold of the conserved values at $(t_0, u_0)$.
 
     A long interval is divided into `windows`, each with its own network that starts where the last
@@ -113,7 +113,6 @@ class PINN(eqx.Module):
     y0s: Y
     edges: tuple[float, ...] = eqx.field(static=True)  # the starts of the windows, and the end
     scale: Float[Array, " n"]
-    normalise: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -127,7 +126,6 @@ class PINN(eqx.Module):
         depth: int = 1,
         activation: str | Activation = "tanh",
         slope: float | None = 2.0,
-        normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):
         check_sizes(width=width, depth=depth, windows=windows)
@@ -144,8 +142,7 @@ class PINN(eqx.Module):
 
         self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
         self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
-        self.layer, self.normalise = layer, normalise
-        self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
+        self.layer, self.scale = layer, flatten(jtu.tree_map(_magnitude, y0))
 
     def __call__(self, t: RealScalarLike) -> Y:
         """The state at time `t`."""
@@ -180,10 +177,8 @@ class PINN(eqx.Module):
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
         """A window with the options of this network."""
         start, length = (jnp.asarray(t, self.scale.dtype) for t in (start, end - start))
-        return Window(
-            net=net, layer=self.layer, y0=y0, start=start, length=length,
-            scale=self.scale, normalise=self.normalise,
-        )  # fmt: skip
+        scale = self.scale
+        return Window(net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale)
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
         """A network with the same options and these windows."""
@@ -213,8 +208,6 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
     spread over the interval. `None` for Glorot initialisation, with which they are nearly the same
     function of time; Levenberg-Marquardt needs about 2.
-- `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
-    leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 
 **Raises:**

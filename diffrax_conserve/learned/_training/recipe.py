@@ -93,7 +93,7 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `epochs`: the number of updates; each uses all collocation points.
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
-    [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3, with clipped gradients.
+    [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3 and clipping.
 - `schedule`: for a network with a conservative layer, a function of the epoch (traced), the number
     of epochs and the number of iterations in the layer, which returns $p$ and $s$. The network is
     trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations.
