@@ -217,7 +217,6 @@ def load_pretrained(name: str) -> Network:
 
 
 def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
-    """The header of a file, and the bytes of the arrays."""
     first, _, rest = _file(path).read_bytes().partition(b"\n")
     version, _, digest = first.removeprefix(_MAGIC).partition(b" ")
     if not first.startswith(_MAGIC) or not version.isdigit():

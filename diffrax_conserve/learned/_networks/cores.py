@@ -107,7 +107,6 @@ def _spread(
 
 
 def check_sizes(**sizes: int) -> None:
-    """Raises unless every size is a positive integer."""
     for name, size in sizes.items():
         if not isinstance(size, int) or size < 1:
             raise ValueError(f"`{name}` must be a positive integer, but is {size!r}.")

@@ -115,7 +115,6 @@ class DeepONet(AbstractFlowMap):
         return self.layer(candidate, values, step[-1], self.radius(), schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
-        """The output before the conservative layer."""
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
@@ -154,7 +153,6 @@ class DeepONet(AbstractFlowMap):
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order of the Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
 
     @property
@@ -169,7 +167,6 @@ class DeepONet(AbstractFlowMap):
 
     @property
     def frame(self) -> MakeFrame | None:
-        """The function that finds the frame of a state, or `None`."""
         return None if isinstance(self.domain, Box) else self.domain.make
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:

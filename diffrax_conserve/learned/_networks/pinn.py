@@ -37,7 +37,6 @@ class Window(AbstractTrainable):
         return self.layer(candidate, values, t, self.radius(), schedule)
 
     def candidate(self, t: RealScalarLike) -> Y:
-        """The state at time `t` before the conservative layer."""
         t = jnp.asarray(t).astype(self.scale.dtype)
         fraction = (t - self.start) / self.length
         out = self.net((2 * fraction - 1)[None])

@@ -73,5 +73,4 @@ Taylor.__init__.__doc__ = r"""**Arguments:**
 
 
 def _along(field: Callable[[Y], Y], function: Callable[[Y], Y]) -> Callable[[Y], Y]:
-    """The derivative of `function` along the flow."""
     return lambda y: jax.jvp(function, (y,), (field(y),))[1]

@@ -105,7 +105,6 @@ class Repeated(AbstractWrapper):
         return self._scan(once, y0, step)
 
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        """Whether every inner step is within the domain."""
 
         def once(carry: tuple[Y, Array], each: Any) -> tuple[tuple[Y, Array], None]:
             y, inside = carry
@@ -232,7 +231,6 @@ class Transformed(AbstractWrapper):
         return None if self.flow_map.domain is None else self
 
     def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is in the domain."""
         return self.flow_map.domain.contains(self.transformation(y))
 
     def seen(self, y: Y) -> Any:
@@ -276,7 +274,6 @@ class OfPairs(AbstractWrapper):
 
 
 def field_of_pairs(vector_field: Callable[..., Any], t: RealScalarLike, y: Any, args: None) -> Any:
-    """The vector field of the pairs."""
     y, args = y
     return vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
 

@@ -58,7 +58,6 @@ def check_learned_terms(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
 
 
 def check_output(function: Callable[..., Any], arguments: tuple, y0: Y, name: str) -> None:
-    """Raises unless `function(*arguments)` is shaped like the state."""
     arguments = jtu.tree_map(jnp.asarray, arguments)
     output = eqx.filter_eval_shape(function, *arguments)
     got, expected = tree_shapes(output), tree_shapes(y0)

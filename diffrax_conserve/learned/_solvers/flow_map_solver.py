@@ -170,7 +170,6 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     def _learned(
         self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
     ) -> StepResult:
-        """The step of the flow map, after the correction sweeps."""
         start, unravel = ravel_pytree(y0)
 
         def state(fraction: Array) -> Array:

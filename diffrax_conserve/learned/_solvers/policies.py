@@ -103,7 +103,6 @@ def step_of(
     y0: Y,
     args: Args,
 ) -> StepResult:
-    """A step of a classical solver, which has no memory of earlier ones."""
     state = solver.init(terms, t0, t1, y0, args)
     y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
@@ -115,7 +114,6 @@ def step_of(
 
 
 def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
-    """Raises unless `policy` is one, and goes with the domain and the error bound."""
     check_number("max_error", max_error, above=0.0)
     choices = (
         "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver, such as "

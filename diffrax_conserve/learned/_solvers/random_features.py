@@ -188,7 +188,6 @@ class StepEquations(NamedTuple):
         return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._fractions(), states)
 
     def residual(self, coefficients: Coefficients) -> Coefficients:
-        """`d - P h f`."""
         fit = self.basis.fit[: len(coefficients)]
         return coefficients - multiply(fit, self.slopes(self.states(coefficients)))
 

@@ -211,7 +211,6 @@ class Data(eqx.Module):
         return model.compared(found, pairs.y1s) / self.deviation
 
     def sample(self, key: PRNGKeyArray) -> Any:
-        """One of the states."""
         i, j = jnp.divmod(jr.randint(key, (), 0, self.ts.size), self.ts.shape[1])
         return jtu.tree_map(lambda y: y[i, j], self.ys)
 

@@ -163,7 +163,6 @@ class Loop:
 
     @property
     def elapsed(self) -> float:
-        """The time since the end of the compilation."""
         return time.perf_counter() - self.created - self.compile_seconds if self.compiled else 0.0
 
     def save(self, state: FitState, always: bool = False) -> None:
@@ -178,7 +177,6 @@ class Loop:
     def log(
         self, state: FitState, carry: Carry, ended: str, error: float, errors: Any = ()
     ) -> FitLog:
-        """The log of a training that ends with `state` and `carry`."""
         found = dataclasses.replace(state, carry=carry).closed()
         return FitLog(
             error=error,

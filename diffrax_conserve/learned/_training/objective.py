@@ -59,7 +59,6 @@ class Problem(eqx.Module):
         return model.measured(points, tree_sub(rates, jax.vmap(self.field)(ts, y)))
 
     def typical(self, model: AbstractTrainable, points: Points) -> Float[Array, ""]:
-        """The median of `|f|²` over the initial states."""
         if self.vector_field is None:
             return jnp.ones(())
         starts = model.starts(points)
@@ -112,7 +111,6 @@ class Objective(eqx.Module):
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def complete(self) -> LayerSchedule:
-        """The schedule with all iterations of the conservative layer."""
         layer = self.static.layer
         return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
 
@@ -124,7 +122,6 @@ class Objective(eqx.Module):
         return p, jnp.asarray(s, float)
 
     def fresh_points(self, epoch: Int[Array, ""]) -> Points:
-        """The points for `epoch`."""
         return self.problem.draw(self.static, jr.fold_in(self.key, epoch))
 
     def best(self, carry: Carry) -> Any:
@@ -206,7 +203,6 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
 
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
-    """The next weights and state of the optimiser, and the loss."""
     optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
     weights, points, state = carry.weights, carry.points, carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):

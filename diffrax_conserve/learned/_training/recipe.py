@@ -26,24 +26,20 @@ def staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
 
 
 def complete(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
-    """All iterations of the layer from the first epoch on."""
     del epochs
     return jnp.full_like(epoch, steps), jnp.ones_like(epoch, float)
 
 
 def mean(squares: Array, typical: Array) -> Float[Array, ""]:
-    """The mean of the squared norms of the defects."""
     del typical
     return jnp.mean(squares)
 
 
 def uniform(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
-    """Independent times."""
     return jr.uniform(key, (count,), minval=first, maxval=last)
 
 
 def grid(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
-    """Equally spaced times."""
     del key
     return jnp.linspace(first, last, count)
 

@@ -29,7 +29,6 @@ Loss = Callable[[Float[Array, " points"], Float[Array, ""]], Float[Array, ""]]
 
 
 def squared_norms(vectors: Float[Array, "points n"]) -> Float[Array, " points"]:
-    """The squared norms of vectors stacked along a leading axis."""
     return jnp.sum(jnp.square(vectors), axis=1)
 
 
@@ -117,7 +116,6 @@ _LENGTH = optax.linear_schedule(1.0, 0.0, 0.6, transition_begin=0.4)  # pyright:
 
 
 def _solve(gram: Array, damping: Array, rhs: Array) -> Array:
-    """The solution of `(gram + damping I) x = rhs`."""
     matrix = gram + damping * jnp.eye(rhs.size, dtype=rhs.dtype)
     return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), rhs)
 

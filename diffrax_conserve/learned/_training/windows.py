@@ -212,7 +212,6 @@ class _Windows:
 
 
 def _replaced(state: FitState, k: int, windows: list[Window], errors: list[float]) -> FitState:
-    """The state with these windows in the place of the `k`th."""
     networks, old = list(state.networks), list(state.errors)
     networks[k : k + 1], old[k : k + 1] = windows, errors
     return dataclasses.replace(state, networks=tuple(networks), errors=tuple(old))
