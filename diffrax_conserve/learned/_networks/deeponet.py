@@ -112,7 +112,7 @@ class DeepONet(AbstractFlowMap):
         if self.layer is None:
             return candidate
         values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
-        return self.layer(candidate, values, step[-1], self.radius(), schedule)
+        return self.layer(candidate, values, step[-1], self.scale, schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
         *args, h = step
@@ -181,10 +181,6 @@ class DeepONet(AbstractFlowMap):
             return ()
         net = self.core.output_layer()
         return net.weights[-1], net.biases[-1]
-
-    def radius(self) -> Float[Array, ""]:
-        """The largest distance by which an iteration of the layer may move a state."""
-        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**

@@ -152,25 +152,19 @@ MakeFrame = Callable[[Any], Any]
 
 def frame_at(make: MakeFrame, y: Y) -> Frame:
     made = make(y)
+    if not isinstance(made, Frame | tuple):
+        raise TypeError("`frame` must return a `diffrax_conserve.learned.Frame`.")
     return made if isinstance(made, Frame) else Frame(*made)
 
 
 def check_frame(make: Any, y: Y) -> None:
     """Raises unless `make` is a function from states like `y` to a `Frame` of the right shapes."""
-    if not callable(make):
-        raise TypeError(f"`frame` is {make!r}, not a function from a state to a `Frame`.")
-    made = eqx.filter_eval_shape(make, y)
-    if not (isinstance(made, Frame) or (isinstance(made, tuple) and len(made) == 3)):
-        raise TypeError(
-            f"`frame` returns a {type(made).__name__}, but must return a "
-            "`diffrax_conserve.learned.Frame`, or a tuple `(inputs, basis, clock)`."
-        )
-    inputs, basis = (made.inputs, made.basis) if isinstance(made, Frame) else made[:2]
-    n = eqx.filter_eval_shape(flatten, y).size
-    if inputs.ndim != 1 or basis.ndim != 2 or len(basis) != n:
+    frame, n = eqx.filter_eval_shape(frame_at, make, y), eqx.filter_eval_shape(flatten, y).size
+    inputs, basis = frame.inputs.shape, frame.basis.shape
+    if len(inputs) != 1 or len(basis) != 2 or basis[0] != n:
         raise ValueError(
-            f"`frame` returns inputs of shape {inputs.shape} and a basis of shape {basis.shape}, "
-            f"but for states of {n} numbers they must have the shapes `(k,)` and `({n}, m)`."
+            f"`frame` returns inputs of shape {inputs} and a basis of shape {basis}, but for "
+            f"states of {n} numbers they must have the shapes `(k,)` and `({n}, m)`."
         )
 
 

@@ -74,11 +74,12 @@ class ConservativeLayer(eqx.Module):
         candidate: Y,
         values: Values,
         t: RealScalarLike,
-        radius: Float[Array, ""],
+        scale: Float[Array, "..."],
         schedule: tuple[Int[Array, ""], Float[Array, ""]] | None = None,
     ) -> Y:
         """The state after all iterations; or `(1 - s) P_{p-1} y + s P_p y` for `schedule = (p, s)`,
-        where `P_k y` is the state after `k` iterations. Those beyond the `p`-th are not computed.
+        where `P_k y` is the state after `k` iterations, and those beyond the `p`-th are not
+        computed. An iteration moves the state by at most the norm of `scale`.
         """
         start = ravel(candidate)
         dtype = start.dtype
@@ -94,7 +95,8 @@ class ConservativeLayer(eqx.Module):
 
         # Arrays over which the functions close become part of `residual`'s PyTree.
         converted = eqx.filter_closure_convert(residual, start)
-        fixed = lax.stop_gradient((equations.magnitude, radius.astype(dtype), p, s.astype(dtype)))
+        radius = jnp.sqrt(jnp.sum(jnp.square(scale))).astype(dtype)
+        fixed = lax.stop_gradient((equations.magnitude, radius, p, s.astype(dtype)))
         y, _ = _conserve(converted, start, fixed, steps=self.steps)
         return unravel(y, candidate)
 

@@ -34,17 +34,13 @@ class Window(AbstractTrainable):
         if self.layer is None:
             return candidate
         values = self.layer.values(self.start, self.y0)
-        return self.layer(candidate, values, t, self.radius(), schedule)
+        return self.layer(candidate, values, t, self.scale, schedule)
 
     def candidate(self, t: RealScalarLike) -> Y:
         t = jnp.asarray(t).astype(self.scale.dtype)
         fraction = (t - self.start) / self.length
         out = self.net((2 * fraction - 1)[None])
         return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
-
-    def radius(self) -> Float[Array, ""]:
-        """The largest distance by which an iteration of the layer may move a state."""
-        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
         del sample

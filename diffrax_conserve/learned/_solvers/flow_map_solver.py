@@ -69,14 +69,9 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz-standard")
         solver = dfc.DeepONetSolver(flow_map, corrections=4)
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton()),
-            t0=0.0,
-            t1=5.0,
-            dt0=0.25,
-            y0=system.y0,
-        )
+        solver = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
+        term = diffrax.ODETerm(system.vector_field)
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0)
         ```
 
     ??? cite "Reference"

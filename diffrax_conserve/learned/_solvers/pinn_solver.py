@@ -51,14 +51,9 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
 
         system = dfc.systems.get("rigid-body")
         solver = dfc.PINNSolver(dfc.load_pretrained("rigid-body-standard"))
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton()),
-            t0=0.0,
-            t1=1.75,
-            dt0=0.05,
-            y0=system.y0,
-        )
+        solver = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
+        term = diffrax.ODETerm(system.vector_field)
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 1.75, 0.05, system.y0)
         ```
 
     ??? cite "Reference"

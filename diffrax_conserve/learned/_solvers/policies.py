@@ -178,15 +178,10 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
 
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz")
-        sol = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.DeepONetSolver(flow_map, outside=dfc.learned.Report()),
-            t0=0.0,
-            t1=5.0,
-            dt0=0.25,
-            y0=system.y0,
-            saveat=diffrax.SaveAt(t1=True, solver_state=True),
-        )
+        solver = dfc.DeepONetSolver(flow_map, outside=dfc.learned.Report())
+        term = diffrax.ODETerm(system.vector_field)
+        saveat = diffrax.SaveAt(t1=True, solver_state=True)
+        sol = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0, saveat=saveat)
         print(dfc.learned.domain_statistics(sol).num_outside)
         ```
 
@@ -200,7 +195,6 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
     if not found:
         raise ValueError(
             "`sol` holds no statistics of a domain. Solve with a learned solver that has "
-            "`outside=`, for example `outside=diffrax_conserve.learned.Report()`, and with "
-            "`saveat=SaveAt(..., solver_state=True)`."
+            "`outside=`, and with `saveat=SaveAt(..., solver_state=True)`."
         )
     return found[0]

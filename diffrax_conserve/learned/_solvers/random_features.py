@@ -75,14 +75,9 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         import diffrax_conserve as dfc
 
         system = dfc.systems.get("harmonic-oscillator")
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.RandomFeatureSolver(),
-            t0=0.0,
-            t1=30.0,
-            dt0=3.0,
-            y0=system.y0,
-        )
+        term = diffrax.ODETerm(system.vector_field)
+        solver = dfc.RandomFeatureSolver()
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 30.0, 3.0, system.y0)
         ```
 
     ??? cite "Reference"

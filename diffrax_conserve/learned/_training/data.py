@@ -218,15 +218,14 @@ class Data(eqx.Module):
 def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     """The trajectories `(ts, ys)`; raises unless they are valid."""
     if not (isinstance(data, tuple) and len(data) == 2):
-        raise TypeError(f"`data` is {type(data).__name__}, but it must be a pair `(ts, ys)`.")
+        raise TypeError(f"`data` is a {type(data).__name__}, but it must be a pair `(ts, ys)`.")
     ts = np.asarray(data[0], float)
     ys = jtu.tree_map(jnp.asarray, data[1])
     shapes = [jnp.shape(y)[:2] for y in jtu.tree_leaves(ys)]
     if ts.ndim != 2 or not shapes or any(shape != ts.shape for shape in shapes):
         raise ValueError(
             f"In `data` the times have shape {ts.shape} and the states leading axes {shapes}, but "
-            "all must be `(n, k)`: n trajectories, with k times each. For a single one write "
-            "`ts[None]` and `jax.tree.map(lambda y: y[None], ys)`."
+            "all must be `(n, k)`: n trajectories, with k times each."
         )
     finite = [np.all(np.isfinite(y)) for y in (ts, *jtu.tree_leaves(ys))]
     if not all(finite) or np.any(np.diff(ts, axis=1) <= 0):
@@ -236,8 +235,8 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     places = np.argwhere(last > np.arange(ts.shape[1]))
     if not places.size:
         raise ValueError(
-            f"No two times of a trajectory in `data` are within {flow_map.max_step}, the "
-            "`max_step` of the flow map. Give it a longer one, or data with shorter steps."
+            "No two times of a trajectory in `data` are within the `max_step` of the flow map, "
+            f"{flow_map.max_step}. Give it a longer one, or data with shorter steps."
         )
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
     pairs = whole.draw(_MANY, jr.key(0))

@@ -72,7 +72,6 @@ class Loop:
     compile_seconds: float = 0.0
     compiled: Any = None
     pace: float = 0.0  # seconds for an epoch; 0 if that is not known
-    first: int = 0  # the number of epochs before this call of `fit`
     saved: float = -math.inf  # time of the last save; `saving` is its duration
     saving: float = 0.0
 
@@ -201,7 +200,6 @@ class Loop:
         lowered = compilable.lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
         self.compiled = lowered.compile()
         estimate(objective.best(state.carry))
-        self.first = state.losses.size + max(state.done, 0)
         self.compile_seconds = time.perf_counter() - self.created
 
     def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
@@ -222,7 +220,4 @@ class Loop:
         if done and (error := estimate()):
             parts.append(f"estimated error {error:.1e}")
         parts.append(f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile")
-        if done > self.first:
-            left = self.elapsed / (done - self.first) * (total - done)
-            parts.append(f"{min(left, self.seconds - self.elapsed):.0f} s left")
         print(", ".join(parts), file=sys.stderr, flush=True)

@@ -87,17 +87,11 @@ class _Windows:
     pinn: PINN
     manifold: Manifold | None
 
-    @property
-    def wrong(self) -> float:
-        return _WRONG if self.loop.target is None else self.loop.target
-
-    @property
-    def aim(self) -> float:
-        return self.wrong if self.pinn.scale.dtype != jnp.float64 else self.loop.target or _AIM
-
-    @property
-    def retries(self) -> int:
-        return self.loop.problem.recipe.retries
+    def __post_init__(self):
+        target, double = self.loop.target, self.pinn.scale.dtype == jnp.float64
+        self.wrong: float = target or _WRONG
+        self.aim: float = (target or _AIM) if double else self.wrong
+        self.retries: int = self.loop.problem.recipe.retries
 
     def edges(self, state: FitState) -> np.ndarray:
         return np.array([*(float(window.start) for window in state.networks), self.pinn.t1])
