@@ -71,7 +71,6 @@ class Carry(NamedTuple):
 
     weights: Any
     optimiser_state: Any
-    points: Points
     best_weights: Any
     best: Float[Array, ""]
     skipped: Int[Array, ""]
@@ -105,9 +104,9 @@ class Objective(eqx.Module):
         squares = squared_norms(self.defects(weights, points, schedule))
         return self.problem.recipe.loss(squares, self.typical)
 
-    def criterion(self, weights: Any, points: Points) -> Float[Array, ""]:
+    def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss with all iterations of the layer, as the trained model is used."""
-        loss = self.loss(weights, points, self.complete())
+        loss = self.loss(weights, self.first_points, self.complete())
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def complete(self) -> LayerSchedule:
@@ -121,8 +120,13 @@ class Objective(eqx.Module):
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
-    def fresh_points(self, epoch: Int[Array, ""]) -> Points:
-        return self.problem.draw(self.static, jr.fold_in(self.key, epoch))
+    def points(self, epoch: Int[Array, ""]) -> Points:
+        refresh = self.problem.recipe.refresh
+        if refresh is None:
+            return self.first_points
+        drawn = epoch - epoch % refresh
+        fresh = self.problem.draw(self.static, jr.fold_in(self.key, drawn))
+        return _where(drawn == 0, self.first_points, fresh)
 
     def best(self, carry: Carry) -> Any:
         return eqx.combine(carry.best_weights, self.static)
@@ -140,7 +144,6 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     carry = Carry(
         weights=weights,
         optimiser_state=problem.recipe.optimiser.init(weights),
-        points=points,
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
         skipped=jnp.asarray(0),
@@ -170,7 +173,7 @@ def advance(
 ) -> tuple[Carry, Float[Array, ""]]:
     """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far."""
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
-    criterion = objective.criterion(carry.weights, objective.first_points)
+    criterion = objective.criterion(carry.weights)
     better = compare & (criterion < carry.best)
     carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
@@ -180,31 +183,22 @@ def advance(
 
 
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
-    """One update, and the points for the next one."""
+    """One update."""
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If not, continue from the best model: the same weights and points would give the same result.
     fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
-    carry = carry._replace(
+    return carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
-    refresh, following = objective.problem.recipe.refresh, epoch + 1
-    if refresh is None:
-        return carry
-    points = lax.cond(
-        following % refresh == 0,
-        lambda: objective.fresh_points(following),
-        lambda: carry.points,
-    )
-    return carry._replace(points=points)
 
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
     optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
-    weights, points, state = carry.weights, carry.points, carry.optimiser_state
+    weights, points, state = carry.weights, objective.points(epoch), carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
         updates, state = optimiser.update(gradient, state, weights)
