@@ -78,7 +78,16 @@ class DeepONet(AbstractFlowMap):
         args_domain: Box | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
-        _check_parts(layer, frame, taylor, checked_box(args_domain))
+        if layer is not None and (frame is not None or checked_box(args_domain) is not None):
+            raise ValueError(
+                "A flow map with a `frame` or an `args_domain` cannot have a `layer`. Wrap its "
+                "solver in `diffrax_conserve.ManifoldProjection` instead."
+            )
+        if checked_box(args_domain) is not None and taylor is not None and taylor.args is not None:
+            raise ValueError(
+                "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
+                "`Taylor(vector_field, order)`."
+            )
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
                 f"`core` is {core!r}, but it must be `diffrax_conserve.learned.Concatenated`, "
@@ -211,18 +220,3 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 `ValueError` or `TypeError` if a size, the step, the states, the frame or `args_domain` is invalid,
 or if a layer is combined with a frame or an `args_domain`.
 """
-
-
-def _check_parts(
-    layer: ConservativeLayer | None, frame: Any, taylor: Taylor | None, domain: Box | None
-) -> None:
-    if layer is not None and (frame is not None or domain is not None):
-        raise ValueError(
-            "A flow map with a `frame` or an `args_domain` cannot have a `layer`. Leave it out, "
-            "and wrap the solver in `diffrax_conserve.ManifoldProjection`."
-        )
-    if domain is not None and taylor is not None and taylor.args is not None:
-        raise ValueError(
-            "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
-            "`Taylor(vector_field, order)`."
-        )

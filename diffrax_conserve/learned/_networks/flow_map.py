@@ -164,8 +164,3 @@ def checked_args(domain: Box, args: Args) -> Args:
             f"This flow map takes `args` of the structure {expected}, but was given {got}."
         )
     return jtu.tree_map(lambda x, a: jnp.asarray(x, a.dtype), args, domain.lower)
-
-
-def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
-    """The inverse of `as_flow_map`: a module of the kind of `model`."""
-    return flow_map if isinstance(model, AbstractFlowMap) else flow_map.weights()

@@ -43,11 +43,11 @@ def reachable_states(
     - `duration`: the longest time.
     - `key`: a random key, for the times.
     - `args`: passed to `vector_field`.
-    - `keep`: a function of one state that tells whether to keep it. Exclude states that change too
+    - `keep`: a function of one state that tells whether to keep it: exclude those that change too
         fast for the step that is to be learned.
-    - `solver`, `dt0`: the diffrax solver. Default: [`diffrax.Dopri8`][] with adaptive steps at a
-        tolerance of $10^{-6}$. With `dt0` the steps are fixed: if `vector_field` is expensive, use
-        the projected solver of a partly trained flow map with its own steps.
+    - `solver`, `dt0`: the diffrax solver, and its fixed step: if `vector_field` is expensive, the
+        solver of a partly trained flow map. Default: [`diffrax.Dopri8`][] at a tolerance of
+        $10^{-6}$.
 
     **Returns:**
 
@@ -97,8 +97,8 @@ def trajectories(
     - `vector_field`, `args`: as for [`diffrax_conserve.learned.reachable_states`][].
     - `y0s`: states at time 0, stacked along a leading axis.
     - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
-    - `solver`, `dt0`: any diffrax solver; for stiff equations [`diffrax.Kvaerno5`][]. Default:
-        [`diffrax.Dopri8`][]. With `dt0` its steps are fixed.
+    - `solver`, `dt0`: any diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and
+        its fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
     - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
         component of all `y0s`.
 

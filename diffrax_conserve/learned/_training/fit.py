@@ -11,7 +11,7 @@ import equinox as eqx
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks.flow_map import restored
+from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
 from .checks import check_types, checked
@@ -140,7 +140,9 @@ def fit(
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)
     trained, log = _train_flow_map(loop, network, state)
-    return restored(trained.flow_map if isinstance(trained, OfPairs) else trained, model), log
+    trained: Any = trained.flow_map if isinstance(trained, OfPairs) else trained
+    # A function is its own weights.
+    return trained if isinstance(model, AbstractFlowMap) else trained.weights(), log
 
 
 def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
