@@ -63,10 +63,8 @@ class FitState(eqx.Module):
             raise ValueError("`state` is that of a training of another kind of network.")
         if self.done >= epochs or (self.finished and len(self.networks) > 1):
             raise ValueError(
-                f"The training whose `state` was given has made all its {self.done} epochs, and "
-                f"the recipe has {epochs}. Give one with more, such as "
-                "`dataclasses.replace(recipe, epochs=...)`; a `PINN` of several windows cannot go "
-                "on."
+                f"The training of `state` has made all its {self.done} epochs. Give a recipe with "
+                "more: `dataclasses.replace(recipe, epochs=...)`; several windows cannot go on."
             )
         losses = self.carry.losses[:epochs]
         losses = jnp.concatenate([losses, jnp.full(epochs - losses.size, jnp.nan, losses.dtype)])
@@ -74,8 +72,8 @@ class FitState(eqx.Module):
 
 
 def fingerprint(given: Any, recipe: Any) -> str:
-    """A hash of the arrays in what was given to `fit` and of the recipe as it prints, which
-    identifies a training. It may be continued with more epochs."""
+    """A hash of the arrays that were given to `fit` and of the recipe as it prints, up to its
+    epochs, which identifies a training."""
     digest = hashlib.sha256()
     for leaf in jtu.tree_leaves(eqx.filter(given, eqx.is_array)):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -104,10 +102,7 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
         try:
             header = json.loads(file.readline())
             if (header["format"], header["mark"]) != (_FORMAT, mark):
-                raise ValueError(
-                    "it is of another training, whose network, key or recipe differs. Give the "
-                    "same arguments, or another file"
-                )
+                raise ValueError("it is of another training, with other arguments")
             count, losses, checked, epochs = header["sizes"]
             like = dataclasses.replace(
                 like,
