@@ -113,7 +113,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 
 COSTS := core overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
   random_features
-TRAININGS := zoo paper zoo_curve pool learning_from_data equal_cost silent_failures chemistry worth \
+TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
   parameters defaults
 STUDIES := max_correction claims long_run refusals
 

@@ -44,6 +44,12 @@ def oscillator(t, y, args):
     return jnp.stack([y[1], -y[0]])
 
 
+def in_single(network):
+    """Evaluated in single precision."""
+    core = jax.tree.map(lambda x: x.astype(jnp.float32), network.core)
+    return eqx.tree_at(lambda m: m.core, network, core)
+
+
 RADIUS = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
 EAST = jnp.array([1.0, 0.0])
 
@@ -59,9 +65,6 @@ class Still(eqx.Module):
 
     def __call__(self, y0, h):
         return jax.tree.map(lambda x: x + 0 * h, y0)
-
-
-SWEEPS = {"picard": unchecked(Still()).sweep, "newton": dfc.learned.NewtonSweep()}
 
 
 class Within(eqx.Module):

@@ -306,25 +306,6 @@ def report_unsolved_equations_as_a_success(package):
     package.function("_newton", mutate)
 
 
-@noticed_by("tests/training/test_pool.py", "-k", "defect_is_large")
-def follow_the_network_wherever_it_goes(package):
-    def mutate(moved):
-        def mutated(pool, model, args, squares, *rest):
-            return moved(pool, model, args, lambda points: 0 * squares(points), *rest)
-
-        return mutated
-
-    package.function("moved", mutate)
-
-
-@noticed_by("tests/training/test_pool.py", "-k", "compared_on_the_same")
-def judge_the_best_model_on_the_states_of_its_time(package):
-    def compared(problem, carry):
-        return problem.criterion(carry.weights, carry.points), carry.best
-
-    package.function("_compared", lambda _: compared)
-
-
 # ---- How they are planted and noticed ----
 
 

@@ -38,7 +38,6 @@ def trained(name, table):
 
 
 TABLES = {
-    "pool": ("training", lambda: lines_of("pool", "OUT")),
     "learning from data": ("learning-from-data", lambda: lines_of("learning_from_data", "OUT")),
     "long run": ("performance", lambda: lines_of("long_run", "RESULTS")),
     "worth": ("../zoo", lambda: lines_of("worth", "RESULTS")),
@@ -87,7 +86,6 @@ SMOKE = {
         and flow_map["errors"]["RK4"]["one_step_rms"] < flow_map["errors"]["plain"]["one_step_rms"]
     ),
     "zoo_curve": lambda point: 0 < point["one_step_rms"] < 1,
-    "pool": lambda sample, grown: grown["outside"] < sample["outside"],
     "paper": lambda standard, conservative: (
         standard["plain"]["drift"] > 1e-6
         and all(x["projected"]["drift"] < 1e-14 for x in (standard, conservative))

@@ -195,7 +195,7 @@ def polynomials(count, names):
     wide = count + -(-count // 2)
     legendre = np.eye(80, wide) * np.sqrt(2 * np.arange(80) + 1)[:, None]
     bases = {
-        "features": feature_basis(count, 0),
+        "features": feature_basis(count),
         "polynomials": tabulate(count, legendre),
     }
     rows = []

@@ -26,7 +26,6 @@ import measuring
 import numpy as np
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._solvers.sweeps import Picard
 
 OUT = Path(__file__).parent.parent / "results" / "sweeps.json"
 FLOW_MAPS = ("conservative-lorenz", "double-pendulum", "point-vortices")
@@ -42,15 +41,12 @@ class Size:
     states: int = 100
     steps: int = 20
     repeats: int = 5
-    picard: tuple[int, ...] = (0, 1, 2, 3, 4, 6, 8)
-    newton: tuple[int, ...] = (1, 2, 3)
+    sweeps: tuple[int, ...] = (0, 1, 2, 3, 4, 6, 8)
     pieces: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 128)
     classical: tuple[str, ...] = tuple(CLASSICAL)
 
 
-SMOKE = Size(
-    states=1, steps=4, repeats=2, picard=(0, 2), newton=(), pieces=(1, 4), classical=("RK4",)
-)
+SMOKE = Size(states=1, steps=4, repeats=2, sweeps=(0, 2), pieces=(1, 4), classical=("RK4",))
 
 
 def system_of(network):
@@ -156,21 +152,18 @@ def sweeps(name, size):
     h, y0s = jnp.asarray(network.max_step), states_of(system, size.states)
     expected = exact(system, h, y0s)
     rows, classical = [], {}
-    kinds = {"picard": Picard(), "newton": dfc.learned.NewtonSweep()}
-    for sweep, numbers in (("picard", size.picard), ("newton", size.newton)):
-        for k in numbers:
-            solver = dfc.DeepONetSolver(network, corrections=k, sweep=kinds[sweep])
-            y1s, estimates = one_step(solver, system, h, y0s)
-            batch, alone = Solve.both(solver, system, y0s, size)
-            row = {
-                "sweep": sweep if k else None,
-                "corrections": k,
-                "error": float(jnp.median(norms(y1s - expected))),
-                "estimate": float(jnp.median(norms(estimates))),
-                "us": batch.us(h, size),
-                "us_alone": alone.us(h, size),
-            }
-            rows.append(row)
+    for k in size.sweeps:
+        solver = dfc.DeepONetSolver(network, corrections=k)
+        y1s, estimates = one_step(solver, system, h, y0s)
+        batch, alone = Solve.both(solver, system, y0s, size)
+        row = {
+            "corrections": k,
+            "error": float(jnp.median(norms(y1s - expected))),
+            "estimate": float(jnp.median(norms(estimates))),
+            "us": batch.us(h, size),
+            "us_alone": alone.us(h, size),
+        }
+        rows.append(row)
     for label in size.classical:
         solver = CLASSICAL[label]
         batch, alone = Solve.both(solver, system, y0s, size, size.pieces)
@@ -226,7 +219,7 @@ def show_sweeps(name, found):
         return "-" if error is None else f"{error:.1e}"
 
     for row in found["rows"]:
-        label = f"{row['corrections']} {row['sweep'].title()}" if row["sweep"] else "none"
+        label = row["corrections"] or "none"
         others = [f"{text(row[f'{x}, us'])} / {text(row[f'{x}, us_alone'])}" for x in labels]
         times = f"{row['us']:.3g} / {row['us_alone']:.3g}"
         print(f"| {label} | {row['error']:.1e} | {times} | " + " | ".join(others) + " |")

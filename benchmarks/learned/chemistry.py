@@ -125,7 +125,9 @@ def train(data, spec):
     network = dfc.learned.Transformed(inner, BOXCOX)
     network, log = dfc.fit(network, data=data, recipe=recipe, key=jr.key(2), progress=True)
     wide = lambda x: x.astype(float) if eqx.is_inexact_array(x) else x  # noqa: E731
-    return dfc.learned.single_precision(jax.tree.map(wide, network)), log
+    # The network alone stays in single precision.
+    single = network.flow_map.core
+    return eqx.tree_at(lambda m: m.flow_map.core, jax.tree.map(wide, network), single), log
 
 
 def relative(found, exact):

@@ -173,7 +173,8 @@ def around(errors, error):
 def measure(name, epochs, batches, count, seconds):
     field = field_of(FORCES[name])
     network, log = train(field, epochs)
-    network = dfc.learned.single_precision(network)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), network.core)
+    network = eqx.tree_at(lambda m: m.core, network, single)
     y0s = jax.vmap(sample)(jr.split(jr.key(9), count))
     exact = jax.jit(jax.vmap(in_pieces(piece_of(dfx.Dopri8(), field), 20)))(y0s)
     steps = {("learned", 1): lambda y: network(y, jnp.asarray(STEP))}

@@ -254,13 +254,18 @@ def train_flow_map(system, spec, seed, key):
     if spec.extremes is not None:
         network = reaching(network, spec.extremes())
     if spec.single:
-        network = dfc.learned.single_precision(network)
+        single = jax.tree.map(lambda x: x.astype(jnp.float32), network.core)
+        network = eqx.tree_at(lambda m: m.core, network, single)
     return network if spec.repeats == 1 else dfc.learned.Repeated(network, spec.repeats), log
 
 
 def reaching(network, states):
     """The same network, with these states in its domain."""
-    return eqx.tree_at(lambda m: m.domain, network, network.domain.extended(states))
+    seen = jax.vmap(lambda y: network.frame(y)[0])(states)
+    corners = lambda m: (m.domain.box.lower[0], m.domain.box.upper[0])  # noqa: E731
+    lower, upper = corners(network)
+    wider = jnp.minimum(lower, seen.min(axis=0)), jnp.maximum(upper, seen.max(axis=0))
+    return eqx.tree_at(corners, network, wider)
 
 
 def scaled(network, system):
@@ -430,7 +435,7 @@ def measure(name, seed, *, specs=SPECS, steps=None, states=1000):
         "seed": seed,
         "weights": sum(x.size for x in jax.tree.leaves(weights_of(network))),
         "epochs": len(log.losses) + (spec.epochs if spec.polish else 0),
-        "best_loss": trained.number(log.best),
+        "best_loss": trained.number(log.criteria.min()),
         "skipped_updates": log.skipped,
         "seconds": round(seconds, 1),
         "cpu_seconds": round(cpu_seconds, 1),

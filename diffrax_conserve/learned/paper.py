@@ -46,10 +46,9 @@ def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) 
     From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
     map 5,000 pairs of an initial state and a time and the projection schedule.
 
-    Changed: a PINN is projected from the first epoch on; the weight of the last iteration rises
-    within each stage; the loss of a flow map is bounded at each point, so that a few states which
-    change too fast for the network do not dominate; gradients are clipped. "The paper, reproduced"
-    gives the reason and the effect of each.
+    Changed, as "The paper, reproduced" explains: a PINN is projected from the first epoch on; the
+    weight of the last iteration rises within each stage; the loss of a flow map is bounded at each
+    point; gradients are clipped.
 
     **Arguments:**
 

@@ -10,6 +10,8 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from ..learned import Still
+
 BOX = dfc.learned.Box(
     {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
 )
@@ -111,6 +113,10 @@ def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
         jax.block_until_ready(dfx.diffeqsolve(other, solver, 0.0, 1.0, 0.5, Y0, ARGS).ys)
 
 
+class Unbounded(Still):
+    args_domain: float = 1.0
+
+
 LAYER = dfc.learned.ConservativeLayer(dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)))
 OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)
 
@@ -119,7 +125,7 @@ OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)
     ("make", "match"),
     [
         (lambda: family(args_domain=(0, 1)), "args_domain"),
-        (lambda: dfc.learned.FlowMap(spring, 0.5, args_domain=1.0), "args_domain"),
+        (lambda: dfc.DeepONetSolver(Unbounded()), "args_domain"),
         (lambda: family()(Y0, 0.1), r"called as `\(y0, args, h\)`"),
         (lambda: family(args_domain=None)(Y0, ARGS, 0.1), r"called as `\(y0, h\)`"),
         (lambda: family()(Y0, jnp.ones(3), 0.1), "takes `args` of the structure"),
@@ -127,7 +133,6 @@ OWN_ARGS = dfc.learned.Taylor(spring, args=ARGS)
         (lambda: family(layer=LAYER), "cannot have a `layer`"),
         (lambda: family(taylor=OWN_ARGS), "`taylor` has `args` of its own"),
         (lambda: fit(args=ARGS), "draws them from its `args_domain`"),
-        (lambda: fit(sample=dfc.learned.Pool(sample)), "`Pool` is for a flow map of one vector"),
     ],
 )
 def test_mistakes_are_named(make, match):

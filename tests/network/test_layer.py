@@ -126,7 +126,7 @@ def test_a_conservative_network_is_its_candidate_moved():
     plain, y0 = flow_map(), LORENZ.y0
     conservative = eqx.filter_jit(flow_map(layer=layer))
     values = layer.values(0.0, y0)
-    expected = moved(layer, plain(y0, 0.2), values, plain.radius())
+    expected = moved(layer, plain(y0, 0.2), values, plain.scale)
     np.testing.assert_allclose(conservative(y0, 0.2), expected, rtol=1e-14)
     assert residual(layer, conservative(y0, 0.2), values) < 1e-14
     np.testing.assert_allclose(conservative(y0, 0.0), y0, rtol=0, atol=1e-15)

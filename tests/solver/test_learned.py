@@ -184,7 +184,7 @@ STILL = dfx.ODETerm(lambda t, y, args: y), FOLLOW, 0.0, 1.0, 0.25
         (
             lambda: dfx.diffeqsolve(*STILL, (LORENZ.y0, LORENZ.y0)),
             ValueError,
-            "Both must be the same",
+            "but the state has",
         ),
     ],
 )

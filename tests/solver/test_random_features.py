@@ -250,5 +250,3 @@ def test_problems_that_are_refused():
         solve(lambda t, y, args: 1j * y, jnp.array(1.0 + 0j), 1.0, dt0=0.1)
     with pytest.raises(ValueError, match="`features` must be an integer from 3 to 32"):
         dfc.RandomFeatureSolver(33)
-    with pytest.raises(ValueError, match="`seed` must be an integer"):
-        dfc.RandomFeatureSolver(seed=-1)

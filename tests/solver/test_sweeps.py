@@ -10,11 +10,10 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import DRIVEN0, LORENZ, SWEEPS, Still, driven, flow_map, states, unchecked
+from ..learned import DRIVEN0, LORENZ, Still, driven, flow_map, states, unchecked
 
 TERM, DRIVEN = dfx.ODETerm(LORENZ.vector_field), dfx.ODETerm(driven)
 SHIPPED = dfc.load_pretrained("conservative-lorenz-standard")
-NEWTON = SWEEPS["newton"]
 
 
 @eqx.filter_jit
@@ -42,27 +41,19 @@ def errors(**options):
     return jnp.median(jnp.linalg.norm(ys - jax.vmap(lambda y0: exact(TERM, y0))(y0s), axis=1))
 
 
-def test_each_picard_sweep_gains_a_digit():
+def test_each_sweep_gains_a_digit():
     found = [errors(corrections=k) for k in (0, 1, 4, 8)]
     assert found[0] > 5 * found[1] > 5e3 * found[2] > 5e7 * found[3]
     assert found[3] < 1e-12
 
 
-def test_newton_squares_the_error():
-    found = [errors(corrections=k, sweep=NEWTON) for k in (0, 1, 2)]
-    assert found[0] > 1e-4
-    assert found[1] < found[0] ** 2
-    assert found[2] < 1e-13
-
-
-@pytest.mark.parametrize(("sweep", "corrections", "order"), [("picard", 3, 3), ("newton", 1, 2)])
-def test_sweeps_of_a_flow_map_that_knows_nothing_have_their_order(sweep, corrections, order):
-    solver = unchecked(Still(), corrections=corrections, sweep=SWEEPS[sweep])
-    assert solver.order(DRIVEN) == order
+def test_sweeps_of_a_flow_map_that_knows_nothing_have_their_order():
+    solver = unchecked(Still(), corrections=3)
+    assert solver.order(DRIVEN) == 3
     options = dict(t0=0.2, t1=1.8, dt0=0.2, args=2.0)
     dct.assert_order(solver, DRIVEN, DRIVEN0, **options)
     with pytest.raises(AssertionError, match="measured order"):
-        dct.assert_order(solver, DRIVEN, DRIVEN0, **options, order=order + 0.7)
+        dct.assert_order(solver, DRIVEN, DRIVEN0, **options, order=3.7)
 
 
 def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
@@ -73,25 +64,21 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Fourth()).order(TERM) == 4
     assert unchecked(Fourth(), corrections=3).order(TERM) == 7
     assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
-    assert unchecked(Fourth(), corrections=1, sweep=NEWTON).order(TERM) == 10
 
 
-def test_both_sweeps_solve_the_same_equations():
+def test_sweeps_converge_to_the_same_path():
     """Whatever the flow map."""
 
-    def end(flow_map, corrections, sweep):
-        solver = unchecked(flow_map, nodes=6, corrections=corrections, sweep=SWEEPS[sweep])
-        return step(solver, LORENZ.y0, 0.1)[0]
+    def end(flow_map):
+        return step(unchecked(flow_map, nodes=6, corrections=14), LORENZ.y0, 0.1)[0]
 
-    many = end(flow_map(), 13, "picard")
-    np.testing.assert_allclose(many, end(flow_map(), 4, "newton"), rtol=0, atol=1e-13)
-    np.testing.assert_allclose(many, end(Still(), 4, "newton"), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(end(flow_map()), end(Still()), rtol=0, atol=1e-13)
 
 
 def test_dense_output_goes_through_the_corrected_path():
     ts = jnp.array([0.07, 0.4, 0.93])
     reference = LORENZ.reference(ts)
-    solver = unchecked(SHIPPED, corrections=2, sweep=NEWTON)
+    solver = unchecked(SHIPPED, corrections=8)
     saveat = dfx.SaveAt(ts=ts, dense=True)
     sol = eqx.filter_jit(dfx.diffeqsolve)(TERM, solver, 0.0, 1.0, 0.25, LORENZ.y0, saveat=saveat)
     np.testing.assert_allclose(sol.ys, reference, rtol=0, atol=1e-9)
@@ -112,7 +99,7 @@ def test_derivatives():
     term = dfx.ODETerm(lambda t, y, args: args * LORENZ.vector_field(t, y, None))
 
     def f(weights, y0, args):
-        solver = unchecked(Sine(weights), nodes=4, corrections=1, sweep=NEWTON)
+        solver = unchecked(Sine(weights), nodes=4, corrections=2)
         return step(solver, y0, term=term, args=args)[0]
 
     dct.assert_gradients(f, jnp.array([0.3, -1.0, 0.5]), LORENZ.y0, jnp.array(0.9), rtol=1e-6)
@@ -123,16 +110,10 @@ def test_a_complex_state():
     y0 = jnp.array([1.0 + 0.5j])
     y1, _ = step(unchecked(Still(), corrections=14), y0, 0.5, term=term)
     np.testing.assert_allclose(y1, y0 * np.exp(0.5j), rtol=1e-14)
-    newton = unchecked(Still(), corrections=1, sweep=NEWTON)
-    with pytest.raises(TypeError, match="`NewtonSweep` needs a real state"):
-        step(newton, y0, 0.5, term=term)
 
 
-@pytest.mark.parametrize("sweep", SWEEPS)
-def test_it_is_the_change_by_the_last_sweep(sweep):
-    (y1, first), (y2, second) = (
-        step(unchecked(SHIPPED, corrections=k, sweep=SWEEPS[sweep]), LORENZ.y0) for k in (1, 2)
-    )
+def test_it_is_the_change_by_the_last_sweep():
+    (y1, first), (y2, second) = (step(unchecked(SHIPPED, corrections=k), LORENZ.y0) for k in (1, 2))
     np.testing.assert_allclose(second, y2 - y1, rtol=0, atol=1e-15)
     np.testing.assert_allclose(first, y1 - SHIPPED(LORENZ.y0, 0.25), rtol=0, atol=1e-15)
 
@@ -188,12 +169,10 @@ def test_it_knows_how_the_vector_field_passes_an_error_on(rate):
     assert not 0.6 < (run(1)[0] - y1) / error < 1.6
 
 
-@pytest.mark.parametrize(("order", "sweep", "corrections"), [(2, "picard", 0), (0, "newton", 2)])
-def test_it_falls_with_the_step_as_claimed(order, sweep, corrections):
+@pytest.mark.parametrize(("order", "corrections"), [(2, 0), (0, 2)])
+def test_it_falls_with_the_step_as_claimed(order, corrections):
     network, options = Wrong(-1.0, order, 0.5), dict(term=LINEAR, args=jnp.array(-1.0))
-    if sweep == "newton":  # which is exact for what is linear
-        options = dict(term=dfx.ODETerm(lambda t, y, args: -y + 0.3 * y**2))
-    solver = unchecked(network, corrections=corrections, sweep=SWEEPS[sweep], nodes=8)
+    solver = unchecked(network, corrections=corrections, nodes=8)
     steps = jnp.array([0.02, 0.04])
     small, large = jax.vmap(lambda h: step(solver, jnp.array(1.0), h, **options)[1])(steps)
     slope = jnp.log2(jnp.abs(large / small))

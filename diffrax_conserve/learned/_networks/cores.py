@@ -38,7 +38,7 @@ def find_activation(activation: str | Activation) -> Activation:
 
 @final
 class MLP(eqx.Module):
-    """`depth` hidden layers of `width` units between `in_size` inputs and `out_size` outputs.
+    """`depth` hidden layers of `width` units.
 
     By hand, because with `equinox.nn.MLP` the gradient of the loss takes 6 to 26 % longer (width
     40, depth 4, 500 points), and products in float32 on a GPU have three digits.
@@ -107,7 +107,6 @@ def _spread(
 
 
 def check_sizes(**sizes: int) -> None:
-    """Raises unless every size is a positive integer."""
     for name, size in sizes.items():
         if not isinstance(size, int) or size < 1:
             raise ValueError(f"`{name}` must be a positive integer, but is {size!r}.")

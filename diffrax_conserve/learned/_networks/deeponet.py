@@ -32,11 +32,6 @@ class DeepONet(AbstractFlowMap):
     manifold of the conserved values at $u_0$. With a `frame` it commutes with the symmetries of the
     equations: see [`diffrax_conserve.learned.Frame`][].
 
-    The `core` $N$ is one fully connected network of the state and the step,
-    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
-    feeds the input into each of its layers; or as in the literature, and less accurate at the same
-    size, [`diffrax_conserve.learned.Product`][].
-
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
     !!! example
@@ -46,8 +41,7 @@ class DeepONet(AbstractFlowMap):
         import jax
 
         system = dfc.systems.get("conservative-lorenz")
-        keys = jax.random.split(jax.random.key(0), 100)
-        states = jax.vmap(system.sample)(keys)
+        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
         deeponet = dfc.DeepONet(states, 0.25, key=jax.random.key(1))
         deeponet(system.y0, 0.1)
         ```
@@ -63,7 +57,6 @@ class DeepONet(AbstractFlowMap):
     max_step: float = eqx.field(static=True)
     shift: Float[Array, " k"]
     scale: Float[Array, " k"]
-    normalise: bool = eqx.field(static=True)
     taylor: Taylor | None
     domain: Box | FramedBox
     args_domain: Box | None
@@ -79,18 +72,26 @@ class DeepONet(AbstractFlowMap):
         latent: int = 20,
         core: type[AbstractCore] = Concatenated,
         activation: str | Activation = "tanh",
-        normalise: bool = True,
         taylor: Taylor | None = None,
         frame: MakeFrame | None = None,
         layer: ConservativeLayer | None = None,
         args_domain: Box | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
-        _check_parts(layer, frame, taylor, checked_box(args_domain))
+        if layer is not None and (frame is not None or checked_box(args_domain) is not None):
+            raise ValueError(
+                "A flow map with a `frame` or an `args_domain` cannot have a `layer`. Wrap its "
+                "solver in `diffrax_conserve.ManifoldProjection` instead."
+            )
+        if checked_box(args_domain) is not None and taylor is not None and taylor.args is not None:
+            raise ValueError(
+                "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
+                "`Taylor(vector_field, order)`."
+            )
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
-                f"`core` is {core!r}, but it must be a class, such as "
-                "`diffrax_conserve.learned.Product`, `Concatenated` or `Gated`."
+                f"`core` is {core!r}, but it must be `diffrax_conserve.learned.Concatenated`, "
+                "`Gated` or `Product`."
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
@@ -104,38 +105,25 @@ class DeepONet(AbstractFlowMap):
             frames = jax.vmap(lambda y: frame_at(frame, y))(states)
             self.domain = FramedBox.around(frame, states)
             seen, m = frames.inputs, frames.basis.shape[-1]
-        n = seen.shape[1]
         sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core(n + known, m, sizes, dtype, key)
+        self.core = core(seen.shape[1] + known, m, sizes, dtype, key)
         self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
-        self.max_step, self.normalise = float(max_step), normalise
-        self.shift, self.scale = jnp.zeros(n, dtype), jnp.ones(n, dtype)
-        if normalise:
-            deviation = jnp.std(seen, axis=0)
-            self.shift = jnp.mean(seen, axis=0)
-            self.scale = jnp.where(deviation > 0, deviation, 1)
+        self.max_step, deviation = float(max_step), jnp.std(seen, axis=0)
+        self.shift, self.scale = jnp.mean(seen, axis=0), jnp.where(deviation > 0, deviation, 1)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state at time `h` after the state `y0`.
-
-        Called as `(y0, h)`, or with an `args_domain` as `(y0, args, h)`.
-        """
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
-            raise TypeError(
-                f"This `DeepONet` is called as `{expected}`, but was given {len(step) + 1} "
-                "arguments."
-            )
+            raise TypeError(f"This `DeepONet` is called as `{expected}`.")
         candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate
-        h = step[-1]
         values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
-        return self.layer(candidate, values, h, self.radius(), schedule)
+        return self.layer(candidate, values, step[-1], self.scale, schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
-        """The output before the conservative layer."""
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
@@ -144,43 +132,36 @@ class DeepONet(AbstractFlowMap):
                 f"{start.size}."
             )
         h = jnp.asarray(h).astype(start.dtype)
-        known = self._known(args, start.dtype)
+        known = self._known(args)
         if isinstance(self.domain, Box):
             fraction = h / self.max_step
-            learned = self.scale * self._network(start, known, h, fraction)
+            learned = self.scale * self._network(start, known, fraction)
         else:
             frame = self.domain.frame(y0)
             own = (h * frame.clock).astype(start.dtype)
             fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
             inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
-            learned = basis @ self._network(inputs, known, own, fraction)
+            learned = basis @ self._network(inputs, known, fraction)
         if self.taylor is not None:
             taylor = dataclasses.replace(self.taylor, args=args[0]) if args else self.taylor
             start = flatten(taylor(y0, h)).astype(start.dtype)
         return unflatten(start + fraction ** (self.order + 1) * learned, y0)
 
-    def _known(self, args: list[Args], dtype: Any) -> Float[Array, " p"]:
+    def _known(self, args: list[Args]) -> Float[Array, " p"]:
         """The `args` as inputs of the network."""
         if self.args_domain is None:
-            return jnp.zeros(0, dtype)
-        found = checked_args(self.args_domain, args[0])
-        return flatten(self.args_domain.centred(found) if self.normalise else found).astype(dtype)
+            return jnp.zeros(0, self.scale.dtype)
+        found = self.args_domain.centred(checked_args(self.args_domain, args[0]))
+        return flatten(found).astype(self.scale.dtype)
 
-    def _network(
-        self,
-        inputs: Float[Array, " k"],
-        known: Float[Array, " p"],
-        step: Float[Array, ""],
-        fraction: Float[Array, ""],
-    ) -> Float[Array, " m"]:
+    def _network(self, inputs: Array, known: Array, fraction: Array) -> Array:
         inputs = jnp.concatenate([(inputs - self.shift) / self.scale, known])
-        time = 2 * fraction - 1 if self.normalise else step
+        time = 2 * fraction - 1
         output = self.core(inputs.astype(self.precision), time.astype(self.precision))
         return output.astype(inputs.dtype)
 
     @property
     def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The order of the Taylor polynomial."""
         return 0 if self.taylor is None else self.taylor.order
 
     @property
@@ -195,7 +176,6 @@ class DeepONet(AbstractFlowMap):
 
     @property
     def frame(self) -> MakeFrame | None:
-        """The function that finds the frame of a state, or `None`."""
         return None if isinstance(self.domain, Box) else self.domain.make
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -211,53 +191,32 @@ class DeepONet(AbstractFlowMap):
         net = self.core.output_layer()
         return net.weights[-1], net.biases[-1]
 
-    def radius(self) -> Float[Array, ""]:
-        """The largest distance by which the conservative layer may move a state in one
-        iteration."""
-        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
-
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 - `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
-    Their mean and standard deviation normalise the inputs, and the box around them is the `domain`
-    of the flow map.
+    $N$ gets $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to
+    $[-1, 1]$. The box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `latent`: the number $L$ of products in each component, for a `Product`.
-- `core`: the architecture of the network, one of the three classes above.
+- `core`: $N$, one fully connected network of the state and the step,
+    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
+    feeds the input into each of its layers; or as in the literature, and less accurate at the same
+    size, [`diffrax_conserve.learned.Product`][].
+- `latent`: the number $L$ of products in each component of a `Product`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
-- `normalise`: whether the network gets $(u_0 - m)/S$, with the mean $m$ and the standard deviation
-    $S$ of `states`, and $h$ scaled to $[-1, 1]$. Otherwise it gets $u_0$ and $h$, and $S = 1$.
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
-- `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][]. The network then
-    gets the inputs of the frame, to which `normalise` applies; the domain consists of all states
-    whose inputs are in the box around those of `states` and whose clock is not faster than theirs.
+- `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][], whose inputs $N$
+    then gets. The domain consists of all states whose inputs are in the box around those of
+    `states` and whose clock is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 - `args_domain`: the smallest and the largest `args` of the vector field, as a
-    [`diffrax_conserve.learned.Box`][]. The network takes `args` as inputs, and so does the
-    polynomial of `taylor`. Default: a network for fixed `args`.
+    [`diffrax_conserve.learned.Box`][]. The network and its polynomial then take `args` as inputs.
 
 **Raises:**
 
 `ValueError` or `TypeError` if a size, the step, the states, the frame or `args_domain` is invalid,
 or if a layer is combined with a frame or an `args_domain`.
 """
-
-
-def _check_parts(
-    layer: ConservativeLayer | None, frame: Any, taylor: Taylor | None, domain: Box | None
-) -> None:
-    if layer is not None and (frame is not None or domain is not None):
-        raise ValueError(
-            "A flow map with a `frame` or an `args_domain` cannot have a `layer`, whose largest "
-            "correction is in the units of a whole state, and whose manifold has its own `args`. "
-            "Leave it out, and wrap the solver in `diffrax_conserve.ManifoldProjection`."
-        )
-    if domain is not None and taylor is not None and taylor.args is not None:
-        raise ValueError(
-            "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
-            "`Taylor(vector_field, order)`."
-        )

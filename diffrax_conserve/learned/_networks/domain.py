@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import RealScalarLike, Y
+from ..._tree import tree_shapes
 from .flat import as_state, as_states, flatten
 
 
@@ -18,9 +19,7 @@ from .flat import as_state, as_states, flatten
 class Box(eqx.Module):
     r"""The states between two corners, $l \le y \le u$ in every component.
 
-    As the `domain` of a flow map it can be replaced by any Module with a method `contains(y)`. The
-    option `outside` of [`diffrax_conserve.DeepONetSolver`][] determines what happens to a step that
-    starts outside it.
+    As the `domain` of a flow map it can be replaced by any Module with a method `contains(y)`.
 
     !!! example
 
@@ -40,12 +39,11 @@ class Box(eqx.Module):
     upper: PyTree[Real[Array, "..."]] = eqx.field(converter=as_state)
 
     def __check_init__(self):
-        lower, upper = jtu.tree_structure(self.lower), jtu.tree_structure(self.upper)
-        shapes = [[jnp.shape(x) for x in jtu.tree_leaves(t)] for t in (self.lower, self.upper)]
-        if lower != upper or shapes[0] != shapes[1]:
+        lower, upper = tree_shapes(self.lower), tree_shapes(self.upper)
+        if lower != upper:
             raise ValueError(
-                f"`lower` has the structure {lower} with shapes {shapes[0]}, but `upper` has "
-                f"{upper} with {shapes[1]}. Both must be those of a state."
+                f"`lower` has the structure {lower}, but `upper` has {upper}. Both must be those "
+                "of a state."
             )
 
     @classmethod
@@ -55,24 +53,13 @@ class Box(eqx.Module):
         lower = jtu.tree_map(lambda x: jnp.min(x, axis=0), states)
         return cls(lower, jtu.tree_map(lambda x: jnp.max(x, axis=0), states))
 
-    def extended(self, states: Y) -> "Box":
-        """The smallest box around this one and `states`, which are stacked along a leading axis."""
-        other = Box.around(states)
-        larger = lambda x, y: jnp.maximum(x, y.astype(x.dtype))  # noqa: E731
-        smaller = lambda x, y: jnp.minimum(x, y.astype(x.dtype))  # noqa: E731
-        lower = jtu.tree_map(smaller, self.lower, other.lower)
-        return Box(lower, jtu.tree_map(larger, self.upper, other.upper))
-
     def contains(self, y: Y) -> Bool[Array, ""]:
         """Whether `y` is in the box, its boundary included. NaN is not."""
-        if jtu.tree_structure(y) != jtu.tree_structure(self.lower):
-            raise ValueError(
-                f"The box is for states of the structure {jtu.tree_structure(self.lower)}, but was "
-                f"given one of {jtu.tree_structure(y)}."
-            )
-        inside = jtu.tree_map(
-            lambda x, a, b: jnp.all((a <= x) & (x <= b)), y, self.lower, self.upper
-        )
+        wanted, got = jtu.tree_structure(self.lower), jtu.tree_structure(y)
+        if got != wanted:
+            raise ValueError(f"The box is for states of the structure {wanted}, not {got}.")
+        within = lambda x, a, b: jnp.all((a <= x) & (x <= b))  # noqa: E731
+        inside = jtu.tree_map(within, y, self.lower, self.upper)
         return jnp.all(jnp.stack(jtu.tree_leaves(inside)))
 
     def sample(self, key: PRNGKeyArray) -> Y:
@@ -83,11 +70,8 @@ class Box(eqx.Module):
 
     def centred(self, y: Y) -> Y:
         """`y`, shifted and scaled such that the box is [-1, 1] in every component."""
-
-        def leaf(x: Array, a: Array, b: Array) -> Array:
-            return (2 * x - a - b) / jnp.where(b > a, b - a, 1)
-
-        return jtu.tree_map(leaf, y, self.lower, self.upper)
+        unit = lambda x, a, b: (2 * x - a - b) / jnp.where(b > a, b - a, 1)  # noqa: E731
+        return jtu.tree_map(unit, y, self.lower, self.upper)
 
 
 Box.__init__.__doc__ = """**Arguments:**
@@ -105,9 +89,9 @@ class Frame(eqx.Module):
     r"""The representation of a state in a moving frame.
 
     Symmetries such as rotations, permutations or changes of scale map solutions to solutions. With
-    a *frame*, a function of one state that returns `inputs`, `basis` and `clock`, a
-    [`diffrax_conserve.DeepONet`][] learns $m$ functions of $k + 1$ numbers, the inputs and the own
-    time $\tau$ = `clock` $h$, instead of $n$ functions of $n + 1$ numbers:
+    a function from a state to its frame, a [`diffrax_conserve.DeepONet`][] learns $m$ functions of
+    the $k$ `inputs` and the own time $\tau$ = `clock` $h$, instead of $n$ functions of $n + 1$
+    numbers:
 
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
@@ -147,8 +131,7 @@ class Frame(eqx.Module):
     clock: RealScalarLike = 1.0
 
     def measure(self, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Converts a rate of change of the state to coefficients of the columns of `basis`, per
-        unit of the frame's own time."""
+        """A rate of change of the state in the columns of `basis`, per unit of the own time."""
         gram = self.basis.T @ self.basis
         return jnp.linalg.solve(gram, self.basis.T @ rate) / self.clock
 
@@ -168,37 +151,26 @@ MakeFrame = Callable[[Any], Any]
 
 
 def frame_at(make: MakeFrame, y: Y) -> Frame:
-    """The frame of `y`."""
     made = make(y)
+    if not isinstance(made, Frame | tuple):
+        raise TypeError("`frame` must return a `diffrax_conserve.learned.Frame`.")
     return made if isinstance(made, Frame) else Frame(*made)
 
 
 def check_frame(make: Any, y: Y) -> None:
     """Raises unless `make` is a function from states like `y` to a `Frame` of the right shapes."""
-    if not callable(make):
-        raise TypeError(f"`frame` is {make!r}, not a function from a state to a `Frame`.")
-    made = eqx.filter_eval_shape(make, y)
-    if not (isinstance(made, Frame) or (isinstance(made, tuple) and len(made) == 3)):
-        raise TypeError(
-            f"`frame` returns a {type(made).__name__}, but must return a "
-            "`diffrax_conserve.learned.Frame`, or a tuple `(inputs, basis, clock)`."
-        )
-    inputs, basis = (made.inputs, made.basis) if isinstance(made, Frame) else made[:2]
-    n = eqx.filter_eval_shape(flatten, y).size
-    shapes = inputs.shape, basis.shape
-    if len(shapes[0]) != 1 or len(shapes[1]) != 2 or shapes[1][0] != n:
+    frame, n = eqx.filter_eval_shape(frame_at, make, y), eqx.filter_eval_shape(flatten, y).size
+    inputs, basis = frame.inputs.shape, frame.basis.shape
+    if len(inputs) != 1 or len(basis) != 2 or basis[0] != n:
         raise ValueError(
-            f"`frame` returns inputs of shape {shapes[0]} and a basis of shape {shapes[1]}, but "
-            f"for states of {n} numbers they must have the shapes `(k,)` and `({n}, m)`."
+            f"`frame` returns inputs of shape {inputs} and a basis of shape {basis}, but for "
+            f"states of {n} numbers they must have the shapes `(k,)` and `({n}, m)`."
         )
 
 
 @final
 class FramedBox(eqx.Module):
-    """The states whose frames resemble those of the states with which a flow map was built.
-
-    The inputs of the frame are in a box, and its clock is at most the largest one.
-    """
+    """The states whose frames have inputs in a box, and a clock of at most the largest one."""
 
     make: MakeFrame
     box: Box  # of pairs of the inputs and the clock
@@ -217,26 +189,14 @@ class FramedBox(eqx.Module):
         example = jtu.tree_map(lambda x: x[0], as_state(states))
         return cls(make, Box(lower, upper), example)
 
-    def extended(self, states: Y) -> "FramedBox":
-        """The set extended by the inputs of `states`; the network scales time by the largest clock,
-        which is not changed."""
-        seen = FramedBox.around(self.make, states).box
-        inputs = self.box.lower[0], self.box.upper[0]
-        around = Box(*inputs).extended(jnp.stack([seen.lower[0], seen.upper[0]]))
-        box = Box((around.lower, self.box.lower[1]), (around.upper, self.box.upper[1]))
-        return FramedBox(self.make, box, self.example)
-
     @property
     def fastest(self) -> Array:
-        """The largest clock."""
         return self.box.upper[1]
 
     def frame(self, y: Y) -> Frame:
-        """The frame of `y`."""
         return frame_at(self.make, y)
 
     def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is one of these states, up to symmetries."""
         frame = self.frame(y)
         return self.box.contains((frame.inputs, jnp.asarray(frame.clock)))
 

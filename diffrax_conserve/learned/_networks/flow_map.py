@@ -21,9 +21,9 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
-    [`diffrax_conserve.DeepONet`][] is a flow map. [`diffrax_conserve.learned.FlowMap`][] makes one
-    from any function; solvers and [`diffrax_conserve.fit`][] do this for a Module `(y0, h) -> y`
-    with an attribute `max_step`, and optionally `order` and `domain`.
+    [`diffrax_conserve.DeepONet`][] is a flow map. Solvers and [`diffrax_conserve.fit`][] make one
+    from a Module `(y0, h) -> y` with an attribute `max_step`, and optionally `order`, `domain` and
+    `args_domain`.
 
     **Attributes:**
 
@@ -90,17 +90,9 @@ class AbstractFlowMap(AbstractTrainable):
 
 @final
 class FlowMap(AbstractFlowMap):
-    """A flow map made from a function `(y0, h) -> y`.
+    """A function `(y0, h) -> y` with an attribute `max_step`, and perhaps others of a flow map.
 
-    !!! example
-
-        ```python
-        import diffrax_conserve as dfc
-        import jax.numpy as jnp
-
-        decay = dfc.learned.FlowMap(lambda y0, h: y0 * jnp.exp(-h), 0.5)
-        solver = dfc.learned.FlowMapSolver(decay)
-        ```
+    `fit` trains all its arrays.
     """
 
     function: Callable[..., Any]
@@ -109,30 +101,18 @@ class FlowMap(AbstractFlowMap):
     domain: Any
     args_domain: Box | None
 
-    # Written out, because type checkers treat the abstract fields of the base class as arguments.
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        max_step: RealScalarLike,
-        *,
-        order: int = 0,
-        domain: Any = None,
-        args_domain: Box | None = None,
-    ):
-        if not callable(function):
-            raise TypeError(f"`function` is {function!r}, not a function `(y0, h) -> y`.")
-        if not isinstance(order, int) or order < 0:
-            raise ValueError(f"`order` is {order!r}, but it must be 0 or a positive integer.")
-        if domain is not None and not callable(getattr(domain, "contains", None)):
+    def __init__(self, function: Any):
+        self.function, self.max_step = function, function.max_step
+        self.order, self.domain = getattr(function, "order", 0), getattr(function, "domain", None)
+        self.args_domain = checked_box(args_domain_of(function))
+        if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
             raise TypeError(
-                f"The `domain` of the flow map is {domain!r}, which has no method `contains(y)`. "
-                "Make it a `diffrax_conserve.learned.Box`, or a Module with that method."
+                f"The `domain` of the flow map is {self.domain!r}, which has no method "
+                "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
+                "method."
             )
-        self.function, self.max_step, self.order = function, max_step, order
-        self.domain, self.args_domain = domain, checked_box(args_domain)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
         del schedule
         return self.function(y0, *step)
 
@@ -144,34 +124,16 @@ class FlowMap(AbstractFlowMap):
         return self.function
 
 
-FlowMap.__init__.__doc__ = r"""**Arguments:**
-
-- `function`: called as `(y0, h) -> y`, or with an `args_domain` as `(y0, args, h) -> y`.
-    [`diffrax_conserve.fit`][] trains all its arrays.
-- `max_step`: the longest step.
-- `order`: the error of one step is $O(h^{q+1})$ with $q$ = `order`. Default: 0.
-- `domain`: the states for which it is valid: a [`diffrax_conserve.learned.Box`][], or a Module with
-    a method `contains(y)`.
-- `args_domain`: the `args` for which it is valid, a [`diffrax_conserve.learned.Box`][]. Default:
-    the function takes no `args`.
-
-**Raises:** `TypeError` or `ValueError` if an argument is not of this kind.
-"""
-
-
 def as_flow_map(model: AbstractFlowMap | Callable[..., Any]) -> AbstractFlowMap:
     """`model` as a flow map, also for a function with an attribute `max_step`."""
     if isinstance(model, AbstractFlowMap):
         return model
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
-            f"`flow_map` is {model!r}, which is no flow map. Pass a `DeepONet`, a Module that is "
-            "called as `(y0, h) -> y` and has an attribute `max_step`, the longest step, or "
-            "`diffrax_conserve.learned.FlowMap(function, max_step)`."
+            f"`flow_map` is {model!r}, which is no flow map. Pass a `DeepONet`, or a Module that "
+            "is called as `(y0, h) -> y` and has an attribute `max_step`, the longest step."
         )
-    order, domain = getattr(model, "order", 0), getattr(model, "domain", None)
-    longest = model.max_step  # pyright: ignore[reportFunctionMemberAccess]
-    return FlowMap(model, longest, order=order, domain=domain, args_domain=args_domain_of(model))
+    return FlowMap(model)
 
 
 def args_domain_of(model: Any) -> Box | None:
@@ -183,8 +145,7 @@ def checked_box(args_domain: Any) -> Box | None:
     """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
     if not isinstance(args_domain, Box | None):
         raise TypeError(
-            f"`args_domain` is {args_domain!r}, but it must be the smallest and the largest "
-            "`args`: `diffrax_conserve.learned.Box(lower, upper)`."
+            f"`args_domain` is {args_domain!r}, but it must be a `diffrax_conserve.learned.Box`."
         )
     return args_domain
 
@@ -200,19 +161,6 @@ def checked_args(domain: Box, args: Args) -> Args:
     expected, got = (tree_shapes(x) for x in (domain.lower, args))
     if got != expected:
         raise ValueError(
-            f"This flow map takes `args` of the structure {expected}, but was given {got}. Pass "
-            "those of its `args_domain`, to `diffeqsolve` as `args=...`."
+            f"This flow map takes `args` of the structure {expected}, but was given {got}."
         )
     return jtu.tree_map(lambda x, a: jnp.asarray(x, a.dtype), args, domain.lower)
-
-
-def restored(flow_map: AbstractFlowMap, model: Any) -> Any:
-    """The inverse of `as_flow_map`: a module of the kind of `model`, with the domain of
-    `flow_map`."""
-    if isinstance(model, AbstractFlowMap):
-        return flow_map
-    assert isinstance(flow_map, FlowMap)
-    if flow_map.domain is None:
-        return flow_map.function
-    is_missing = lambda x: x is None  # noqa: E731
-    return eqx.tree_at(lambda m: m.domain, flow_map.function, flow_map.domain, is_leaf=is_missing)

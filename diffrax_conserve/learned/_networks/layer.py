@@ -31,9 +31,8 @@ class ConservativeLayer(eqx.Module):
 
     This is Newton's method in $\lambda$, with rows scaled to norm one and a damping
     $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale. An iteration
-    moves a state by at most the size of a state: it could be arbitrarily long near a point where
-    $G$ vanishes. Derivatives of the network include the layer, by the implicit function theorem for
-    $g(y) = r$ with the remaining residual $r$; no iteration is unrolled.
+    moves a state by at most the size of a state. Derivatives of the network include the layer, by
+    the implicit function theorem for $g(y) = r$ with the remaining residual $r$.
 
     For a state on the manifold to roundoff, wrap the solver in
     [`diffrax_conserve.ManifoldProjection`][].
@@ -75,14 +74,12 @@ class ConservativeLayer(eqx.Module):
         candidate: Y,
         values: Values,
         t: RealScalarLike,
-        radius: Float[Array, ""],
+        scale: Float[Array, "..."],
         schedule: tuple[Int[Array, ""], Float[Array, ""]] | None = None,
     ) -> Y:
         """The state after all iterations; or `(1 - s) P_{p-1} y + s P_p y` for `schedule = (p, s)`,
-        where `P_k y` is the state after `k` iterations.
-
-        The numbers `p` and `s` may be traced, so that a training with any schedule compiles once.
-        Iterations beyond the `p`-th are not computed.
+        where `P_k y` is the state after `k` iterations, and those beyond the `p`-th are not
+        computed. An iteration moves the state by at most the norm of `scale`.
         """
         start = ravel(candidate)
         dtype = start.dtype
@@ -98,7 +95,8 @@ class ConservativeLayer(eqx.Module):
 
         # Arrays over which the functions close become part of `residual`'s PyTree.
         converted = eqx.filter_closure_convert(residual, start)
-        fixed = lax.stop_gradient((equations.magnitude, radius.astype(dtype), p, s.astype(dtype)))
+        radius = jnp.sqrt(jnp.sum(jnp.square(scale))).astype(dtype)
+        fixed = lax.stop_gradient((equations.magnitude, radius, p, s.astype(dtype)))
         y, _ = _conserve(converted, start, fixed, steps=self.steps)
         return unravel(y, candidate)
 
@@ -153,11 +151,10 @@ def _conserve(
 
 @_conserve.def_jvp
 def _conserve_jvp(primals, tangents, *, steps):
-    """The implicit function theorem for `g(ŷ + G(ŷ)ᵀ λ) = r` with the remaining residual `r`.
+    """`λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`, where `ġ` is the tangent of the residual at constant `λ`.
 
-    Let `ẏ` and `ġ` be the tangents of the displaced state and of its residual at constant `λ`. Then
-    `λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`. Where the first iteration is not complete (`p = 0`, or `p = 1` with `s
-    < 1`) the multipliers are `s` times those of a complete one, and so is their tangent.
+    Where the first iteration is not complete (`p = 0`, or `p = 1` with `s < 1`) the multipliers are
+    `s` times those of a complete one, and so is their tangent.
 
     The linear solve is differentiated implicitly too. Second derivatives, which every loss with a
     time derivative needs, then cost products with `G` instead of derivatives of its rows.
@@ -197,9 +194,6 @@ def _conserve_jvp(primals, tangents, *, steps):
 
 
 def _stored(tree: PyTree[Array], p: Int[Array, ""]) -> PyTree[Array]:
-    """`tree`, passed through a `cond` that makes XLA store it and its cotangent.
-
-    Otherwise XLA repeats their computation in each loop that uses them, and for each element where
-    scalars are stacked to an array.
-    """
+    """`tree`, through a `cond`, because otherwise XLA computes it and its cotangent again in each
+    loop that uses them, and for each element where scalars are stacked to an array."""
     return lax.cond(p >= 0, lambda x: x, lambda x: jtu.tree_map(jnp.zeros_like, x), tree)

@@ -1,6 +1,5 @@
 """A physics-informed network: one solution, as a function of time."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -29,26 +28,19 @@ class Window(AbstractTrainable):
     start: Float[Array, ""]
     length: Float[Array, ""]
     scale: Float[Array, " n"]
-    normalise: bool = eqx.field(static=True)
 
     def __call__(self, t: RealScalarLike, schedule: LayerSchedule | None = None) -> Y:
         candidate = self.candidate(t)
         if self.layer is None:
             return candidate
         values = self.layer.values(self.start, self.y0)
-        return self.layer(candidate, values, t, self.radius(), schedule)
+        return self.layer(candidate, values, t, self.scale, schedule)
 
     def candidate(self, t: RealScalarLike) -> Y:
-        """The state at time `t` before the conservative layer."""
         t = jnp.asarray(t).astype(self.scale.dtype)
         fraction = (t - self.start) / self.length
-        out = self.net((2 * fraction - 1 if self.normalise else t)[None])
+        out = self.net((2 * fraction - 1)[None])
         return unflatten(flatten(self.y0) + fraction * self.scale * out, self.y0)
-
-    def radius(self) -> Float[Array, ""]:
-        """The largest distance by which the conservative layer may move a state in one
-        iteration."""
-        return jnp.sqrt(jnp.sum(jnp.square(self.scale)))
 
     def draw(self, times: Times, sample: Sampler | None, count: int, key: PRNGKeyArray) -> Points:
         del sample
@@ -84,13 +76,14 @@ class PINN(eqx.Module):
 
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
-    with a fully connected network $N$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
+    with a fully connected network $N$ of time scaled to $[-1, 1]$, and the largest component $S$ of
+    each leaf of $u_0$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
     output is projected to the manifold of the conserved values at $(t_0, u_0)$.
 
     A long interval is divided into `windows`, each with its own network that starts where the last
-    one ends: small networks on short intervals are far easier to train than a large one on a long
-    interval. Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step
-    it by [`diffrax_conserve.PINNSolver`][].
+    one ends: small networks on short intervals are far easier to train. Train it by
+    [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
+    [`diffrax_conserve.PINNSolver`][].
 
     !!! example
 
@@ -115,7 +108,6 @@ class PINN(eqx.Module):
     y0s: Y
     edges: tuple[float, ...] = eqx.field(static=True)  # the starts of the windows, and the end
     scale: Float[Array, " n"]
-    normalise: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -124,29 +116,28 @@ class PINN(eqx.Module):
         t1: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        windows: int | Sequence[float] = 1,
+        windows: int = 1,
         width: int = 30,
         depth: int = 1,
         activation: str | Activation = "tanh",
         slope: float | None = 2.0,
-        normalise: bool = True,
         layer: ConservativeLayer | None = None,
     ):
-        check_sizes(width=width, depth=depth)
+        check_sizes(width=width, depth=depth, windows=windows)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         if slope is not None and not slope > 0:
             raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
-        y0, self.edges = as_state(y0), _edges(float(t0), float(t1), windows)
-        dtype, n, count = working_dtype(y0), flatten(y0).size, self.windows
+        y0, length = as_state(y0), float(t1) - float(t0)
+        self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
+        dtype, n, count = working_dtype(y0), flatten(y0).size, windows
 
         def net(key: PRNGKeyArray) -> MLP:
             return MLP(1, n, width, depth, activation, dtype, key=key, slope=slope)
 
         self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
         self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
-        self.layer, self.normalise = layer, normalise
-        self.scale = flatten(jtu.tree_map(_magnitude, y0)) if normalise else jnp.ones(n, dtype)
+        self.layer, self.scale = layer, flatten(jtu.tree_map(_magnitude, y0))
 
     def __call__(self, t: RealScalarLike) -> Y:
         """The state at time `t`."""
@@ -181,11 +172,8 @@ class PINN(eqx.Module):
     def window_of(self, net: MLP, y0: Y, start: RealScalarLike, end: RealScalarLike) -> Window:
         """A window with the options of this network."""
         start, length = (jnp.asarray(t, self.scale.dtype) for t in (start, end - start))
-        scale, normalise = self.scale, self.normalise
-        return Window(
-            net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale,
-            normalise=normalise,
-        )  # fmt: skip
+        scale = self.scale
+        return Window(net=net, layer=self.layer, y0=y0, start=start, length=length, scale=scale)
 
     def cut(self, edges: Sequence[float], nets: MLP, y0s: Y) -> "PINN":
         """A network with the same options and these windows."""
@@ -208,36 +196,19 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `y0`: the initial state $u_0$, any PyTree of real arrays.
 - `t0`, `t1`: the interval of time.
 - `key`: a random key, for the initial weights.
-- `windows`: the number of equal intervals, each with its own network; or the times between `t0` and
-    `t1` that separate the intervals.
+- `windows`: the number of equal intervals, each with its own network.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
-    spread over the interval. `None` for Glorot initialisation, with which all units are nearly the
-    same function of time; Levenberg-Marquardt needs about 2.
-- `normalise`: whether $N$ gets time scaled to $[-1, 1]$ and $S$ has the largest component of each
-    leaf of $u_0$. Otherwise $N$ gets $t$, and $S = 1$.
+    spread over the interval. `None` for Glorot initialisation, with which they are nearly the same
+    function of time; Levenberg-Marquardt needs about 2.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 
 **Raises:**
 
 `ValueError` or `TypeError` if a size or the interval is invalid.
 """
-
-
-def _edges(t0: float, t1: float, windows: int | Sequence[float]) -> tuple[float, ...]:
-    """The times at which windows start, and the end of the last one."""
-    if not isinstance(windows, Sequence):
-        check_sizes(windows=windows)
-        return (*(t0 + (t1 - t0) / windows * k for k in range(windows)), t1)
-    edges = (t0, *map(float, windows), t1)
-    if not all(a < b for a, b in itertools.pairwise(edges)):
-        raise ValueError(
-            f"`windows` is {windows!r}, but the times at which the interval is cut must increase "
-            f"and lie between {t0} and {t1}."
-        )
-    return edges
 
 
 def _magnitude(leaf: Array) -> Array:

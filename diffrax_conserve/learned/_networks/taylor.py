@@ -21,9 +21,8 @@ class Taylor(eqx.Module):
     u'(0) = f(u_0), \quad u''(0) = f'(u_0) f(u_0), \quad \dots$$
 
     A [`diffrax_conserve.DeepONet`][] with it learns the remainder, $u(h) = T_q(u_0, h) +
-    (h/\Delta)^{q+1} S N(u_0, h)$. It is then a method of order $q$ for all weights, so that smaller
-    steps reduce the error. The cost doubles with each order, which pays only if the polynomial
-    itself is accurate: $h$ times the rate of change of $f$ should not be much above one.
+    (h/\Delta)^{q+1} S N(u_0, h)$, and is a method of order $q$ for all weights. The cost doubles
+    with each order, which pays only if $h$ times the rate of change of $f$ is not much above one.
 
     !!! example
 
@@ -74,5 +73,4 @@ Taylor.__init__.__doc__ = r"""**Arguments:**
 
 
 def _along(field: Callable[[Y], Y], function: Callable[[Y], Y]) -> Callable[[Y], Y]:
-    """The derivative of `function` along the flow."""
     return lambda y: jax.jvp(function, (y,), (field(y),))[1]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -13,18 +13,16 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import tree_sub, unflatten
-from .cores import AbstractCore, check_sizes
+from ..._tree import unflatten
+from .cores import check_sizes
 from .domain import Box
-from .flat import flatten, stacked_vectors
+from .flat import flatten
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .trainable import LayerSchedule, Sampler
 
-_Model = TypeVar("_Model")
-
 
 class AbstractWrapper(AbstractFlowMap):
-    """A flow map of another one, `flow_map`. What a subclass does not define is the other's."""
+    """A flow map of another one, which has what a subclass does not define."""
 
     flow_map: eqx.AbstractVar[AbstractFlowMap]
 
@@ -48,14 +46,19 @@ class AbstractWrapper(AbstractFlowMap):
     def layer(self) -> Any:
         """`None`: an inner layer is applied inside."""
 
+    def seen(self, y: Any) -> Any:
+        """A state as the inner flow map sees it."""
+        return y
+
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        return self.flow_map.inside(y0, *step)
+        return self.flow_map.inside(self.seen(y0), *step)
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        return self.flow_map.measure(y0, rate)
+        seen, rates = jax.jvp(self.seen, (y0,), (unflatten(rate, y0),))
+        return self.flow_map.measure(seen, flatten(rates))
 
     def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
-        return self.flow_map.compared(ys, others)
+        return self.flow_map.compared(*(jax.vmap(self.seen)(y) for y in (ys, others)))
 
     def weights(self) -> Any:
         return self.flow_map.weights()
@@ -67,7 +70,7 @@ class Repeated(AbstractWrapper):
     \Phi_{h/k}(u_0)$.
 
     A flow is easier to learn over shorter steps. Train the inner flow map: the repeated one has no
-    weights of its own. It costs as much as `count` steps of the inner one.
+    weights of its own, and costs `count` steps of the inner one.
 
     !!! example
 
@@ -102,7 +105,6 @@ class Repeated(AbstractWrapper):
         return self._scan(once, y0, step)
 
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        """Whether every inner step is within the domain."""
 
         def once(carry: tuple[Y, Array], each: Any) -> tuple[tuple[Y, Array], None]:
             y, inside = carry
@@ -139,8 +141,8 @@ class BoxCox(eqx.Module):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
-    of zero is finite. With an exponent of 0 it is the logarithm, for positive states. Powers of 1/2
-    take a tenth of the time of other exponents.
+    of zero is finite. With an exponent of 0 it is the logarithm. Powers of 1/2 are ten times as
+    fast as other exponents.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -229,17 +231,10 @@ class Transformed(AbstractWrapper):
         return None if self.flow_map.domain is None else self
 
     def contains(self, y: Y) -> Bool[Array, ""]:
-        """Whether `y` is in the domain."""
         return self.flow_map.domain.contains(self.transformation(y))
 
-    def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
-        return self.flow_map.inside(self.transformation(y0), *step)
-
-    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " n"]:
-        return flatten(jax.jvp(self.transformation, (y0,), (unflatten(rate, y0),))[1])
-
-    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
-        return stacked_vectors(tree_sub(*(jax.vmap(self.transformation)(y) for y in (ys, others))))
+    def seen(self, y: Y) -> Any:
+        return self.transformation(y)
 
 
 Transformed.__init__.__doc__ = """**Arguments:**
@@ -252,10 +247,7 @@ Transformed.__init__.__doc__ = """**Arguments:**
 
 @final
 class OfPairs(AbstractWrapper):
-    """A family of flow maps as a single flow map of the pairs `(y, args)`, with constant `args`.
-
-    For `fit`, `args` are then a part of the state.
-    """
+    """A family of flow maps as one of the pairs `(y, args)`, with constant `args`, for `fit`."""
 
     flow_map: AbstractFlowMap
 
@@ -263,16 +255,11 @@ class OfPairs(AbstractWrapper):
         self.flow_map = flow_map
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The pair a time `h` after the pair `y0`, with `step` = `h`."""
         y0, args = y0
         return self.flow_map(y0, args, *step, schedule=schedule), args
 
-    def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        # The last part is the rate of `args`, which is zero.
-        return self.flow_map.measure(y0[0], rate[: flatten(y0[0]).size])
-
-    def compared(self, ys: Any, others: Any) -> Float[Array, "points n"]:
-        return self.flow_map.compared(ys[0], others[0])
+    def seen(self, y: tuple[Any, Args]) -> Any:
+        return y[0]
 
     def linear_weights(self) -> Any:
         return self.flow_map.linear_weights()
@@ -287,8 +274,6 @@ class OfPairs(AbstractWrapper):
 
 
 def field_of_pairs(vector_field: Callable[..., Any], t: RealScalarLike, y: Any, args: None) -> Any:
-    """The vector field of the pairs."""
-    del args
     y, args = y
     return vector_field(t, y, args), jtu.tree_map(jnp.zeros_like, args)
 
@@ -297,45 +282,3 @@ def pair(sample: Sampler, domain: Box, key: PRNGKeyArray) -> tuple[Any, Any]:
     """A random state, and random `args` from their domain."""
     state_key, args_key = jr.split(key)
     return sample(state_key), domain.sample(args_key)
-
-
-def single_precision(flow_map: _Model) -> _Model:
-    r"""The same flow map, whose network is evaluated in float32.
-
-    In $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$ only $N$ is rounded to float32, about $10^{-7}
-    S$; if the network's own error is larger, nothing is lost. On a CPU evaluation takes about half
-    as long, and a file about half the space. Convert a network after its training.
-
-    !!! example
-
-        ```python
-        import diffrax_conserve as dfc
-
-        flow_map = dfc.load_pretrained("conservative-lorenz")
-        faster = dfc.learned.single_precision(flow_map)
-        solver = dfc.DeepONetSolver(faster)
-        ```
-
-    **Arguments:**
-
-    - `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that contains some, such as a
-        [`diffrax_conserve.learned.Repeated`][] or a solver.
-
-    **Raises:**
-
-    `TypeError` if it contains no `DeepONet`.
-    """
-
-    def is_core(x: Any) -> bool:
-        return isinstance(x, AbstractCore)
-
-    def single(x: Any) -> Any:
-        return x.astype(jnp.float32) if eqx.is_array(x) and x.dtype == jnp.float64 else x
-
-    if not any(map(is_core, jtu.tree_leaves(flow_map, is_leaf=is_core))):
-        raise TypeError(
-            f"`flow_map` is {flow_map!r}, which contains no `DeepONet`, whose network alone can be "
-            "evaluated in another precision than that of the state."
-        )
-    rounded = lambda x: jtu.tree_map(single, x) if is_core(x) else x  # noqa: E731
-    return jtu.tree_map(rounded, flow_map, is_leaf=is_core)

@@ -108,7 +108,6 @@ def _integration(count: int) -> np.ndarray:
 
 
 def _clenshaw(coefficients: Array, x: Array) -> Array:
-    """`Σ_j c_j T_j(x)`."""
     zero = jnp.zeros_like(coefficients[0])
     b1, b2 = zero, zero
     for c in coefficients[:0:-1]:

@@ -47,32 +47,22 @@ _NOT_FINITE = register(
 )
 
 
-def check_nodes(nodes: int) -> None:
-    if not isinstance(nodes, int) or nodes < 2:
-        raise ValueError(f"`nodes` must be an integer of at least 2, but is {nodes!r}.")
-
-
 def check_learned_terms(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
     """Raises if the solver is given the adjoint equations, for which it was not trained."""
     if is_backsolve(terms):
         raise ValueError(
-            f"`{name}` cannot solve the adjoint equations of `diffrax.BacksolveAdjoint`: it was "
-            "trained for the equations themselves. Name another solver for them, for example "
-            "`BacksolveAdjoint(solver=diffrax.Tsit5())`, or use "
-            "`diffrax.RecursiveCheckpointAdjoint()`."
+            f"`{name}` cannot solve the adjoint equations of `diffrax.BacksolveAdjoint`. Name "
+            "another solver for them, for example `BacksolveAdjoint(solver=diffrax.Tsit5())`, or "
+            "use `diffrax.RecursiveCheckpointAdjoint()`."
         )
 
 
 def check_output(function: Callable[..., Any], arguments: tuple, y0: Y, name: str) -> None:
-    """Raises unless `function(*arguments)` is shaped like the state."""
     arguments = jtu.tree_map(jnp.asarray, arguments)
     output = eqx.filter_eval_shape(function, *arguments)
     got, expected = tree_shapes(output), tree_shapes(y0)
     if got != expected:
-        raise ValueError(
-            f"`{name}` returns the structure {got}, but the state has {expected}. "
-            "Both must be the same."
-        )
+        raise ValueError(f"`{name}` returns the structure {got}, but the state has {expected}.")
 
 
 # The largest accepted difference of the two slopes, relative to the larger one. The slope of a
@@ -82,9 +72,8 @@ _EXACT, _LEARNED = 1e-3, 0.75
 # is ignored.
 _LITTLE = 1e-2
 # A learned slope for h -> 0 is an extrapolation from longer steps, so it is compared only as far as
-# the field is nearly constant in them. In stiff equations it is not, and then nothing is refused.
-# With these numbers no shipped flow map refuses any of a thousand states of its own system; another
-# one is told if it differs by a factor of several, such as the double pendulum on the moon.
+# the field is nearly constant in them, which it is not in stiff equations. With these numbers no
+# shipped flow map refuses any of a thousand states of its own system.
 _CHANGE = 0.2
 
 

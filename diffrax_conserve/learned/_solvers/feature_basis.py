@@ -1,10 +1,8 @@
 """An orthonormal basis of random tanh features on the unit interval, with the tables for a step.
 
-Random features are nearly dependent: of the singular values of fifty features, only the first
-twenty are above roundoff. A step therefore fits the leading directions of their span, which are
-computed here once, in numpy and double precision. A direction is a Legendre series and is
-integrated exactly. Integrating the features instead, with coefficients that compensate the small
-singular values, would lose digits by cancellation.
+Of the singular values of fifty random features only the first twenty are above roundoff. A step
+therefore fits the leading directions of their span. A direction is a Legendre series and is
+integrated exactly; integrating the features instead would lose digits by cancellation.
 """
 
 import functools as ft
@@ -16,8 +14,7 @@ from numpy.polynomial import legendre
 
 from .chebyshev import chebyshev_points, to_coefficients
 
-# The length of the Legendre series, and of the Gauss rule that computes them: far more than any
-# feature needs.
+# The length of the Legendre series, and of the Gauss rule that computes them.
 _DEGREES = 80
 # The number of exact directions: the constant (a bias) and the linear function (a skip connection).
 _EXACT = 2
@@ -42,9 +39,9 @@ class FeatureBasis(NamedTuple):
 
 
 @ft.cache
-def feature_basis(count: int, seed: int) -> FeatureBasis:
+def feature_basis(count: int) -> FeatureBasis:
     """The basis with `count` members for the solution and 1.5 times as many for its error."""
-    return tabulate(count, _directions(count + -(-count // 2), seed))
+    return tabulate(count, _directions(count + -(-count // 2)))
 
 
 def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureBasis:
@@ -70,12 +67,12 @@ def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureB
     )
 
 
-def _directions(wide: int, seed: int) -> Float[np.ndarray, "degrees wide"]:
+def _directions(wide: int) -> Float[np.ndarray, "degrees wide"]:
     """The Legendre coefficients, in `2 s - 1`, of an orthonormal basis of slopes."""
     points, weights = legendre.leggauss(_DEGREES)
     norms = np.sqrt(2 * np.arange(_DEGREES) + 1)
     project = (legendre.legvander(points, _DEGREES - 1) * norms).T * (weights / 2)
-    features = project @ _slopes((points + 1) / 2, wide, seed)
+    features = project @ _slopes((points + 1) / 2, wide)
     features[:_EXACT] = 0
     leading = np.linalg.svd(features, full_matrices=False)[0]
     members = np.eye(_DEGREES, wide)
@@ -83,14 +80,13 @@ def _directions(wide: int, seed: int) -> Float[np.ndarray, "degrees wide"]:
     return members * norms[:, None]
 
 
-def _slopes(s: np.ndarray, wide: int, seed: int) -> Float[np.ndarray, "points neurons"]:
+def _slopes(s: np.ndarray, wide: int) -> Float[np.ndarray, "points neurons"]:
     """`d/ds` of `s tanh(a (s - c))`, the term of a neuron in a network with an exact initial state.
 
-    The steepness `a` grows with the number of directions, so that the last ones are above roundoff.
-    Flatter features nearly span polynomials, and steeper ones are less accurate for smooth
-    solutions.
+    The steepness `a` grows with the number of directions, so that the last ones are above roundoff;
+    steeper features are less accurate for smooth solutions.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     steepness = rng.uniform(-wide / 8, wide / 8, _NEURONS * wide)
     centre = rng.uniform(0, 1, _NEURONS * wide)
     tanh = np.tanh(steepness * (s[:, None] - centre))

@@ -19,13 +19,12 @@ from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import (
     Refused,
     check_learned_terms,
-    check_nodes,
     check_output,
     judged,
     refused_from_start,
 )
 from .policies import DomainStatistics, Policy, StepResult, check_policy, outcome, step_of
-from .sweeps import Increment, Picard, Sweep, correct, estimate, increment
+from .sweeps import Increment, correct, estimate, increment
 
 
 class _State(NamedTuple):
@@ -38,26 +37,25 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
-    controller (pass it `dtmax=flow_map.max_step`) and fails with fixed steps; so does a solve
+    controller (pass it `dtmax=flow_map.max_step`) and fails with fixed steps, as does a solve
     backwards in time.
 
     **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
-    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` sweeps of
+    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` Picard sweeps
 
-    $$u \leftarrow y_n + h \int f(t, u, args) \quad \text{(Picard)}$$
+    $$u \leftarrow y_n + h \int f(t, u, args)$$
 
-    with the vector field of the term, at all points in parallel, or by `k` Newton iterations for
-    the fixed point. The $j$-th Picard sweep multiplies the error by about $h \|\partial f\| / j$; a
-    Newton iteration squares it.
+    with the vector field of the term, at all points in parallel. The $j$-th sweep multiplies the
+    error by about $h \|\partial f\| / j$.
 
-    **Error estimate.** Without sweeps it is the solution of the differential equation of the error,
-    driven by the defect $u' - f(u)$, for 12 states of the flow map and 28 evaluations of $f$; with
-    sweeps the change by the last one, at no extra cost. With fixed steps it is not computed.
-    Smaller steps reduce the error of a solve with sweeps, or with a flow map of order 1 or more.
+    **Error estimate.** Without sweeps it solves the differential equation of the error, driven by
+    the defect $u' - f(u)$, by 28 evaluations of $f$; with sweeps it is the change by the last one.
+    With fixed steps it is not computed. Smaller steps reduce the error of a solve with sweeps, or
+    with a flow map of order 1 or more.
 
-    **Leaving the domain.** The output of a flow map does not show whether it has learned the state.
-    `outside` determines what happens to a step that starts outside `flow_map.domain` or with `args`
-    outside its `args_domain`, or whose estimated error has a component larger than `max_error`.
+    **Leaving the domain.** `outside` determines what happens to a step that starts outside
+    `flow_map.domain` or with `args` outside its `args_domain`, or whose estimated error has a
+    component larger than `max_error`.
 
     Dense output is the polynomial through the (corrected) states at the `nodes` points, which are
     computed only if something needs them. Derivatives are those of the computed solution.
@@ -71,28 +69,20 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz-standard")
         solver = dfc.DeepONetSolver(flow_map, corrections=4)
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton()),
-            t0=0.0,
-            t1=5.0,
-            dt0=0.25,
-            y0=system.y0,
-        )
+        solver = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
+        term = diffrax.ODETerm(system.vector_field)
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0)
         ```
 
     ??? cite "Reference"
 
-        S. Wang and P. Perdikaris, "Long-time integration of parametric evolution equations with
-        physics-informed DeepONets", J. Comput. Phys. 475 (2023), for the steps; A. Dutt, L.
-        Greengard and V. Rokhlin, "Spectral deferred correction methods for ordinary differential
-        equations", BIT 40 (2000), for correction by sweeps.
+        S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023), for the steps; A. Dutt, L. Greengard
+        and V. Rokhlin, BIT 40 (2000), for correction by sweeps.
     """
 
     flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
     nodes: int = option(12, static=True)
     corrections: int = option(0, static=True)
-    sweep: Sweep = option(Picard())
     outside: Policy | None = option(None)
     max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
@@ -102,20 +92,13 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
     def __check_init__(self):
-        check_nodes(self.nodes)
+        if not isinstance(self.nodes, int) or self.nodes < 2:
+            raise ValueError(f"`nodes` must be an integer of at least 2, but is {self.nodes!r}.")
         domains = self.flow_map.domain, args_domain_of(self.flow_map)
-        check_policy(
-            self.outside, self.max_error, next((d for d in domains if d is not None), None)
-        )
+        check_policy(self.outside, self.max_error, any(d is not None for d in domains))
         if not isinstance(self.corrections, int) or self.corrections < 0:
             raise ValueError(
-                f"`corrections` is {self.corrections!r}, but it must be a number of sweeps: zero "
-                "or a positive integer."
-            )
-        if not isinstance(self.sweep, Sweep):
-            raise TypeError(
-                f"`sweep` is {self.sweep!r}, but it must be "
-                "`diffrax_conserve.learned.NewtonSweep()`, or left out for Picard's."
+                f"`corrections` is {self.corrections!r}, but it must be a number of sweeps."
             )
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
@@ -130,19 +113,12 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
 
     def _local_order(self, sweeps: int) -> int:
         """The power of the step size in the error of one step after this many sweeps."""
-        power = self.flow_map.order + 1
-        for _ in range(sweeps):
-            power = self.sweep.power(power)
+        power = self.flow_map.order + 1 + sweeps
         # The error of the collocation polynomial has this power.
         return min(power, self.nodes + 1) if sweeps else power
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> _State:
         check_learned_terms(terms, "FlowMapSolver")
         known = known_args(self.flow_map, args)
@@ -189,7 +165,6 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     def _learned(
         self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
     ) -> StepResult:
-        """The step of the flow map, after the correction sweeps."""
         start, unravel = ravel_pytree(y0)
 
         def state(fraction: Array) -> Array:
@@ -202,7 +177,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
             y1 = jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), y1, y0)
             error = estimate(increment, path)
         else:
-            path, error = correct(self.sweep, increment, path, self.corrections)
+            path, error = correct(increment, path, self.corrections)
             y1 = unravel(path[-1])
         states = jax.vmap(unravel)(path)
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
@@ -210,12 +185,11 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
 
 FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
-- `flow_map`: a [`diffrax_conserve.DeepONet`][], any other
+- `flow_map`: a [`diffrax_conserve.DeepONet`][], another
     [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module that is called as `(y0, h) -> y` and
     has an attribute `max_step`, and optionally `order` and `domain`.
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
-- `sweep`: [`diffrax_conserve.learned.NewtonSweep`][]`()`. Default: Picard's.
 - `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
     counts them, for [`diffrax_conserve.learned.domain_statistics`][];
     [`diffrax_conserve.learned.Refuse`][]`()` fails at the first; a diffrax solver takes them itself
@@ -223,10 +197,9 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 - `max_error`: the largest estimated error of a component, in its own units, of a step that counts
     as inside. Default: only the domain decides.
 - `check_field`: whether to fail if the vector field at the initial state differs from the slope of
-    the flow map for $h \to 0$, in the Euclidean norm, by more than 0.1 % if that slope is exact
-    (`order` at least 1): this detects a wrong parameter or another system at once. A learned slope
-    may differ by 75 %, and by more where the field changes much within `max_step`, as in stiff
-    equations.
+    the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order` at least 1). A
+    learned slope may differ by 75 %, and by more where the field changes much within `max_step`, as
+    in stiff equations.
 
 **Raises:**
 

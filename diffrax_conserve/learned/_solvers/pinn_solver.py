@@ -10,13 +10,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection.options import option
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
 from ..._tree import tree_max, tree_sub, working_dtype
 from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
-from .checks import Refused, check_learned_terms, check_nodes, check_output
+from .checks import Refused, check_learned_terms, check_output
 
 _OUTSIDE = register(
     "a step ends, or the solve starts, outside the interval that the PINN was trained for. Solve "
@@ -28,6 +27,10 @@ _ANOTHER_START = register(
 )
 
 
+# The number of states in a step that dense output interpolates.
+_NODES = 12
+
+
 @final
 class PINNSolver(dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
@@ -37,9 +40,8 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
     solution, $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. There is no error
     estimate, so use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
 
-    Dense output is the polynomial through the states of the network at `nodes` Chebyshev points of
-    the step, which are computed only if something needs them. The derivative with respect to `y0`,
-    which must be the trained one, is zero.
+    Dense output is the polynomial through the states at 12 Chebyshev points of the step, which are
+    computed only if something needs them. The derivative with respect to `y0` is zero.
 
     !!! example
 
@@ -49,14 +51,9 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
 
         system = dfc.systems.get("rigid-body")
         solver = dfc.PINNSolver(dfc.load_pretrained("rigid-body-standard"))
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton()),
-            t0=0.0,
-            t1=1.75,
-            dt0=0.05,
-            y0=system.y0,
-        )
+        solver = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
+        term = diffrax.ODETerm(system.vector_field)
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 1.75, 0.05, system.y0)
         ```
 
     ??? cite "Reference"
@@ -65,14 +62,12 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
     """
 
     pinn: PINN
-    nodes: int = option(12, static=True)
 
     evaluates_vector_field: ClassVar[bool] = False
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
     def __check_init__(self):
-        check_nodes(self.nodes)
         if not isinstance(self.pinn, PINN):
             raise TypeError(
                 f"`pinn` is {self.pinn!r}, which is not a `PINN`. A flow map `(y0, h) -> y` goes "
@@ -83,12 +78,7 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         del terms
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> Refused:
         """Zero, or why the solve cannot start: it is not on the solution of the network."""
         del t1, args
@@ -116,7 +106,7 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         def state(t: RealScalarLike) -> Y:
             return jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.pinn(t), y0)
 
-        coefficients = series(lambda c: state(start + c * (end - start)), self.nodes, end.dtype)
+        coefficients = series(lambda c: state(start + c * (end - start)), _NODES, end.dtype)
         failed = jnp.where(self._covers(end), 0, _OUTSIDE)
         result = member(jnp.where(solver_state > 0, solver_state, failed))
         return state(end), None, dict(coefficients=coefficients), solver_state, result
@@ -134,7 +124,6 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
 PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `pinn`: a [`diffrax_conserve.PINN`][].
-- `nodes`: the number of states in a step that dense output interpolates.
 
 **Raises:**
 

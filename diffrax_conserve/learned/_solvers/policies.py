@@ -1,8 +1,7 @@
 """Policies for steps that a flow map cannot be trusted with."""
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -14,7 +13,6 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
 from ..._options import check_number, check_solution
-from ..._printing import is_traced, printed
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
@@ -29,37 +27,20 @@ _INACCURATE = register(
 )
 
 
-@final
-class DomainStatistics(eqx.Module):
+class DomainStatistics(NamedTuple):
     """What `domain_statistics` returns."""
 
-    num_steps: Int[Array, "..."]
     num_outside: Int[Array, "..."]
     first_outside: Float[Array, "..."]
 
-    @property
-    def fraction_outside(self) -> Float[Array, "..."]:
-        """`num_outside / num_steps`."""
-        return self.num_outside / jnp.maximum(self.num_steps, 1)
-
-    def __str__(self) -> str:
-        if is_traced(self):
-            return repr(self)
-        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return printed("steps of a learned solver", rows)
-
     @classmethod
     def zero(cls, t0: RealScalarLike) -> "DomainStatistics":
-        never = jnp.full((), jnp.inf, jnp.result_type(t0, np.float16))
-        return cls(jnp.asarray(0), jnp.asarray(0), never)
+        return cls(jnp.asarray(0), jnp.full((), jnp.inf, jnp.result_type(t0, np.float16)))
 
     def add(self, t0: RealScalarLike, trusted: BoolScalarLike) -> "DomainStatistics":
         time = jnp.where(trusted, jnp.inf, t0).astype(self.first_outside.dtype)
-        return DomainStatistics(
-            self.num_steps + 1,
-            self.num_outside + jnp.where(trusted, 0, 1),
-            jnp.minimum(self.first_outside, time),
-        )
+        count = self.num_outside + jnp.where(trusted, 0, 1)
+        return DomainStatistics(count, jnp.minimum(self.first_outside, time))
 
 
 class StepResult(eqx.Module):
@@ -84,8 +65,7 @@ class Refuse(eqx.Module):
     """
 
 
-# What becomes of a step that starts outside the domain, or is not accurate enough. A solver takes
-# it.
+# A solver takes the step itself.
 Policy = Report | Refuse | dfx.AbstractSolver
 
 
@@ -123,7 +103,6 @@ def step_of(
     y0: Y,
     args: Args,
 ) -> StepResult:
-    """A step of a classical solver, which has no memory of earlier ones."""
     state = solver.init(terms, t0, t1, y0, args)
     y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
@@ -134,45 +113,40 @@ def step_of(
     return StepResult(y1, error, coefficients, result)
 
 
-def check_policy(policy: Any, max_error: Any, domain: Any) -> None:
-    """Raises unless `policy` is one, and goes with the domain and the error bound."""
+def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
     check_number("max_error", max_error, above=0.0)
+    choices = (
+        "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver, such as "
+        "`diffrax.Tsit5()`"
+    )
     if policy is None:
         if max_error is not None:
             raise ValueError(
                 "`max_error` says which steps count as outside, but these are ignored: pass "
-                "`outside=diffrax_conserve.learned.Report()`, `Refuse()` or `diffrax.Tsit5()` too."
+                f"`outside`, {choices}, too."
             )
         return
-    if isinstance(policy, dfx.AbstractSolver):
-        _check_solver(policy)
-    elif not isinstance(policy, Report | Refuse):
-        raise TypeError(
-            f"`outside` is {policy!r}, but it must be `diffrax_conserve.learned.Report()`, "
-            "`Refuse()`, or a diffrax solver, such as `diffrax.Tsit5()`."
-        )
-    if max_error is None and domain is None:
+    if not isinstance(policy, Policy):
+        raise TypeError(f"`outside` is {policy!r}, but it must be {choices}.")
+    if max_error is None and not has_domain:
         raise ValueError(
             f"`outside` is {policy!r}, but the flow map does not know what that is: it has no "
             "`domain`. Give it `diffrax_conserve.learned.Box.around(states)`, with the states that "
             "it was trained on, or pass `max_error`."
         )
-
-
-def _check_solver(solver: Any) -> None:
-    """Raises unless a solver can take a step inside another one."""
-    name, root_finder = type(solver).__name__, getattr(solver, "root_finder", None)
-    if solver.term_structure is not dfx.AbstractTerm:
+    if not isinstance(policy, dfx.AbstractSolver):
+        return
+    if policy.term_structure is not dfx.AbstractTerm:
         raise ValueError(
-            f"`outside` is a {name}, which needs several terms, but a learned solver has one. "
+            f"`outside` is {policy!r}, which needs several terms, but a learned solver has one. "
             "Pass a solver of one, for example `diffrax.Tsit5()`."
         )
+    root_finder = getattr(policy, "root_finder", None)
     if root_finder is not None and not eqx.is_array_like(getattr(root_finder, "rtol", 0.0)):
         raise ValueError(
-            f"`outside` is a {name}, whose root finder takes its tolerances from the step-size "
-            "controller; diffrax does not pass these to a nested solver. Give them explicitly, "
-            f"for example `{name}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
-            "norm=optimistix.max_norm))`."
+            f"`outside` is {policy!r}, whose root finder takes its tolerances from the step-size "
+            "controller; diffrax does not pass these to a nested solver. Give them explicitly: "
+            "`root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, norm=optimistix.max_norm)`."
         )
 
 
@@ -186,12 +160,10 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
 
     **Returns:**
 
-    An object with the attributes
+    A named tuple of
 
-    - `num_steps`: the number of accepted steps;
-    - `num_outside`: the number of them that started outside the flow map's `domain`, or had an
-        estimated error above `max_error`;
-    - `fraction_outside`: `num_outside / num_steps`;
+    - `num_outside`: the number of accepted steps that started outside the flow map's `domain`, or
+        had an estimated error above `max_error`;
     - `first_outside`: the time at which the first of them started; infinity if there is none.
 
     **Raises:**
@@ -206,20 +178,15 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
 
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz")
-        sol = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.DeepONetSolver(flow_map, outside=dfc.learned.Report()),
-            t0=0.0,
-            t1=5.0,
-            dt0=0.25,
-            y0=system.y0,
-            saveat=diffrax.SaveAt(t1=True, solver_state=True),
-        )
-        print(dfc.learned.domain_statistics(sol).fraction_outside)
+        solver = dfc.DeepONetSolver(flow_map, outside=dfc.learned.Report())
+        term = diffrax.ODETerm(system.vector_field)
+        saveat = diffrax.SaveAt(t1=True, solver_state=True)
+        sol = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0, saveat=saveat)
+        print(dfc.learned.domain_statistics(sol).num_outside)
         ```
 
         ```text
-        0.0
+        0
         ```
     """
     check_solution(sol, "domain_statistics")
@@ -228,7 +195,6 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
     if not found:
         raise ValueError(
             "`sol` holds no statistics of a domain. Solve with a learned solver that has "
-            "`outside=`, for example `outside=diffrax_conserve.learned.Report()`, and with "
-            "`saveat=SaveAt(..., solver_state=True)`."
+            "`outside=`, and with `saveat=SaveAt(..., solver_state=True)`."
         )
     return found[0]

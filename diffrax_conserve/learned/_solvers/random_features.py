@@ -2,8 +2,7 @@
 
 With the basis `q_k` of slopes, `s` the fraction of the step and `u(s) = u0 + Σ_k d_k ∫_0^s q_k`,
 the `d_k` solve `d = P h f(t, u0 + Q d)`, where `Q` integrates, and `P` fits values at the Gauss
-points by least squares: `u'` is the best approximation of `h f(t0 + s h, u)` in the span of the
-basis. There are more points than members.
+points, of which there are more than members, by least squares.
 
 Newton's method is written here because its matrix is put together from the Jacobians of `f` at the
 points, where a library would differentiate the residual once for each coefficient.
@@ -21,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from ..._projection.options import check_state, option
+from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import check_ode
 from .chebyshev import ChebyshevInterpolation, multiply
@@ -30,8 +29,6 @@ from .sweeps import increment
 
 # With fewer features none is random; with more they cannot be distinguished in double precision.
 _FEWEST, _MOST = 3, 32
-
-
 _UNSOLVED = register(
     "the equations of a step of `RandomFeatureSolver` were not solved. Newton's method diverged, "
     "or the vector field is not finite near the step. Take smaller steps: a smaller `dt0`, or with "
@@ -48,25 +45,25 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
 
     $$u(s) = u_0 + h s \Bigl(b + w s + \sum_j c_j \tanh(a_j (s - s_j))\Bigr),$$
 
-    where the $a_j$ and $s_j$ are random and drawn once, so that the network is linear in the fitted
-    coefficients. The `features` leading directions of its span are kept; the others are dependent
-    on them in double precision. The slope of the network is fitted to $f(t, u)$ by least squares at
-    twice as many Gauss points: Newton's method solves
+    where the $a_j$ and $s_j$ are random and fixed, so that the network is linear in the fitted
+    coefficients. The `features` leading directions of its span are kept; the others depend on them
+    in double precision. Newton's method solves
 
-    $$u' = P f(t, u), \qquad P \text{ the least-squares fit by slopes of the network.}$$
+    $$u' = P f(t, u), \qquad P \text{ the least-squares fit by slopes of the network,}$$
 
-    **Accuracy.** Steps can be long: with 16 features the error over half a period of an oscillator
-    is 2e-14, over a whole one 1e-12 and over two 1e-9. The solver is fast for high accuracy or
-    stiff systems of few unknowns.
+    at twice as many Gauss points.
+
+    **Accuracy.** With 16 features the error over half a period of an oscillator is 2e-14, over a
+    whole one 1e-12 and over two 1e-9. The solver is fast for high accuracy or stiff systems of few
+    unknowns.
 
     **Error estimate.** The remaining defect, propagated to the end of the step by the linearised
-    equation. It agrees with the true error of the step to within some per cent, down to roundoff.
-    With fixed steps it is not computed.
+    equation; with fixed steps it is not computed. It agrees with the true error of the step to
+    within some per cent, down to roundoff.
 
-    **Conservation.** As a least-squares fit of slopes (a continuous Galerkin method) the solver
-    conserves the energy of every canonical Hamiltonian system, $y' = J \nabla H(y)$, to the
-    accuracy of the Gauss rule, which soon reaches roundoff. Very stiff components are not damped;
-    in such transients steps become short.
+    **Conservation.** As a continuous Galerkin method the solver conserves the energy of every
+    canonical Hamiltonian system, $y' = J \nabla H(y)$, to the accuracy of the Gauss rule, which
+    soon reaches roundoff. Very stiff components are not damped; there steps become short.
 
     If Newton's method fails, an adaptive solve tries a shorter step, and a solve with fixed steps
     fails. Dense output is the network. Derivatives of any order are those of the solved equations.
@@ -78,15 +75,9 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         import diffrax_conserve as dfc
 
         system = dfc.systems.get("harmonic-oscillator")
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.RandomFeatureSolver(),
-            t0=0.0,
-            t1=30.0,
-            dt0=3.0,
-            y0=system.y0,
-            args=system.args,
-        )
+        term = diffrax.ODETerm(system.vector_field)
+        solver = dfc.RandomFeatureSolver()
+        solution = diffrax.diffeqsolve(term, solver, 0.0, 30.0, 3.0, system.y0)
         ```
 
     ??? cite "Reference"
@@ -98,7 +89,6 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
     """
 
     features: int = eqx.field(default=16, static=True)
-    seed: int = option(0, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
@@ -109,26 +99,15 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
                 f"`features` must be an integer from {_FEWEST} to {_MOST}, but is "
                 f"{self.features!r}."
             )
-        if not (isinstance(self.seed, int) and self.seed >= 0):
-            raise ValueError(
-                f"`seed` must be an integer of at least 0, the seed of the random features, but is "
-                f"{self.seed!r}."
-            )
 
     def order(self, terms: dfx.AbstractTerm) -> int:
-        """The order of the method with polynomials instead of features. The error of random
-        features has no exact order, but this one gives good step sizes for errors well above
-        roundoff."""
         del terms
+        # That of the method with polynomials. Random features have none, but it gives good step
+        # sizes for errors well above roundoff.
         return 2 * self.features
 
     def init(
-        self,
-        terms: dfx.AbstractTerm,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> None:
         del t0, t1, args
         check_ode(terms, "RandomFeatureSolver")
@@ -146,7 +125,7 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
     ) -> tuple[Y, Y, DenseInfo, None, dfx.RESULTS]:
         del solver_state, made_jump
         start, unravel = ravel_pytree(y0)
-        basis = feature_basis(self.features, self.seed)
+        basis = feature_basis(self.features)
         equations = StepEquations(basis, increment(terms, t0, t1, y0, args), start)
         coefficients, found = solve(equations)
         errors = _error(equations, coefficients)
@@ -170,7 +149,6 @@ RandomFeatureSolver.__init__.__doc__ = r"""**Arguments:**
 - `features`: the number of directions fitted for each component of the state, from 3 to 32. More
     features allow longer steps, but each step solves a few dense linear systems of `features`
     $\cdot n$ unknowns for a state of size $n$.
-- `seed`: the seed of the random neurons, which hardly matters.
 
 **Raises:**
 
@@ -182,8 +160,6 @@ RandomFeatureSolver.__init__.__doc__ = r"""**Arguments:**
 # ---- The equations of a step ----
 
 Coefficients = Float[Array, "members n"]
-Errors = Float[Array, "wide n"]
-
 # If Newton's method has not converged by then, a shorter step is cheaper.
 _MAX_STEPS = 10
 
@@ -196,20 +172,17 @@ class StepEquations(NamedTuple):
     y0: Float[Array, " n"]
 
     def states(self, coefficients: Coefficients) -> Float[Array, "points n"]:
-        """`u` at the Gauss points."""
+        """`u` at the Gauss points; there are also `h f`, `slopes`, and `h ∂f/∂u`, `jacobians`."""
         integrals = self.basis.integrals[:, : len(coefficients)]
         return self.y0 + multiply(integrals, coefficients)
 
     def slopes(self, states: Float[Array, "points n"]) -> Float[Array, "points n"]:
-        """`h f` at the Gauss points."""
         return jax.vmap(self.increment)(self._fractions(), states)
 
     def jacobians(self, states: Float[Array, "points n"]) -> Float[Array, "points n n"]:
-        """`h ∂f/∂u` at the Gauss points."""
         return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._fractions(), states)
 
     def residual(self, coefficients: Coefficients) -> Coefficients:
-        """`d - P h f`."""
         fit = self.basis.fit[: len(coefficients)]
         return coefficients - multiply(fit, self.slopes(self.states(coefficients)))
 
@@ -232,12 +205,9 @@ class StepEquations(NamedTuple):
 
 
 def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
-    """The coefficients, and whether Newton's method converged. If not, they are zero: the state is
-    then constant, where the vector field is finite, so that derivatives of a rejected step are
-    finite.
-
-    Derivatives follow from the implicit function theorem, not through the iteration.
-    """
+    """The coefficients, differentiated by the implicit function theorem, and whether Newton's
+    method converged. If not, they are zero: the state is then constant, where the vector field is
+    finite, so that derivatives of a rejected step are finite."""
     slope = equations.increment(jnp.zeros((), equations.y0.dtype), equations.y0)
     rest = jnp.zeros((equations.basis.size - 1, slope.size), slope.dtype)
     start = jnp.concatenate([slope[None], rest])
@@ -279,12 +249,11 @@ def _newton(
     return jnp.where(found, coefficients, 0), found.astype(start.dtype)
 
 
-def _error(equations: StepEquations, coefficients: Coefficients) -> Errors:
-    """The error of the solution over the step, in the wider basis, from its defect.
+def _error(equations: StepEquations, coefficients: Coefficients) -> Float[Array, "wide n"]:
+    """The error of the solution over the step, in the wider basis.
 
-    The linearised equation of the error, `e' = h ∂f/∂u e + h f - u'`, is solved on the same points:
-    one more linear system. Only the first member has a nonzero integral over the step, so the error
-    at the end is the first row.
+    It solves `e' = h ∂f/∂u e + h f - u'` at the same points. Only the first member has a nonzero
+    integral over the step, so the error at the end is the first row.
     """
     states = equations.states(coefficients)
     slopes = multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
@@ -293,12 +262,10 @@ def _error(equations: StepEquations, coefficients: Coefficients) -> Errors:
 
 
 def _dense_series(
-    equations: StepEquations, coefficients: Coefficients, error: Errors
+    equations: StepEquations, coefficients: Coefficients, error: Float[Array, "wide n"]
 ) -> Float[Array, "degrees n"]:
-    """`u` over the step, as a Chebyshev series in `2 s - 1`.
-
-    A Galerkin method is far more accurate at the end of a step than inside. So the estimated error
-    is added inside the step, and the end is not changed.
-    """
+    """`u` over the step, as a Chebyshev series in `2 s - 1`."""
+    # A Galerkin method is far more accurate at the end of a step than inside, where the estimated
+    # error is therefore added.
     inside = error.at[0].set(0).at[: len(coefficients)].add(coefficients)
     return multiply(equations.basis.series, inside).at[0].add(equations.y0)

@@ -1,18 +1,12 @@
 r"""Collocation on the Chebyshev points of a step, by correction sweeps, and the error of a path.
 
-A path $u$ through a step of length $h$ is stored as its states at the fractions $c_i$, one row
-each. The collocation solution satisfies
-
-$$u(c_i) = y_0 + h \int_0^{c_i} f(u(c))\,dc,$$
-
-at all points, where the integral is that of the polynomial through the increments $h f$.
+A path $u$ through a step is stored as its states at the fractions $c_i$, one row each. Integrals
+are those of the polynomial through the increments $h f$.
 """
 
 from collections.abc import Callable
-from typing import final
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -43,50 +37,13 @@ def increment(
     return evaluate
 
 
-@final
-class Picard(eqx.Module):
-    r"""The sweep $u \leftarrow y_0 + h \int f(u)$, at all points in parallel."""
-
-    def __call__(self, increment: Increment, path: Path) -> Path:
-        return path[0] + integrals(jax.vmap(increment)(_fractions(path), path))
-
-    def power(self, power: int) -> int:
-        """The power of the step size in the error of the new path, given that of the old one."""
-        return power + 1
-
-
-@final
-class NewtonSweep(eqx.Module):
-    """A Newton iteration, with a dense linear system of the size of the state times the nodes."""
-
-    def __call__(self, increment: Increment, path: Path) -> Path:
-        if jnp.issubdtype(path.dtype, jnp.complexfloating):
-            raise TypeError("`NewtonSweep` needs a real state: leave `sweep` out.")
-        count, n = path.shape
-        residual = Picard()(increment, path) - path
-        jacobians = jax.vmap(jax.jacfwd(increment, argnums=1))(_fractions(path), path)
-        # The first point is the initial state, which is known.
-        weights = integrals(jnp.eye(count, dtype=path.dtype))[1:, 1:]
-        blocks = jnp.einsum("ij,jab->iajb", weights, jacobians[1:])
-        size = (count - 1) * n
-        matrix = jnp.eye(size, dtype=path.dtype) - blocks.reshape(size, size)
-        change = jnp.linalg.solve(matrix, residual[1:].reshape(size)).reshape(count - 1, n)
-        return path.at[1:].add(change)
-
-    def power(self, power: int) -> int:
-        return 2 * power + 1
-
-
-Sweep = Picard | NewtonSweep
-
-
-def correct(
-    sweep: Sweep, increment: Increment, path: Path, count: int
-) -> tuple[Path, Inexact[Array, " n"]]:
-    """The path after `count` sweeps, and the change by the last of them at the end of the step."""
+def correct(increment: Increment, path: Path, count: int) -> tuple[Path, Inexact[Array, " n"]]:
+    r"""The path after `count` Picard sweeps `u ← y0 + h ∫ f(u)`, at all points in parallel, and
+    the change by the last of them at the end of the step."""
     previous = path
     for _ in range(count):
-        previous, path = path, sweep(increment, path)
+        values = jax.vmap(increment)(_fractions(path), path)
+        previous, path = path, path[0] + integrals(values)
     return path, path[-1] - previous[-1]
 
 
@@ -107,9 +64,9 @@ def estimate(increment: Increment, path: Path) -> Inexact[Array, " n"]:
 
     $$d' = h \left(f(p + \rho + d) - F\right), \qquad d(0) = 0,$$
 
-    which is exact. $\rho$ is the change by a Picard sweep; by itself it underestimates the error by
-    a large factor where $h \|\partial f\|$ is large. Nothing is differentiated, so the roundoff is
-    that of the states.
+    which is exact. $\rho$ is the change by a sweep; alone it underestimates the error by a large
+    factor where $h \|\partial f\|$ is large. Nothing is differentiated, so the roundoff is that of
+    the states.
     """
     values = jax.vmap(increment)(_fractions(path), path)
     rho = path[0] + integrals(values) - path

@@ -12,9 +12,8 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
-from ..._manifold import check_manifold, conserved_values
+from ..._manifold import check_manifold
 from ..._options import check_number
-from ..._projection.options import check_state
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
@@ -26,25 +25,18 @@ from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
 from .objective import Problem, VectorField
-from .pool import Pool
 from .recipe import Recipe, second_order
-from .state import FitState
 
 
-def check_types(
-    vector_field: Any, key: Any, recipe: Any, state: Any, progress: Any, **limits: Any
-) -> None:
+def check_types(key: Any, recipe: Any, **limits: Any) -> None:
     """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
     is_key = eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)
-    for name, value, good, wanted in (
-        ("vector_field", vector_field, callable(vector_field), "a function `(t, y, args)`"),
-        ("key", key, is_key, "a random key: `jax.random.key(0)`"),
-        ("recipe", recipe, isinstance(recipe, Recipe), "a `diffrax_conserve.learned.Recipe`"),
-        ("state", state, isinstance(state, FitState), "the `state` of a log of `fit`"),
-        ("progress", progress, isinstance(progress, bool) or callable(progress), "a function"),
-    ):
-        if not good and (value is not None or name == "key"):
-            raise TypeError(f"`{name}` is {value!r}, but it must be {wanted}.")
+    if not is_key:
+        raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
+    if not isinstance(recipe, Recipe | None):
+        raise TypeError(
+            f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`."
+        )
     for name, value in limits.items():
         check_number(name, value, above=0.0)
 
@@ -59,18 +51,14 @@ def checked(
     recipe: Recipe | None,
     manifold: Manifold | None,
 ) -> tuple[Any, Problem]:
-    """The flow map, or the first window of a PINN, and the problem; raises unless the arguments
-    fit."""
+    """The flow map, or the first window of a PINN, and the problem; raises unless they fit."""
     if vector_field is None and data is None:
         raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
     _check_manifold(model, manifold)
     recipe = second_order(model) if recipe is None else recipe
     if isinstance(model, PINN):
         if sample is not None or data is not None:
-            raise ValueError(
-                "A `PINN` has one initial state, its own: leave `sample` out, and `data`, from "
-                "which only a flow map is trained."
-            )
+            raise ValueError("A `PINN` has one initial state: leave `sample` and `data` out.")
         network, problem = model.window(0), Problem(vector_field, args, None, None, recipe)
     else:
         network, problem = _of_flow_map(model, vector_field, sample, data, args, recipe)
@@ -91,25 +79,32 @@ def _of_flow_map(
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
         )
-    _check_precision(model)
+    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
+    networks = filter(is_network, jtu.tree_leaves(model, is_leaf=is_network))
+    if any(network.precision != network.scale.dtype for network in networks):
+        raise TypeError(
+            "The weights of the model are float32, but its states are float64. Train it in double "
+            "precision, and convert its `core` afterwards."
+        )
     if sample is None and data is None:
         if not isinstance(flow_map.domain, Box):
             raise ValueError(
-                "A flow map is trained on many initial states, and this one has no `domain` to "
-                "draw them from: pass `sample`, states or a function from a random key to one of "
-                "them, for example `sample=system.sample`."
+                "This flow map has no `domain` to draw initial states from: pass `sample`, states "
+                "or a function from a random key to one, for example `sample=system.sample`."
             )
         sample = flow_map.domain.sample
     if domain is not None:
-        _check_family(sample, args)
+        if args is not None:
+            raise ValueError(
+                "Leave `args` out: this flow map takes them as inputs, and a training draws them "
+                "from its `args_domain`."
+            )
         flow_map = OfPairs(flow_map)
         field = None if field is None else eqx.Partial(field_of_pairs, field)
         sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
     if found is not None and field is not None and sample is None:
         sample = found.sample
-    if isinstance(sample, Pool):
-        _check_pool(sample, flow_map, args, recipe)
     return flow_map, Problem(field, args, sample, found, recipe)
 
 
@@ -153,40 +148,13 @@ def _check_manifold(model: Any, manifold: Manifold | None) -> None:
     refuse_rates(manifold, "a training")
     if not isinstance(model, PINN):
         raise ValueError(
-            "`manifold` is where the ends of the windows of a `PINN` are moved to, but this "
-            "network has no windows. To conserve its integrals give the network a `layer`, or "
-            "wrap its solver in `ManifoldProjection`."
-        )
-
-
-def _check_precision(model: Any) -> None:
-    """Raises for a network that is evaluated in a lower precision than its states have."""
-    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
-    networks = filter(is_network, jtu.tree_leaves(model, is_leaf=is_network))
-    if any(network.precision != network.scale.dtype for network in networks):
-        raise TypeError(
-            "The weights of the model are float32, but its states are float64. Train it in double "
-            "precision, and pass the result to `diffrax_conserve.learned.single_precision`."
-        )
-
-
-def _check_family(sample: Any, args: Args) -> None:
-    """Raises unless states and `args` can be drawn for a flow map that takes `args`."""
-    if args is not None:
-        raise ValueError(
-            "`args` were given, but this flow map takes them as inputs: a training draws them "
-            "from its `args_domain`. Leave `args` out."
-        )
-    if isinstance(sample, Pool):
-        raise ValueError(
-            "A `Pool` is for a flow map of one vector field, but this one takes `args`. Pass "
-            "`sample=diffrax_conserve.learned.reachable_states(...)`."
+            "`manifold` is for the windows of a `PINN`. To conserve its integrals give the network "
+            "a `layer`, or wrap its solver in `ManifoldProjection`."
         )
 
 
 def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
-    """Raises unless the vector field fits the states, is finite, and for a flow map is
-    autonomous."""
+    """Raises unless the field fits the states, is finite, and for a flow map is autonomous."""
     starts = network.starts(problem.draw(network, key))
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
     check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
@@ -196,7 +164,7 @@ def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
         y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
         raise ValueError(
             f"`vector_field` is not finite at {wrong.size} of {len(now)} initial states, for "
-            f"example at {y0}. Draw states at which it is."
+            f"example at {y0}."
         )
     if isinstance(network, AbstractFlowMap):
         later = _rates(problem, starts.ts + 0.618 * network.max_step, starts.y0s)
@@ -212,18 +180,3 @@ def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
 @eqx.filter_jit
 def _rates(problem: Problem, ts: Array, y0s: Y) -> Array:
     return stacked_vectors(jax.vmap(problem.field)(ts, y0s))
-
-
-def _check_pool(pool: Pool, flow_map: AbstractFlowMap, args: Args, recipe: Recipe) -> None:
-    """Raises unless a pool can grow and its states fit the model and the manifold."""
-    if recipe.refresh is None or recipe.refresh >= recipe.epochs:
-        raise ValueError(
-            "A `Pool` grows when new points are drawn, but with "
-            f"`refresh={recipe.refresh}` in a recipe of {recipe.epochs} epochs that is never. "
-            "Write for example `recipe=dataclasses.replace(recipe, refresh=1)`."
-        )
-    y0 = jtu.tree_map(jnp.asarray, pool.sample(jr.key(0)))
-    check_state(y0, "a `Pool`")
-    check_output(flow_map, (y0, float(flow_map.max_step)), y0, "model")
-    if pool.manifold is not None:
-        conserved_values(pool.manifold, 0.0, y0, args)

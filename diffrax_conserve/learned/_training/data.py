@@ -32,8 +32,8 @@ def reachable_states(
 ) -> PyTree[Array]:
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
-    In a solve, each step of a flow map starts at the end of the last one, so it must be trained on
-    such states. Pass the result as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
+    In a solve, each step of a flow map starts at the end of the last one, so train it on such
+    states: pass them as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
     [`diffrax_conserve.fit`][].
 
     **Arguments:**
@@ -43,11 +43,11 @@ def reachable_states(
     - `duration`: the longest time.
     - `key`: a random key, for the times.
     - `args`: passed to `vector_field`.
-    - `keep`: a function of one state that tells whether to keep it. Exclude states that change too
+    - `keep`: a function of one state that tells whether to keep it: exclude those that change too
         fast for the step that is to be learned.
-    - `solver`, `dt0`: the diffrax solver. Default: [`diffrax.Dopri8`][] with adaptive steps at a
-        tolerance of $10^{-6}$. With `dt0` the steps are fixed: if `vector_field` is expensive, use
-        the projected solver of a partly trained flow map with its own steps.
+    - `solver`, `dt0`: the diffrax solver, and its fixed step: if `vector_field` is expensive, the
+        solver of a partly trained flow map. Default: [`diffrax.Dopri8`][] at a tolerance of
+        $10^{-6}$.
 
     **Returns:**
 
@@ -72,7 +72,9 @@ def reachable_states(
     """
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    _, ys = _solutions(vector_field, y0s, times, args, solver, dt0, 1e-6, 1e-6)
+    _, ys = trajectories(
+        vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6, atol=1e-6
+    )
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
     return ys if keep is None else _the_good(ys, eqx.filter_jit(jax.vmap(keep))(ys))
 
@@ -95,8 +97,8 @@ def trajectories(
     - `vector_field`, `args`: as for [`diffrax_conserve.learned.reachable_states`][].
     - `y0s`: states at time 0, stacked along a leading axis.
     - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
-    - `solver`, `dt0`: any diffrax solver; for stiff equations [`diffrax.Kvaerno5`][]. Default:
-        [`diffrax.Dopri8`][]. With `dt0` its steps are fixed.
+    - `solver`, `dt0`: any diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and
+        its fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
     - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
         component of all `y0s`.
 
@@ -123,22 +125,8 @@ def trajectories(
     count = jtu.tree_leaves(y0s)[0].shape[0]
     times = jnp.asarray(ts, float)
     times = jnp.broadcast_to(times, (count, times.shape[-1]))
-    size = max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
-    atol = rtol * size if atol is None else atol
-    return _solutions(vector_field, y0s, times, args, solver, dt0, rtol, atol)
-
-
-def _solutions(
-    vector_field: Any,
-    y0s: Any,
-    ts: Array,
-    args: Args,
-    solver: dfx.AbstractSolver | None,
-    dt0: RealScalarLike | None,
-    rtol: float,
-    atol: float,
-) -> tuple[Array, Any]:
-    """The times and states of the solves that succeeded."""
+    if atol is None:
+        atol = rtol * max(float(jnp.max(jnp.abs(jnp.asarray(y)))) for y in jtu.tree_leaves(y0s))
 
     def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
         adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
@@ -158,8 +146,8 @@ def _solutions(
         )
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, ts)
-    return _the_good((ts, ys), good)
+    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)
+    return _the_good((times, ys), good)
 
 
 def _the_good(ys: Any, good: Array) -> Any:
@@ -223,7 +211,6 @@ class Data(eqx.Module):
         return model.compared(found, pairs.y1s) / self.deviation
 
     def sample(self, key: PRNGKeyArray) -> Any:
-        """One of the states."""
         i, j = jnp.divmod(jr.randint(key, (), 0, self.ts.size), self.ts.shape[1])
         return jtu.tree_map(lambda y: y[i, j], self.ys)
 
@@ -231,15 +218,14 @@ class Data(eqx.Module):
 def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     """The trajectories `(ts, ys)`; raises unless they are valid."""
     if not (isinstance(data, tuple) and len(data) == 2):
-        raise TypeError(f"`data` is {type(data).__name__}, but it must be a pair `(ts, ys)`.")
+        raise TypeError(f"`data` is a {type(data).__name__}, but it must be a pair `(ts, ys)`.")
     ts = np.asarray(data[0], float)
     ys = jtu.tree_map(jnp.asarray, data[1])
     shapes = [jnp.shape(y)[:2] for y in jtu.tree_leaves(ys)]
     if ts.ndim != 2 or not shapes or any(shape != ts.shape for shape in shapes):
         raise ValueError(
             f"In `data` the times have shape {ts.shape} and the states leading axes {shapes}, but "
-            "all must be `(n, k)`: n trajectories, with k times each. For a single one write "
-            "`ts[None]` and `jax.tree.map(lambda y: y[None], ys)`."
+            "all must be `(n, k)`: n trajectories, with k times each."
         )
     finite = [np.all(np.isfinite(y)) for y in (ts, *jtu.tree_leaves(ys))]
     if not all(finite) or np.any(np.diff(ts, axis=1) <= 0):
@@ -249,8 +235,8 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     places = np.argwhere(last > np.arange(ts.shape[1]))
     if not places.size:
         raise ValueError(
-            f"No two times of a trajectory in `data` are within {flow_map.max_step}, the "
-            "`max_step` of the flow map. Give it a longer one, or data with shorter steps."
+            "No two times of a trajectory in `data` are within the `max_step` of the flow map, "
+            f"{flow_map.max_step}. Give it a longer one, or data with shorter steps."
         )
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
     pairs = whole.draw(_MANY, jr.key(0))

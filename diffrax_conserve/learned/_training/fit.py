@@ -11,7 +11,7 @@ import equinox as eqx
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
-from .._networks.flow_map import restored
+from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
 from .checks import check_types, checked
@@ -53,22 +53,18 @@ def fit(
     $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
-    estimates the error of its solution.
-
-    A `DeepONet` without a [`diffrax_conserve.learned.Taylor`][] polynomial gets that of first order
-    of the vector field, unless this changes too fast: see `taylor` of
-    [`diffrax_conserve.learned.Recipe`][].
+    estimates the error of its solution. A `DeepONet` gets the Taylor polynomial that its recipe
+    prescribes.
 
     A `PINN` is trained window by window; each starts at the end of the previous one, projected to
     the manifold if one is given. A window whose estimated error is too large is cut in halves, as
-    often as the recipe's `retries` allow. Errors add up along the solution and may grow: if it
-    misses the `target`, the windows are trained again, to smaller errors. If the solution is still
-    wrong, a warning names the window and the error.
+    often as the recipe's `retries` allow. If the whole solution misses the `target`, the windows
+    are trained again, to smaller errors. If it is still wrong, a warning names the window and the
+    error.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
-    same arguments; the result is the same, bit for bit, as without the stop. A finished one can be
-    continued with a recipe of more epochs. The result is that of all epochs at once unless the
-    optimiser depends on their number, as SPRING does.
+    same arguments, or with a recipe of more epochs; the result is the same, bit for bit, as without
+    the stop, unless the optimiser depends on the number of epochs, as SPRING does.
 
     **Arguments:**
 
@@ -78,9 +74,9 @@ def fit(
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time; with `data` it is
         optional.
     - `key`: a random key. The same key gives the same result.
-    - `sample`: for a flow map, initial states, stacked along a leading axis, a function from a
-        random key to one of them, or a [`diffrax_conserve.learned.Pool`][]. Default: the states of
-        `data`, or else all of the `domain`, if that is a [`diffrax_conserve.learned.Box`][].
+    - `sample`: for a flow map, initial states, stacked along a leading axis, or a function from a
+        random key to one of them. Default: the states of `data`, or else all of the `domain`, if
+        that is a [`diffrax_conserve.learned.Box`][].
     - `data`: for a flow map, trajectories `(ts, ys)`: increasing times of shape `(n, k)`, and
         states with leading axes `(n, k)`. [`diffrax_conserve.learned.trajectories`][] computes
         some.
@@ -129,7 +125,7 @@ def fit(
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
     created = time.perf_counter()
-    check_types(vector_field, key, recipe, state, progress, target=target, seconds=seconds)
+    check_types(key, recipe, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     loop = Loop(
         problem,
@@ -144,7 +140,9 @@ def fit(
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)
     trained, log = _train_flow_map(loop, network, state)
-    return restored(trained.flow_map if isinstance(trained, OfPairs) else trained, model), log
+    trained: Any = trained.flow_map if isinstance(trained, OfPairs) else trained
+    # A function is its own weights.
+    return trained if isinstance(model, AbstractFlowMap) else trained.weights(), log
 
 
 def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:

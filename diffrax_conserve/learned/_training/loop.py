@@ -29,22 +29,18 @@ class FitLog(eqx.Module):
 
     - `error`: the estimated error of the solution, for each leaf of the state relative to its
         largest component: for a `PINN` the largest in the whole interval, for a flow map the root
-        mean square for its longest step, over states from `sample`. The estimate solves the
-        differential equation of the error, driven by the defect. Infinity if there is none, or a
-        window was not trained.
+        mean square for its longest step, over states from `sample`. Infinity if there is no
+        estimate, or a window was not trained.
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points (with a
-        [`diffrax_conserve.learned.Pool`][] on its states for the next epoch) with all iterations of
-        the conservative layer.
-    - `best_epoch`, `best`: the epoch of the returned model, and its criterion; for several windows
-        those of the worst.
+        the compared values: the loss on the first collocation points with all iterations of the
+        conservative layer.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
-    - `seconds`, `compile_seconds`: the wall times of the training, and of all that comes before its
-        first epoch, which is mostly compilation.
+    - `seconds`, `compile_seconds`: the wall times of the training, and of all before its first
+        epoch.
     - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
     """
 
@@ -53,8 +49,6 @@ class FitLog(eqx.Module):
     losses: np.ndarray
     checked: np.ndarray
     criteria: np.ndarray
-    best_epoch: int
-    best: float
     skipped: int
     ended: str
     seconds: float
@@ -78,7 +72,6 @@ class Loop:
     compile_seconds: float = 0.0
     compiled: Any = None
     pace: float = 0.0  # seconds for an epoch; 0 if that is not known
-    first: int = 0  # the number of epochs before this call of `fit`
     saved: float = -math.inf  # time of the last save; `saving` is its duration
     saving: float = 0.0
 
@@ -108,11 +101,9 @@ class Loop:
         close_enough: Callable[[Carry], bool],
         estimate: Callable[[Any], float],
     ) -> tuple[FitState, Carry, str]:
-        """Trains one network to its last epoch, or until the training ends earlier.
-
-        Returns the state to go on from, and the carry with the best model. They differ if the time
-        is over between two comparisons: a training that goes on must not make one more.
-        """
+        """Trains one network. Returns the state to go on from, the carry with the best model, and
+        why it ended. The first two differ if the time is over between two comparisons: a training
+        that goes on must not make one more."""
         recipe, ended = self.problem.recipe, ""
         self._compile(objective, state, estimate)
         try:
@@ -141,9 +132,8 @@ class Loop:
         skipped = int(state.carry.skipped)
         if skipped and skipped == state.done:
             raise FloatingPointError(
-                f"None of the {skipped} updates was finite, so nothing was learned, although the "
-                "vector field is finite at the initial states. It may not be finite where the "
-                "network leads, or the updates are too long: lower the learning rate."
+                f"None of the {skipped} updates was finite. The vector field may not be finite "
+                "where the network leads, or the updates are too long: lower the learning rate."
             )
         shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
         return state, shown.carry, ended
@@ -172,12 +162,10 @@ class Loop:
 
     @property
     def elapsed(self) -> float:
-        """The time since the end of the compilation, which takes `compile_seconds`."""
         return time.perf_counter() - self.created - self.compile_seconds if self.compiled else 0.0
 
     def save(self, state: FitState, always: bool = False) -> None:
-        """Writes a checkpoint, unless the time since the last one is short compared with its
-        duration."""
+        """Writes a checkpoint, unless the last took a twentieth of the time since then."""
         begun = time.perf_counter()
         if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
             return
@@ -188,7 +176,6 @@ class Loop:
     def log(
         self, state: FitState, carry: Carry, ended: str, error: float, errors: Any = ()
     ) -> FitLog:
-        """The log of a training that ends with `state` and `carry`."""
         found = dataclasses.replace(state, carry=carry).closed()
         return FitLog(
             error=error,
@@ -196,8 +183,6 @@ class Loop:
             losses=found.losses,
             checked=found.checked,
             criteria=found.criteria,
-            best_epoch=found.worst_epoch,
-            best=found.worst,
             skipped=found.skipped,
             ended=ended,
             seconds=self.elapsed,
@@ -215,11 +200,10 @@ class Loop:
         lowered = compilable.lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
         self.compiled = lowered.compile()
         estimate(objective.best(state.carry))
-        self.first = state.losses.size + max(state.done, 0)
         self.compile_seconds = time.perf_counter() - self.created
 
     def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
-        """Calls the function `progress`, or prints a line."""
+        """Calls the function `progress`, or prints a line for each tenth of the epochs."""
         if self.progress is False:
             return
         rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
@@ -230,16 +214,10 @@ class Loop:
         if self.progress is not True:
             self.progress(done, total, float(loss), best)
             return
-        # On a terminal one line is overwritten; a file gets one for each tenth of the epochs.
-        terminal = sys.stderr.isatty()
-        if not (terminal or done == total or done % max(total // 10, 1) == 0):
+        if not (done == total or done % max(total // 10, 1) == 0):
             return
         parts = [f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"]
         if done and (error := estimate()):
             parts.append(f"estimated error {error:.1e}")
         parts.append(f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile")
-        if done > self.first:
-            left = self.elapsed / (done - self.first) * (total - done)
-            parts.append(f"{min(left, self.seconds - self.elapsed):.0f} s left")
-        ending = "\r" if terminal and done < total else "\n"
-        print(", ".join(parts), end=ending, file=sys.stderr, flush=True)
+        print(", ".join(parts), file=sys.stderr, flush=True)

@@ -1,7 +1,7 @@
 """The compiled part of a training: the loss, and the epochs that minimise it.
 
-The defect `du/dt - f(t, u)` is computed at a batch of collocation points by one forward-mode pass.
-A `vmap` of forward passes takes twice as long, and reverse mode six times as long.
+The defect `du/dt - f(t, u)` is computed at all points by one forward-mode pass. A `vmap` of forward
+passes takes twice as long, and reverse mode six times as long.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike
 from ..._tree import tree_all_finite, tree_sub
-from .._networks.domain import Box, FramedBox
 from .._networks.trainable import AbstractTrainable, LayerSchedule, Points, Sampler
 from .data import Data
-from .pool import Pool, moved
 from .recipe import Recipe
 from .second_order import LeastSquares, SecondOrder, squared_norms
 
@@ -39,7 +37,6 @@ class Problem(eqx.Module):
     recipe: Recipe
 
     def field(self, t: Any, y: Any) -> Any:
-        """The vector field with its `args`."""
         assert self.vector_field is not None
         return self.vector_field(t, y, self.args)
 
@@ -62,7 +59,6 @@ class Problem(eqx.Module):
         return model.measured(points, tree_sub(rates, jax.vmap(self.field)(ts, y)))
 
     def typical(self, model: AbstractTrainable, points: Points) -> Float[Array, ""]:
-        """The median of `|f|²` over the initial states."""
         if self.vector_field is None:
             return jnp.ones(())
         starts = model.starts(points)
@@ -75,13 +71,9 @@ class Carry(NamedTuple):
 
     weights: Any
     optimiser_state: Any
-    points: Points
     best_weights: Any
     best: Float[Array, ""]
-    best_epoch: Int[Array, ""]
     skipped: Int[Array, ""]
-    domain: Any  # around all states of a pool; `best_domain` belongs to the best model
-    best_domain: Any
     losses: Float[Array, " epochs"]
 
 
@@ -112,13 +104,12 @@ class Objective(eqx.Module):
         squares = squared_norms(self.defects(weights, points, schedule))
         return self.problem.recipe.loss(squares, self.typical)
 
-    def criterion(self, weights: Any, points: Points) -> Float[Array, ""]:
+    def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss with all iterations of the layer, as the trained model is used."""
-        loss = self.loss(weights, points, self.complete())
+        loss = self.loss(weights, self.first_points, self.complete())
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def complete(self) -> LayerSchedule:
-        """The schedule with all iterations of the conservative layer."""
         layer = self.static.layer
         return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
 
@@ -129,12 +120,16 @@ class Objective(eqx.Module):
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
+    def points(self, epoch: Int[Array, ""]) -> Points:
+        refresh = self.problem.recipe.refresh
+        if refresh is None:
+            return self.first_points
+        drawn = epoch - epoch % refresh
+        fresh = self.problem.draw(self.static, jr.fold_in(self.key, drawn))
+        return _where(drawn == 0, self.first_points, fresh)
+
     def best(self, carry: Carry) -> Any:
-        """The best model so far."""
-        model = eqx.combine(carry.best_weights, self.static)
-        if carry.best_domain is None:
-            return model
-        return eqx.tree_at(lambda m: m.domain, model, carry.best_domain)
+        return eqx.combine(carry.best_weights, self.static)
 
 
 @eqx.filter_jit
@@ -146,18 +141,12 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
-    domain = getattr(model, "domain", None) if isinstance(problem.sample, Pool) else None
-    domain = domain if isinstance(domain, Box | FramedBox) else None
     carry = Carry(
         weights=weights,
         optimiser_state=problem.recipe.optimiser.init(weights),
-        points=points,
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
-        best_epoch=jnp.asarray(0),
         skipped=jnp.asarray(0),
-        domain=domain,
-        best_domain=domain,
         losses=jnp.full(problem.recipe.epochs, jnp.nan, dtype),
     )
     # No array is weakly typed, because the compiled epochs return none that is.
@@ -182,65 +171,34 @@ def advance(
     stop: Int[Array, ""],
     compare: Bool[Array, ""],
 ) -> tuple[Carry, Float[Array, ""]]:
-    """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far.
-
-    The last three may be traced, so that all calls share one compilation.
-    """
+    """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far."""
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
-    criterion, best = _compared(objective, carry)
-    better = compare & (criterion < best)
+    criterion = objective.criterion(carry.weights)
+    better = compare & (criterion < carry.best)
     carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
-        best_domain=_where(better, carry.domain, carry.best_domain),
-        best=jnp.where(better, criterion, jnp.where(compare, best, carry.best)),
-        best_epoch=jnp.where(better, stop, carry.best_epoch),
+        best=jnp.where(better, criterion, carry.best),
     )
     return carry, criterion
 
 
-def _compared(objective: Objective, carry: Carry) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The criterion of the model, and that of the best one so far."""
-    if not isinstance(objective.problem.sample, Pool):
-        return objective.criterion(carry.weights, objective.first_points), carry.best
-    # The states of a pool move, so both models are compared on the points of the next epoch, on
-    # which with `refresh=1` neither has been trained.
-    best = objective.criterion(carry.best_weights, carry.points)
-    best = jnp.where(jnp.isfinite(carry.best), best, jnp.inf).astype(carry.best.dtype)
-    return objective.criterion(carry.weights, carry.points), best
-
-
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
-    """One update, and the points for the next one."""
+    """One update."""
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If not, continue from the best model: the same weights and points would give the same result.
-    fresh, domain = objective.problem.recipe.optimiser.init(carry.best_weights), carry.domain
-    if domain is not None:
-        # Earlier, the network may have moved states where no solution goes.
-        late = 2 * epoch >= objective.problem.recipe.epochs
-        domain = _where(late, domain.extended(carry.points.y0s), domain)
-    carry = carry._replace(
+    fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
+    return carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
-        domain=domain,
         skipped=carry.skipped + jnp.where(finite, 0, 1),
         losses=carry.losses.at[epoch].set(loss.astype(carry.losses.dtype)),
     )
-    refresh, following = objective.problem.recipe.refresh, epoch + 1
-    if refresh is None:
-        return carry
-    points = lax.cond(
-        following % refresh == 0,
-        lambda: fresh_points(objective, carry, following),
-        lambda: carry.points,
-    )
-    return carry._replace(points=points)
 
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
-    """The next weights and state of the optimiser, and the loss."""
     optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
-    weights, points, state = carry.weights, carry.points, carry.optimiser_state
+    weights, points, state = carry.weights, objective.points(epoch), carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
         updates, state = optimiser.update(gradient, state, weights)
@@ -261,22 +219,6 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     fraction = epoch / objective.problem.recipe.epochs
     vector, state, loss = optimiser.update(least_squares, vector, state, fraction, objective.linear)
     return restore(vector), state, loss
-
-
-def fresh_points(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Points:
-    """The points for `epoch`. The states of a pool are moved by the network."""
-    problem, key = objective.problem, jr.fold_in(objective.key, epoch)
-    points = problem.draw(objective.static, key)
-    if not isinstance(problem.sample, Pool):
-        return points
-
-    def squares(steps: Points) -> Float[Array, " points"]:
-        return squared_norms(objective.defects(carry.weights, steps, objective.complete()))
-
-    model = eqx.combine(carry.weights, objective.static)
-    old, new, key = carry.points.y0s, points.y0s, jr.fold_in(key, 0)
-    y0s = moved(problem.sample, model, problem.args, squares, objective.typical, old, new, key)
-    return points._replace(y0s=y0s)
 
 
 def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:

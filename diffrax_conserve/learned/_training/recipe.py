@@ -26,24 +26,20 @@ def staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
 
 
 def complete(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
-    """All iterations of the layer from the first epoch on."""
     del epochs
     return jnp.full_like(epoch, steps), jnp.ones_like(epoch, float)
 
 
 def mean(squares: Array, typical: Array) -> Float[Array, ""]:
-    """The mean of the squared norms of the defects."""
     del typical
     return jnp.mean(squares)
 
 
 def uniform(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
-    """Independent times."""
     return jr.uniform(key, (count,), minval=first, maxval=last)
 
 
 def grid(key: PRNGKeyArray, count: int, first: Any, last: Any) -> Float[Array, " points"]:
-    """Equally spaced times."""
     del key
     return jnp.linspace(first, last, count)
 
@@ -86,9 +82,6 @@ class Recipe(eqx.Module):
                 f"`optimiser` is {self.optimiser!r}, but it must be one of optax, or "
                 "`diffrax_conserve.learned.SPRING()` or `LevenbergMarquardt()`."
             )
-        for name in ("schedule", "loss", "times"):
-            if not callable(getattr(self, name)):
-                raise TypeError(f"`{name}` is {getattr(self, name)!r}, not a function.")
 
 
 Recipe.__init__.__doc__ = r"""**Arguments:**
@@ -96,8 +89,7 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `epochs`: the number of updates; each uses all collocation points.
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
-    [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3, for gradients of a
-    norm of at most 1.
+    [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3 and clipping.
 - `schedule`: for a network with a conservative layer, a function of the epoch (traced), the number
     of epochs and the number of iterations in the layer, which returns $p$ and $s$. The network is
     trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations.
@@ -107,13 +99,11 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
     jnp.mean(q / (1 + q / typical))` states that change too fast for the network do not dominate.
 - `times`: a function from a key, a number of points, the first and the last time to the times of
     the points. Default: independent and uniform.
-- `taylor`: the order of the Taylor polynomial that `fit` gives to a
-    [`diffrax_conserve.DeepONet`][] without one, if it is trained with a vector field that changes
-    slowly enough in the longest step. Default: 0, none.
+- `taylor`: the order of the polynomial that a [`diffrax_conserve.DeepONet`][] without one gets, if
+    the vector field changes slowly enough in the longest step. Default: 0, none.
 - `refresh`: the number of epochs after which new points are drawn. Default: never.
 - `check_every`: the number of epochs after which the model is compared with the best one so far.
-- `retries`: how often a window of a `PINN` that failed is cut in halves. With 0 windows are judged
-    but not trained again.
+- `retries`: how often a window of a `PINN` that failed is cut in halves.
 """
 
 

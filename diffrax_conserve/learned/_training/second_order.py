@@ -1,14 +1,11 @@
 r"""Second-order training: each update solves a linear least-squares problem in the weights.
 
 With the defects of all collocation points in one vector $r(\theta)$ and its Jacobian $J$, an update
-$\delta$ minimises $|J \delta + r|^2 + \lambda |\delta - \zeta|^2$. The two methods differ in the
-points, in the damping $\lambda$, and in $\zeta$.
+$\delta$ minimises $|J \delta + r|^2 + \lambda |\delta - \zeta|^2$. A loss $\ell$ of the squared
+norms $q_i$ that is not their mean gives each point the weight $\partial \ell / \partial q_i$, which
+leaves the gradient the same.
 
-A loss $\ell$ of the squared norms $q_i$ of the defects other than their mean is converted to least
-squares by giving each point the weight $\partial \ell / \partial q_i$, which leaves the gradient
-the same.
-
-Both are written here because no library has them: optax has no method for least squares, and the
+Both methods are written here because no library has them: optax has none for least squares, and the
 Levenberg-Marquardt of optimistix damps all weights alike and took 9.4 s for a step of 0.1 s here.
 """
 
@@ -32,17 +29,14 @@ Loss = Callable[[Float[Array, " points"], Float[Array, ""]], Float[Array, ""]]
 
 
 def squared_norms(vectors: Float[Array, "points n"]) -> Float[Array, " points"]:
-    """The squared norms of vectors stacked along a leading axis."""
     return jnp.sum(jnp.square(vectors), axis=1)
 
 
 class LeastSquares(NamedTuple):
     """The problem of one update, as a function of the weights in one vector."""
 
-    # The defects at every point, and their Jacobian.
     defects: Callable[[Float[Array, " weights"]], Float[Array, "points n"]]
     jacobian: Callable[[Float[Array, " weights"]], Float[Array, "points n weights"]]
-    # The loss as a function of the squared norms of the defects, and the typical square.
     loss: Loss
     typical: Float[Array, ""]
 
@@ -75,7 +69,7 @@ class SPRING(eqx.Module):
     $$\delta = \zeta - J^\top (J J^\top + \lambda I)^{-1} (r + J \zeta),$$
 
     with a damping $\lambda$ proportional to the loss. The size of the matrix is the number of
-    equations, 750 for 250 points of a system of three, for any size of the network. After the first
+    equations, 750 for 250 points of a system of three, or that of weights, if it is smaller. After
     two fifths of the epochs the length of the updates decreases linearly to zero, so that the noise
     of the batches averages out.
 
@@ -122,7 +116,6 @@ _LENGTH = optax.linear_schedule(1.0, 0.0, 0.6, transition_begin=0.4)  # pyright:
 
 
 def _solve(gram: Array, damping: Array, rhs: Array) -> Array:
-    """The solution of `(gram + damping I) x = rhs`."""
     matrix = gram + damping * jnp.eye(rhs.size, dtype=rhs.dtype)
     return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), rhs)
 
@@ -141,10 +134,10 @@ class LevenbergMarquardt(eqx.Module):
     An update that does not reduce the loss is rejected, and the damping $\lambda$ is increased;
     after an update that reduces the loss as the linear model predicts, it is decreased.
 
-    The output of a network is linear in the weights of its last layer. Those are damped far less,
-    by $10^{-12} \lambda$, so that every update solves for them almost exactly, as in variable
-    projection: with equal damping the residual reaches $10^{-5}$ instead of $10^{-10}$. The problem
-    is ill-conditioned, and therefore solved by a QR factorisation of $J$.
+    The weights of the last layer, in which the output is linear, are damped far less, by $10^{-12}
+    \lambda$, so that every update solves for them almost exactly, as in variable projection: with
+    equal damping the residual reaches $10^{-5}$ instead of $10^{-10}$. The problem is
+    ill-conditioned, and therefore solved by a QR factorisation of $J$.
 
     ??? cite "Reference"
 

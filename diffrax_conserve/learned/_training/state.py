@@ -34,12 +34,10 @@ class FitState(eqx.Module):
     finished: int = 0
     passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
     tightening: float = 1.0  # by which the limit of a window's error is divided
-    # The records of all networks, and of those before the present one the values of the worst.
-    losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))  # without the present ones
+    # The records of all networks; in `losses` and `skipped` without the present one.
+    losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
     checked: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0, int))
     criteria: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
-    worst: float = -1.0
-    worst_epoch: int = 0
     skipped: int = 0
 
     def compared(self, criterion: float) -> "FitState":
@@ -50,13 +48,9 @@ class FitState(eqx.Module):
 
     def closed(self) -> "FitState":
         """This state with all of its present network in the records."""
-        best, before = float(self.carry.best), self.losses.size
-        worse = best > self.worst
         return dataclasses.replace(
             self,
             losses=np.concatenate([self.losses, np.asarray(self.carry.losses)]),
-            worst=best if worse else self.worst,
-            worst_epoch=before + int(self.carry.best_epoch) if worse else self.worst_epoch,
             skipped=self.skipped + int(self.carry.skipped),
             done=-1,
             trained=self.trained + 1,
@@ -69,10 +63,8 @@ class FitState(eqx.Module):
             raise ValueError("`state` is that of a training of another kind of network.")
         if self.done >= epochs or (self.finished and len(self.networks) > 1):
             raise ValueError(
-                f"The training whose `state` was given has made all its {self.done} epochs, and "
-                f"the recipe has {epochs}. Give one with more, such as "
-                "`dataclasses.replace(recipe, epochs=...)`; a `PINN` of several windows cannot go "
-                "on."
+                f"The training of `state` has made all its {self.done} epochs. Give a recipe with "
+                "more: `dataclasses.replace(recipe, epochs=...)`; several windows cannot go on."
             )
         losses = self.carry.losses[:epochs]
         losses = jnp.concatenate([losses, jnp.full(epochs - losses.size, jnp.nan, losses.dtype)])
@@ -80,8 +72,8 @@ class FitState(eqx.Module):
 
 
 def fingerprint(given: Any, recipe: Any) -> str:
-    """A hash of the arrays in what was given to `fit` and of the recipe as it prints, which
-    identifies a training. It may be continued with more epochs."""
+    """A hash of the arrays that were given to `fit` and of the recipe as it prints, up to its
+    epochs, which identifies a training."""
     digest = hashlib.sha256()
     for leaf in jtu.tree_leaves(eqx.filter(given, eqx.is_array)):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -110,10 +102,7 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
         try:
             header = json.loads(file.readline())
             if (header["format"], header["mark"]) != (_FORMAT, mark):
-                raise ValueError(
-                    "it is of another training, whose network, key or recipe differs. Give the "
-                    "same arguments, or another file"
-                )
+                raise ValueError("it is of another training, with other arguments")
             count, losses, checked, epochs = header["sizes"]
             like = dataclasses.replace(
                 like,
@@ -131,4 +120,4 @@ def read_checkpoint(path: Path, like: FitState, mark: str) -> FitState:
             ) from error
 
 
-_FORMAT = 3
+_FORMAT = 4

@@ -26,10 +26,9 @@ from .errors import relative, window_errors
 from .loop import FitLog, Loop
 from .state import FitState
 
-# A solution with a larger error than this, relative to its largest component, counts as wrong.
-_WRONG = 1e-4
-# The error that is aimed at without a `target`; in single precision `_WRONG`.
-_AIM = 1e-7
+# Without a `target`: the error above which a solution is wrong, relative to its largest component,
+# and the one that is aimed at in double precision.
+_WRONG, _AIM = 1e-4, 1e-7
 # A safety factor: errors of windows add up, and later windows may amplify them.
 _GROWTH = 20
 # The number of times that all windows may be trained again, to smaller errors.
@@ -88,19 +87,11 @@ class _Windows:
     pinn: PINN
     manifold: Manifold | None
 
-    @property
-    def wrong(self) -> float:
-        """The error above which a solution is wrong."""
-        return _WRONG if self.loop.target is None else self.loop.target
-
-    @property
-    def aim(self) -> float:
-        """The error that is aimed at."""
-        return self.wrong if self.pinn.scale.dtype != jnp.float64 else self.loop.target or _AIM
-
-    @property
-    def retries(self) -> int:
-        return self.loop.problem.recipe.retries
+    def __post_init__(self):
+        target, double = self.loop.target, self.pinn.scale.dtype == jnp.float64
+        self.wrong: float = target or _WRONG
+        self.aim: float = (target or _AIM) if double else self.wrong
+        self.retries: int = self.loop.problem.recipe.retries
 
     def edges(self, state: FitState) -> np.ndarray:
         return np.array([*(float(window.start) for window in state.networks), self.pinn.t1])
@@ -111,8 +102,8 @@ class _Windows:
         return share * (self.aim if self.retries else self.wrong) / (_GROWTH * state.tightening)
 
     def own_error(self, window: Window) -> float:
-        """The largest error of a window alone, relative to the larger of the solution in it and the
-        initial state."""
+        """The largest error of a window alone, relative to the solution in it or the initial
+        state."""
         found = window_errors(window, self.loop.problem, jnp.zeros_like(self.pinn.scale))
         size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(self.pinn.y0))))
         return relative(found.largest[0], size, self.pinn.y0)
@@ -150,8 +141,8 @@ class _Windows:
         return _projected(manifold, args, self.pinn.t0, self.pinn.y0, t, y)
 
     def next(self, state: FitState) -> FitState:
-        """The state for the next training: of the first half of the window, of the next window, or
-        of the first that is not accurate enough for the whole solution."""
+        """The state for the training of the first half of the window, of the next window, or of the
+        first that is not accurate enough for the whole solution."""
         k = state.present
         failed = ~(np.array(state.errors) <= self.limits(state))
         # After a window that has finally failed the others start at a wrong state.
@@ -201,27 +192,20 @@ class _Windows:
         )
 
     def warn(self, state: FitState, along: list[float]) -> None:
-        """Warns, with the window that is wrong and its error."""
+        """Warns, with the first window that failed, or else the one with the largest error."""
         errors, edges = np.array(state.errors), self.edges(state)
         failed = np.flatnonzero(~(errors <= self.limits(state)))
         k = int(failed[0]) if failed.size else int(np.argmax(along))
-        if np.isinf(errors[k]):
-            fault = "was not trained, or its error cannot be estimated"
-        elif failed.size:
-            fault = f"has an estimated error of {errors[k]:.2g} by itself"
-        else:
-            fault = "is where errors of earlier windows have grown largest"
         warnings.warn(
             f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of "
             f"the largest component, above {self.wrong:.2g}. Window {k} of {errors.size}, from "
-            f"{edges[k]:.6g} to {edges[k + 1]:.6g}, {fault}. Use more windows, more `width` or "
-            "more `epochs`, or a recipe with `retries`.",
+            f"{edges[k]:.6g} to {edges[k + 1]:.6g}, has an estimated error of {errors[k]:.2g} by "
+            "itself. Use more windows, more `width` or more `epochs`, or a recipe with `retries`.",
             stacklevel=4,
         )
 
 
 def _replaced(state: FitState, k: int, windows: list[Window], errors: list[float]) -> FitState:
-    """The state with these windows in the place of the `k`th."""
     networks, old = list(state.networks), list(state.errors)
     networks[k : k + 1], old[k : k + 1] = windows, errors
     return dataclasses.replace(state, networks=tuple(networks), errors=tuple(old))
