@@ -79,7 +79,7 @@ class Network(eqx.Module):
 
 
 def projected(solver, manifold):
-    options = dict(projection=dfc.Newton(rtol=1e-9), max_correction=None)
+    options = dict(projection=dfc.Newton(), max_correction=None)
     return dfc.ManifoldProjection(solver, manifold, **options)
 
 
