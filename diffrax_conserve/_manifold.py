@@ -54,7 +54,8 @@ class FirstIntegral(eqx.Module):
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
-    be differentiated) that returns a PyTree of real arrays. Every element is one first integral.
+    be differentiated) that returns a PyTree of real arrays. Every element is one first integral. It
+    is differentiated in reverse mode, in which JAX has no `while_loop`.
 - `value`: the conserved value at the start of a solve, a PyTree like the one that `fn` returns.
     Default: that of the initial state.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,

@@ -53,7 +53,7 @@ class Directional(AbstractProjection):
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    max_steps: int = option(20, static=True)
+    max_steps: int = option(50, static=True)
     metric: None = eqx.field(default=None, init=False)
     sees_step: ClassVar[bool] = True
 

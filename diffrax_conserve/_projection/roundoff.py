@@ -5,7 +5,7 @@ terms of the hidden layers cancel. Each operand `v` of an operation has an error
 unit in the last place. With the adjoint `v̄` it changes the value by `v̄ v` units of roundoff, and
 as errors are independent, all together by the root of the sum of squares. A product passes relative
 errors on, so operands of sums and functions count. What does not depend on the state has the same
-error at each evaluation, which is none here.
+error at each evaluation, which is none here; the error of the state itself is in the gradient.
 """
 
 import functools as ft
@@ -28,6 +28,13 @@ logistic pow sin sinh tan tanh
 _COUNTED = frozenset(_NAMES.split())
 # Sums of products, each with an error of its own.
 _PRODUCTS = {"dot_general", "conv_general_dilated"}
+# What these take from the state is still the state.
+_PARTS = """
+broadcast_in_dim concatenate convert_element_type gather reshape rev slice split squeeze stack
+transpose unstack
+"""
+# How a value depends on the state: not at all, as a part of it, or as computed from it.
+_CONSTANT, _STATE, _COMPUTED = range(3)
 
 
 def hidden_terms(
@@ -58,22 +65,23 @@ def hidden_terms(
     return jnp.where(jnp.isfinite(total), total, 0)
 
 
-# A value, and whether it depends on the state.
-_Pair = tuple[Any, bool]
+# A value, and how it depends on the state.
+_Pair = tuple[Any, int]
 
 
 def _constant(x: Any) -> _Pair:
-    return x, False
+    return x, _CONSTANT
 
 
 def _evaluated(closed: Any, y: Array, changed: Callable[[Any, Any], Any]) -> Array:
     """The value of a jaxpr whose operands are `changed(x, size)` where they depend on `y`."""
-    return walk(closed, [(y, True)], _constant, ft.partial(_equation, changed))[0][0]
+    return walk(closed, [(y, _STATE)], _constant, ft.partial(_equation, changed))[0][0]
 
 
 def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
     name, params = eqn.primitive.name, eqn.params
-    inputs, moves = [x for x, _ in given], any(moves for _, moves in given)
+    inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
+    kind = _COMPUTED if kind == _STATE and name not in _PARTS.split() else kind
     inside = ft.partial(walk, constant=_constant, equation=ft.partial(_equation, changed))
     inner = params.get("call_jaxpr")
     if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
@@ -84,19 +92,20 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
         branches = [inside(branch, given[1:]) for branch in params["branches"]]
         which = jnp.clip(inputs[0].astype(int), 0, len(branches) - 1)
         return [
-            (jnp.stack([x for x, _ in outs])[which], any(flag for _, flag in outs))
+            (jnp.stack([x for x, _ in outs])[which], max(kind for _, kind in outs))
             for outs in zip(*branches, strict=True)
         ]
     if name == "scan":
-        return [(x, moves) for x in _scanned(changed, params, inputs)]
+        return [(x, kind) for x in _scanned(changed, params, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
-    counted = [own and jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x, own in given]
-    if name in _PRODUCTS and any(counted):
-        return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), True)]
+    inexact = [jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in inputs]
+    if name in _PRODUCTS and kind and all(inexact):
+        return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), _COMPUTED)]
     if name in _COUNTED or list(jex.jaxprs_in_params(params)):
-        inputs = [changed(x, x) if own else x for x, own in zip(inputs, counted, strict=True)]
+        own = [kind == _COMPUTED and is_real for (_, kind), is_real in zip(given, inexact)]
+        inputs = [changed(x, x) if counts else x for x, counts in zip(inputs, own, strict=True)]
     outs = evaluate(*inputs)
-    return [(x, moves) for x in (outs if eqn.primitive.multiple_results else [outs])]
+    return [(x, kind) for x in (outs if eqn.primitive.multiple_results else [outs])]
 
 
 def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:
@@ -112,7 +121,7 @@ def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any])
                 sizes.append(size)
                 return x if given is None else x + next(given)
 
-            values = [(x, True) for x in (*consts, *carry, *x[0])]
+            values = [(x, _COMPUTED) for x in (*consts, *carry, *x[0])]
             outs = walk(params["jaxpr"], values, _constant, ft.partial(_equation, shifted))
             outs = [x for x, _ in outs]
             return outs[: last - first], (outs[last - first :], sizes)

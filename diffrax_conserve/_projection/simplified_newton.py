@@ -21,8 +21,9 @@ class SimplifiedNewton(AbstractProjection):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    With more than four constraints the matrix is that at the candidate, factored once. Two
-    iterations are enough for nearly every step of an integrator. For candidates far away use
+    Two iterations are enough for nearly every step of an integrator. With more than four scalar
+    constraints the matrix is that at the candidate, factored once, so that after a long step it
+    takes more iterations, and fails sooner. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
     Success is judged at the returned state, relative to the scale of the constraints there.
@@ -51,7 +52,7 @@ class SimplifiedNewton(AbstractProjection):
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    max_steps: int = option(20, static=True)
+    max_steps: int = option(50, static=True)
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
