@@ -98,14 +98,16 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if name == "scan":
         return [(x, kind) for x in _scanned(changed, params, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
-    inexact = [jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in inputs]
-    if name in _PRODUCTS and kind and all(inexact):
+    if name in _PRODUCTS and kind and _is_inexact(*inputs):
         return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), _COMPUTED)]
     if name in _COUNTED or list(jex.jaxprs_in_params(params)):
-        own = [kind == _COMPUTED and is_real for (_, kind), is_real in zip(given, inexact)]
-        inputs = [changed(x, x) if counts else x for x, counts in zip(inputs, own, strict=True)]
+        inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
     outs = evaluate(*inputs)
     return [(x, kind) for x in (outs if eqn.primitive.multiple_results else [outs])]
+
+
+def _is_inexact(*xs: Any) -> bool:
+    return all(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in xs)
 
 
 def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:

@@ -39,7 +39,7 @@ class SetupError(Exception):
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
     """The solvers to compare, in the order of the table and the legends."""
-    # The paper projects whatever RK4 proposes, steps of the double pendulum too long for it as well.
+    # The paper projects whatever RK4 proposes, too long steps of the double pendulum as well.
     projected = ManifoldProjection(RK4(), system.manifold, max_correction=None)
     classical = {"rk4": RK4(), "projected rk4": projected}
     return classical | (learned_solvers(system, networks) if networks else {})
