@@ -13,7 +13,7 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold
-from ..._options import check_number
+from ..._options import check_number, is_real
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
@@ -38,6 +38,8 @@ def check_types(key: Any, recipe: Any, **limits: Any) -> None:
             f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`."
         )
     for name, value in limits.items():
+        if value is not None and not (is_real(value) and np.ndim(value) == 0):
+            raise TypeError(f"`{name}` is {value!r}, but it must be one real number, or `None`.")
         check_number(name, value, above=0.0)
 
 

@@ -1,10 +1,7 @@
 """`fit`: trains a network from the vector field alone, or from data."""
 
-import dataclasses
 import math
-import os
 import time
-from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -19,7 +16,7 @@ from .errors import flow_map_error
 from .loop import FitLog, Loop, Progress
 from .objective import Carry, VectorField
 from .recipe import Recipe
-from .state import FitState, fingerprint
+from .state import FitState
 from .windows import train_windows
 
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -38,7 +35,6 @@ def fit(
     state: FitState | None = None,
     target: float | None = None,
     seconds: float | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone, or a flow map from data, or from both.
@@ -86,14 +82,13 @@ def fit(
         [`diffrax_conserve.learned.second_order`][]`(model)`.
     - `manifold`: for a `PINN`, the manifold to which the ends of the windows are
         projected, with the conserved values at the initial state. Default: that of its layer.
-    - `state`: the `state` in the log of a training that is to be continued.
+    - `state`: the `state` in the log of a training that is to be continued. That of a flow map can
+        be kept in a file, by `equinox.tree_serialise_leaves`.
     - `target`: for a flow map, the loss at which the training ends; default: none. For a `PINN`,
         the accepted estimated error of its solution, relative to its largest component. Default:
         windows are cut until the error is about 1e-7 (1e-4 in single precision), and a solution
         with an error above 1e-4 counts as wrong.
     - `seconds`: ends the training after this wall time, without the compilation.
-    - `checkpoint`: a file for the state of the training, which is updated regularly; if it exists,
-        the training continues from it.
     - `progress`: whether to print a line on standard error, or a function that is called regularly
         with the number of epochs done, the total number, the last loss and the best criterion.
 
@@ -133,8 +128,6 @@ def fit(
         target=None if target is None else float(target),
         seconds=math.inf if seconds is None else seconds,
         progress=progress,
-        checkpoint=None if checkpoint is None else Path(checkpoint),
-        mark=fingerprint((model, key, args, vector_field), problem.recipe),
         created=created,
     )
     if isinstance(model, PINN):
@@ -154,11 +147,6 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
     def close(carry: Carry) -> bool:
         return loop.target is not None and float(carry.best) <= loop.target
 
-    carry, ended = state.carry, "epochs"
-    if not state.finished:
-        state, carry, ended = loop.train(objective, state, close, error)
-        finished = int(state.done >= loop.problem.recipe.epochs)
-        state = dataclasses.replace(state, finished=finished)
-    loop.save(state, always=True)
+    state, carry, ended = loop.train(objective, state, close, error)
     trained = objective.best(carry)
     return trained, loop.log(state, carry, ended, error(trained))

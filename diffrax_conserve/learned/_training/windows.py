@@ -60,12 +60,10 @@ def train_windows(
                 break
             state, ended = windows.next(shown), "epochs"
             shown = state
-            loop.save(state)
     except KeyboardInterrupt:
         if not state.trained:
             raise
         ended = "interrupt"
-    loop.save(state, always=True)
     along = windows.errors_along(shown)
     if not max(along) <= windows.wrong:
         windows.warn(shown, along)
