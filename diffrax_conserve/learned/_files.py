@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._manifold import Constraint, FirstIntegral
-from .._replace_file import replace_file
 from ..systems import AbstractSystem
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
@@ -36,6 +35,7 @@ from ._networks.layer import ConservativeLayer
 from ._networks.pinn import PINN
 from ._networks.taylor import Taylor
 from ._networks.wrappers import BoxCox, Repeated, Transformed
+from ._replace_file import replace_file
 
 PathLike = str | os.PathLike[str]
 Network = PINN | DeepONet | Transformed | Repeated

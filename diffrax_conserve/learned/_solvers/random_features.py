@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
-from ..._solver.terms import check_ode
+from ..._solver.terms import is_ode
 from .chebyshev import ChebyshevInterpolation, multiply
 from .feature_basis import FeatureBasis, feature_basis
 from .sweeps import increment
@@ -110,7 +110,11 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> None:
         del t0, t1, args
-        check_ode(terms, "RandomFeatureSolver")
+        if not is_ode(terms):
+            raise TypeError(
+                "`RandomFeatureSolver` solves ordinary differential equations: pass a "
+                "`diffrax.ODETerm`, or for a stochastic equation another solver: `diffrax.Heun()`."
+            )
         check_state(y0, "`RandomFeatureSolver`")
 
     def step(
