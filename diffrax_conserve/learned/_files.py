@@ -64,11 +64,10 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     **Arguments:**
 
     - `path`: where to write.
-    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]; the latter also
-        in a [`diffrax_conserve.learned.Transformed`][] with a
-        [`diffrax_conserve.learned.BoxCox`][], and in a [`diffrax_conserve.learned.Repeated`][]. The
-        functions in its layer, polynomial and frame are stored by name if they are those of a
-        system of the catalogue; others must be passed to [`diffrax_conserve.load`][] again.
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter also
+        in [`diffrax_conserve.learned.Transformed`][] (with a `BoxCox`) or `Repeated`. Functions in
+        its layer, polynomial and frame are stored by name if they are those of a system of the
+        catalogue; others must be passed to [`diffrax_conserve.load`][] again.
     - `info`: what JSON can express, for [`diffrax_conserve.learned.read_info`][].
 
     **Raises:**
@@ -109,8 +108,7 @@ def load(
     **Arguments:**
 
     - `path`: the file.
-    - `layer`, `taylor`, `frame`: the conservative layer, the Taylor polynomial, and the function
-        that finds the frame, if they are not in the file: see [`diffrax_conserve.save`][].
+    - `layer`, `taylor`, `frame`: the parts of the network that are not in the file.
 
     **Returns:**
 
@@ -134,11 +132,7 @@ def load(
 
 
 def read_info(path: PathLike) -> dict[str, Any]:
-    """What a file says about its network, without building it.
-
-    **Arguments:**
-
-    - `path`: the file.
+    """What the file `path` says about its network, without building it.
 
     **Returns:**
 
@@ -165,16 +159,8 @@ def read_info(path: PathLike) -> dict[str, Any]:
 
 
 def pretrained_path(name: str) -> Path:
-    """The file of a network that comes with the package.
-
-    **Arguments:**
-
-    - `name`: as for [`diffrax_conserve.load_pretrained`][].
-
-    **Raises:**
-
-    `ValueError` for an unknown name; the message lists the known names.
-    """
+    """The file of a network that comes with the package, of a `name` as for
+    [`diffrax_conserve.load_pretrained`][]. Raises a `ValueError` for another name."""
     folder = Path(__file__).parents[1] / "pretrained"
     known = {file.stem: file for file in sorted(folder.glob("*.network"))}
     if name not in known:
@@ -187,11 +173,11 @@ def pretrained_path(name: str) -> Path:
 def load_pretrained(name: str) -> Network:
     """A network that comes with the package.
 
-    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
-    trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
-    trained by [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of
-    eccentricities up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of
-    stiff chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
+    For each of the paper's five systems there are `SYSTEM-standard` and, with a conservative layer,
+    `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
+    [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
+    up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
+    chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
 
     **Arguments:**
 
@@ -206,8 +192,7 @@ def load_pretrained(name: str) -> Network:
         ```python
         import diffrax_conserve as dfc
 
-        pinn = dfc.load_pretrained("rigid-body")
-        pinn(1.0)
+        dfc.load_pretrained("rigid-body")(1.0)
         ```
     """
     return load(pretrained_path(name))
@@ -223,9 +208,8 @@ def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
         raise ValueError(f"{path} holds no network that `save` wrote, or is truncated.")
     if version != b"%d" % _VERSION:
         raise ValueError(
-            f"The file {path} has format {version.decode()[:9]}, but this version of "
-            f"diffrax-conserve reads {_VERSION}. Upgrade diffrax-conserve, or convert an older "
-            "file as the changelog says."
+            f"The file {path} has format {version.decode()[:9]}, but this version reads "
+            f"{_VERSION}. Upgrade diffrax-conserve, or convert the file as the changelog says."
         )
     if hashlib.sha256(rest).hexdigest().encode() != digest:
         raise ValueError(
@@ -249,7 +233,7 @@ def _well_formed(path: PathLike) -> Iterator[None]:
     except Exception as error:
         raise ValueError(
             f"The file {path} is malformed, though its checksum is right: "
-            f"{type(error).__name__}, {str(error)[:300]}. `save` does not write such files."
+            f"{type(error).__name__}, {str(error)[:300]}."
         ) from error
 
 
@@ -287,9 +271,8 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
         return {type(x).__name__: {f: _describe_field(x, f, arrays) for f in _fields(type(x))}}
     raise TypeError(
         f"The network holds {x!r:.200}, which a file cannot describe. It can hold a `PINN` or a "
-        "`DeepONet`, also `Transformed` by a `BoxCox` or `Repeated`, with a named activation "
-        "function, and a state of tuples, lists and dictionaries with strings as keys. For others "
-        "use `equinox.tree_serialise_leaves`."
+        "`DeepONet`, also `Transformed` by a `BoxCox` or `Repeated`, a named activation function, "
+        "and tuples, lists and dictionaries. Else use `equinox.tree_serialise_leaves`."
     )
 
 
@@ -339,10 +322,8 @@ def _build(described: Any, body: io.BytesIO, given: dict[str, Any]) -> Any:
             attribute, argument = _GIVEN[field]
             part, given[field] = given[field], None
             if part is None or getattr(part, attribute, None) != number:
-                raise _NotGiven(
-                    "The network has functions that no file can hold. Give them again: "
-                    f"`load(path, {argument.format(str(number)[:20])})`."
-                )
+                call = f"load(path, {argument.format(str(number)[:20])})"
+                raise _NotGiven(f"A file cannot hold all functions. Give them again: `{call}`.")
             return part
     return _module(_CLASSES[kind], {f: _build(x, body, given) for f, x in content.items()})
 

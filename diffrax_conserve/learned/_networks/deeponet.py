@@ -174,10 +174,6 @@ class DeepONet(AbstractFlowMap):
         """A state such as the network expects."""
         return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
 
-    @property
-    def frame(self) -> MakeFrame | None:
-        return None if isinstance(self.domain, Box) else self.domain.make
-
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         return rate if isinstance(self.domain, Box) else self.domain.frame(y0).measure(rate)
 
@@ -200,20 +196,19 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `core`: $N$, one fully connected network of the state and the step,
-    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
-    feeds the input into each of its layers; or as in the literature, and less accurate at the same
-    size, [`diffrax_conserve.learned.Product`][].
+- `core`: one network of the state and the step, [`diffrax_conserve.learned.Concatenated`][]; or
+    [`diffrax_conserve.learned.Gated`][], which feeds the input into each layer; or as in the
+    literature, and less accurate at the same size, [`diffrax_conserve.learned.Product`][].
 - `latent`: the number $L$ of products in each component of a `Product`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][], whose inputs $N$
-    then gets. The domain consists of all states whose inputs are in the box around those of
-    `states` and whose clock is not faster than theirs.
+    then gets. The domain is all states with inputs in the box around those of `states` and a clock
+    that is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
-- `args_domain`: the smallest and the largest `args` of the vector field, as a
-    [`diffrax_conserve.learned.Box`][]. The network and its polynomial then take `args` as inputs.
+- `args_domain`: a [`diffrax_conserve.learned.Box`][] of the `args` of the vector field, which the
+    network and its polynomial then take as inputs.
 
 **Raises:**
 

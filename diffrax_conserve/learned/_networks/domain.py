@@ -96,9 +96,8 @@ class Frame(eqx.Module):
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
     and commutes with the symmetries for all weights. $\tau_{\max}$ is the largest own time of
-    `max_step` among the states with which it was built. Examples are the methods `frame` of
-    [`diffrax_conserve.systems.PointVortices`][] and of [`diffrax_conserve.systems.Kepler`][], which
-    return the three as a tuple.
+    `max_step`. See `frame` of [`diffrax_conserve.systems.PointVortices`][] and of
+    [`diffrax_conserve.systems.Kepler`][], which return the three as a tuple.
 
     !!! example
 

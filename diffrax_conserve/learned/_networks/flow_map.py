@@ -42,10 +42,8 @@ class AbstractFlowMap(AbstractTrainable):
 
     @abc.abstractmethod
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`.
-
-        `fit` passes the `schedule` of the conservative layer.
-        """
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`. `fit` passes
+        the `schedule` of the conservative layer."""
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         """A rate of change of the solution through `y0`, in the units of the loss."""
@@ -90,10 +88,7 @@ class AbstractFlowMap(AbstractTrainable):
 
 @final
 class FlowMap(AbstractFlowMap):
-    """A function `(y0, h) -> y` with an attribute `max_step`, and perhaps others of a flow map.
-
-    `fit` trains all its arrays.
-    """
+    """A function `(y0, h) -> y` with an attribute `max_step`, and perhaps others of a flow map."""
 
     function: Callable[..., Any]
     max_step: RealScalarLike
@@ -108,8 +103,7 @@ class FlowMap(AbstractFlowMap):
         if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
             raise TypeError(
                 f"The `domain` of the flow map is {self.domain!r}, which has no method "
-                "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
-                "method."
+                "`contains(y)`, as `diffrax_conserve.learned.Box` has."
             )
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:

@@ -31,11 +31,9 @@ class ConservativeLayer(eqx.Module):
 
     This is Newton's method in $\lambda$, with rows scaled to norm one and a damping
     $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale. An iteration
-    moves a state by at most the size of a state. Derivatives of the network include the layer, by
-    the implicit function theorem for $g(y) = r$ with the remaining residual $r$.
-
-    For a state on the manifold to roundoff, wrap the solver in
-    [`diffrax_conserve.ManifoldProjection`][].
+    moves a state by at most the size of a state. Derivatives include the layer, by the implicit
+    function theorem for $g(y) = r$ with the remaining residual $r$. For a state on the manifold to
+    roundoff, wrap the solver in [`diffrax_conserve.ManifoldProjection`][].
 
     !!! example
 

@@ -34,9 +34,7 @@ def check_types(key: Any, recipe: Any, **limits: Any) -> None:
     if not is_key:
         raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
     if not isinstance(recipe, Recipe | None):
-        raise TypeError(
-            f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`."
-        )
+        raise TypeError(f"`recipe` is {recipe!r}, but it must be a `learned.Recipe`.")
     for name, value in limits.items():
         if value is not None and not (is_real(value) and np.ndim(value) == 0):
             raise TypeError(f"`{name}` is {value!r}, but it must be one real number, or `None`.")
@@ -92,7 +90,7 @@ def _of_flow_map(
         if not isinstance(flow_map.domain, Box):
             raise ValueError(
                 "This flow map has no `domain` to draw initial states from: pass `sample`, states "
-                "or a function from a random key to one, for example `sample=system.sample`."
+                "or a function from a random key to one."
             )
         sample = flow_map.domain.sample
     if domain is not None:
@@ -117,15 +115,11 @@ def _with_taylor(network: Any, problem: Problem, vector_field: VectorField) -> A
     if not (order and isinstance(inner, DeepONet) and inner.taylor is None):
         return network
     # The polynomial helps only if the field changes by little in a step, at most of the states.
-    if not inner.max_step * _rate_of_change(problem) <= _SLOW:
+    if not inner.max_step * _rate_of_change(problem) <= 3.0:
         return network
     taylor = Taylor(vector_field, order, args=problem.args)
     inner = eqx.tree_at(lambda m: m.taylor, inner, taylor, is_leaf=lambda x: x is None)
     return OfPairs(inner) if isinstance(network, OfPairs) else inner
-
-
-# In units of the field itself.
-_SLOW = 3.0
 
 
 @eqx.filter_jit
@@ -150,8 +144,8 @@ def _check_manifold(model: Any, manifold: Manifold | None) -> None:
     refuse_rates(manifold, "a training")
     if not isinstance(model, PINN):
         raise ValueError(
-            "`manifold` is for the windows of a `PINN`. To conserve its integrals give the network "
-            "a `layer`, or wrap its solver in `ManifoldProjection`."
+            "`manifold` is for the windows of a `PINN`. Give the network a `layer`, or wrap its "
+            "solver in `ManifoldProjection`."
         )
 
 

@@ -111,10 +111,8 @@ _STATES, _SUBSTEPS = 64, 32
 
 
 def relative(errors: Any, sizes: Any, example: Y) -> float:
-    """The largest of `errors`, each relative to the largest component of its leaf.
-
-    Infinity if any error is not finite.
-    """
+    """The largest of `errors`, each relative to the largest component of its leaf; infinity if any
+    is not finite."""
     errors, sizes = (unflatten(jnp.asarray(x), example) for x in (errors, sizes))
 
     def of_leaf(error: Array, size: Array) -> float:

@@ -27,15 +27,13 @@ class FitLog(eqx.Module):
 
     **Attributes:**
 
-    - `error`: the estimated error of the solution, for each leaf of the state relative to its
-        largest component: for a `PINN` the largest in the whole interval, for a flow map the root
-        mean square for its longest step, over states from `sample`. Infinity if there is no
-        estimate, or a window was not trained.
+    - `error`: the estimated error, for each leaf of the state relative to its largest component: of
+        a `PINN` the largest in the interval, of a flow map the root mean square for its longest
+        step, over states from `sample`. Infinity if it is unknown, or a window was not trained.
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points with all iterations of the
-        conservative layer.
+        what was compared: the loss on the first collocation points with all iterations of a layer.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
@@ -158,12 +156,11 @@ class Loop:
         found = dataclasses.replace(state, carry=carry).closed()
         # The records of a network have one criterion more than losses.
         compared = np.flatnonzero(~np.isnan(found.criteria))
-        checked = compared - compared // carry.criteria.size
         return FitLog(
             error=error,
             errors=np.asarray(errors),
             losses=found.losses,
-            checked=checked,
+            checked=compared - compared // carry.criteria.size,
             criteria=found.criteria[compared],
             skipped=found.skipped,
             ended=ended,

@@ -107,17 +107,15 @@ class Objective(eqx.Module):
 
     def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss with all iterations of the layer, as the trained model is used."""
-        loss = self.loss(weights, self.first_points, self.complete())
-        return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
-
-    def complete(self) -> LayerSchedule:
         layer = self.static.layer
-        return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
+        complete = jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
+        loss = self.loss(weights, self.first_points, complete)
+        return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
         layer, recipe = self.static.layer, self.problem.recipe
         if layer is None:
-            return self.complete()
+            return jnp.asarray(0), jnp.ones(())
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
