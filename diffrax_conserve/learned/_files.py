@@ -90,8 +90,8 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     path, arrays = _file(path), []
     header = {"network": _describe(model, arrays), "info": info or {}}
     _check(model)
-    text = json.dumps(header, allow_nan=False).encode()
-    rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
+    text = json.dumps(header, allow_nan=False).encode() + b"\n"
+    rest = b"".join([text, *(x.tobytes() for x in arrays)])
     first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
     replace_file(path, lambda temporary: temporary.write_bytes(first + rest))
 
@@ -212,9 +212,7 @@ def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
             f"{_VERSION}. Upgrade diffrax-conserve, or convert the file as the changelog says."
         )
     if hashlib.sha256(rest).hexdigest().encode() != digest:
-        raise ValueError(
-            f"The file {path} is truncated or damaged: its contents do not match its checksum."
-        )
+        raise ValueError(f"The file {path} is truncated or damaged: its checksum is another.")
     text, _, body = rest.partition(b"\n")
     with _well_formed(path):
         header = json.loads(text)

@@ -27,10 +27,9 @@ class DeepONet(AbstractFlowMap):
     $$u(h) = u_0 + \frac{h}{\Delta} S N(u_0, h)$$
 
     with steps $h$ up to $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. With `taylor`, which
-    [`diffrax_conserve.fit`][] adds by default, it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$:
-    see [`diffrax_conserve.learned.Taylor`][]. With a `layer` the output is projected to the
-    manifold of the conserved values at $u_0$. With a `frame` it commutes with the symmetries of the
-    equations: see [`diffrax_conserve.learned.Frame`][].
+    [`diffrax_conserve.fit`][] adds by default, it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$.
+    With a `layer` the output is projected to the manifold of the conserved values at $u_0$. With a
+    `frame` it commutes with the symmetries of the equations.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -90,8 +89,7 @@ class DeepONet(AbstractFlowMap):
             )
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
-                f"`core` is {core!r}, but it must be `diffrax_conserve.learned.Concatenated`, "
-                "`Gated` or `Product`."
+                f"`core` is {core!r}, but it must be `learned.Concatenated`, `Gated` or `Product`."
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
@@ -127,10 +125,7 @@ class DeepONet(AbstractFlowMap):
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
-            raise ValueError(
-                f"This `DeepONet` is for states of {size} numbers, but was given one of "
-                f"{start.size}."
-            )
+            raise ValueError(f"This `DeepONet` is for states of {size} numbers, not {start.size}.")
         h = jnp.asarray(h).astype(start.dtype)
         known = self._known(args)
         if isinstance(self.domain, Box):
@@ -190,9 +185,9 @@ class DeepONet(AbstractFlowMap):
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
-- `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
-    $N$ gets $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to
-    $[-1, 1]$. The box around them is the `domain` of the flow map.
+- `states`: initial states, stacked along a leading axis: any PyTree of real arrays. $N$ gets
+    $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to $[-1, 1]$. The
+    box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.

@@ -21,9 +21,8 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
-    [`diffrax_conserve.DeepONet`][] is a flow map. Solvers and [`diffrax_conserve.fit`][] make one
-    from a Module `(y0, h) -> y` with an attribute `max_step`, and optionally `order`, `domain` and
-    `args_domain`.
+    Solvers and [`diffrax_conserve.fit`][] also take a Module `(y0, h) -> y` with an attribute
+    `max_step`, and optionally `order`, `domain` and `args_domain`.
 
     **Attributes:**
 
@@ -138,9 +137,7 @@ def args_domain_of(model: Any) -> Box | None:
 def checked_box(args_domain: Any) -> Box | None:
     """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
     if not isinstance(args_domain, Box | None):
-        raise TypeError(
-            f"`args_domain` is {args_domain!r}, but it must be a `diffrax_conserve.learned.Box`."
-        )
+        raise TypeError(f"`args_domain` is {args_domain!r}, but it must be a `learned.Box`.")
     return args_domain
 
 

@@ -21,8 +21,8 @@ class Taylor(eqx.Module):
     u'(0) = f(u_0), \quad u''(0) = f'(u_0) f(u_0), \quad \dots$$
 
     A [`diffrax_conserve.DeepONet`][] with it learns the remainder, $u(h) = T_q(u_0, h) +
-    (h/\Delta)^{q+1} S N(u_0, h)$, and is a method of order $q$ for all weights. The cost doubles
-    with each order, which pays only if $h$ times the rate of change of $f$ is not much above one.
+    (h/\Delta)^{q+1} S N(u_0, h)$, and is a method of order $q$. The cost doubles with each order,
+    which pays only if $h$ times the rate of change of $f$ is not much above one.
 
     !!! example
 

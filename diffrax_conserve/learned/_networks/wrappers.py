@@ -76,13 +76,10 @@ class Repeated(AbstractWrapper):
 
         ```python
         import diffrax_conserve as dfc
-        import jax
 
-        system = dfc.systems.get("conservative-lorenz")
-        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
-        half = dfc.DeepONet(states, 0.125, key=jax.random.key(1))
+        half = dfc.load_pretrained("conservative-lorenz-standard")
         flow_map = dfc.learned.Repeated(half, 2)
-        assert flow_map.max_step == 0.25
+        assert flow_map.max_step == 2 * half.max_step
         ```
     """
 
@@ -209,8 +206,7 @@ class Transformed(AbstractWrapper):
         there = self.transformation.inverse(z1)
 
         def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
-            # Where the step changes nothing, the roundoff of the transformation and its inverse is
-            # removed. The derivatives are those of `y`.
+            # Where the step changes nothing there is no roundoff. The derivatives are those of `y`.
             exact = lax.stop_gradient(y0) + (y - lax.stop_gradient(y))
             return jnp.where(z0 == z1, exact, y).astype(y0.dtype)
 

@@ -39,7 +39,7 @@ _BACKWARDS = register(
 _ANOTHER_FIELD = register(
     "the flow map was not trained for this vector field: at the initial state its slope for h -> 0 "
     "is another. Solve the equation that it was trained for, with the same parameters, or pass "
-    "`check_field=False` to the solver to use it all the same."
+    "`check_field=False`."
 )
 _NOT_FINITE = register(
     "a state is not finite: the initial one, or that of the flow map after a step. Start where the "

@@ -29,8 +29,8 @@ from .sweeps import increment
 _FEWEST, _MOST = 3, 32
 _UNSOLVED = register(
     "the equations of a step of `RandomFeatureSolver` were not solved. Newton's method diverged, "
-    "or the vector field is not finite near the step. Take smaller steps: a smaller `dt0`, or with "
-    "`diffrax.PIDController`, which tries them by itself, a smaller `dtmin`."
+    "or the vector field is not finite near the step. Take smaller steps: a smaller `dt0`, or a "
+    "smaller `dtmin` of `diffrax.PIDController`."
 )
 
 
@@ -89,8 +89,7 @@ class RandomFeatureSolver(dfx.AbstractSolver[None]):
     def __check_init__(self):
         if not (isinstance(self.features, int) and _FEWEST <= self.features <= _MOST):
             raise ValueError(
-                f"`features` must be an integer from {_FEWEST} to {_MOST}, but is "
-                f"{self.features!r}."
+                f"`features` must be an integer from {_FEWEST} to {_MOST}, not {self.features!r}."
             )
 
     def order(self, terms: dfx.AbstractTerm) -> int:

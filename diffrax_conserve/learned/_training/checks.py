@@ -30,8 +30,7 @@ from .recipe import Recipe, second_order
 
 def check_types(key: Any, recipe: Any, **limits: Any) -> None:
     """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
-    is_key = eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)
-    if not is_key:
+    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
         raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
     if not isinstance(recipe, Recipe | None):
         raise TypeError(f"`recipe` is {recipe!r}, but it must be a `learned.Recipe`.")
@@ -103,8 +102,8 @@ def _of_flow_map(
         field = None if field is None else eqx.Partial(field_of_pairs, field)
         sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
-    if found is not None and field is not None and sample is None:
-        sample = found.sample
+    if found is not None and field is not None:
+        sample = sample or found.sample
     return flow_map, Problem(field, args, sample, found, recipe)
 
 

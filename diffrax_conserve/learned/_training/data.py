@@ -93,10 +93,10 @@ def trajectories(
     - `vector_field`, `args`: as for [`diffrax_conserve.learned.reachable_states`][].
     - `y0s`: states at time 0, stacked along a leading axis.
     - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
-    - `solver`, `dt0`: any diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and
-        its fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
-    - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
-        component of all `y0s`.
+    - `solver`, `dt0`: a diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and its
+        fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
+    - `rtol`, `atol`: tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
+        component of `y0s`.
 
     **Returns:**
 
@@ -231,7 +231,7 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     if not places.size:
         raise ValueError(
             "No two times of a trajectory in `data` are within the `max_step` of the flow map, "
-            f"{flow_map.max_step}. Give it a longer one, or data with shorter steps."
+            f"{flow_map.max_step}. Give it a longer one."
         )
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
     pairs = whole.draw(_MANY, jr.key(0))

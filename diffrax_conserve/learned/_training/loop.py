@@ -130,8 +130,7 @@ class Loop:
         """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
         if math.isinf(self.seconds) or goal == 0:
             return goal
-        left = self.seconds - self.elapsed
-        if left <= self.pace / 2:
+        if (left := self.seconds - self.elapsed) <= self.pace / 2:
             return done
         # Half of the time, because the pace may change.
         return min(goal, done + max(1, int(left / (2 * self.pace)) if self.pace else 1))
@@ -193,11 +192,8 @@ class Loop:
         best = float(carry.best)
         if self.progress is not True:
             self.progress(done, total, loss, best)
-            return
-        if not (done == total or done % max(total // 10, 1) == 0):
-            return
-        parts = [f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"]
-        if done and (error := estimate()):
-            parts.append(f"estimated error {error:.1e}")
-        parts.append(f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile")
-        print(", ".join(parts), file=sys.stderr, flush=True)
+        elif done == total or done % max(total // 10, 1) == 0:
+            epoch = f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"
+            spent = f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile"
+            error = f"estimated error {estimate():.1e}"
+            print(epoch, error, spent, sep=", ", file=sys.stderr, flush=True)
