@@ -3,10 +3,10 @@
 A file is a line `diffrax-conserve network <version> <SHA-256 of all that follows>`, a line of JSON
 with the description of the network, and the bytes of its arrays.
 
-In a description numbers, strings and `None` are themselves. Everything else is an object with one
-entry: a container (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation`
-by name, a `method` of a system of the catalogue, a part that must be `given` again, or a class of
-this package with its fields. Reading calls only the checks of these classes.
+In a description numbers, strings and `None` are themselves. All else is an object with one entry: a
+container (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation` by name, a
+`method` of a system of the catalogue, a part that must be `given` again, or a class of this package
+with its fields. Reading calls only the checks of these classes.
 """
 
 import contextlib
@@ -116,8 +116,8 @@ def load(
 
     **Raises:**
 
-    `ValueError` if the file was not written by this version of `save`, is truncated or damaged, or
-    needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
+    `ValueError` if the file is not of this version, is truncated or damaged, or needs a `layer`,
+    `taylor` or `frame`; `OSError` if it cannot be read.
     """
     header, body = _read(path)
     given = {"layer": layer, "taylor": taylor, "make": frame}
@@ -147,12 +147,8 @@ def read_info(path: PathLike) -> dict[str, Any]:
         ```python
         import diffrax_conserve as dfc
 
-        found = dfc.learned.read_info(dfc.learned.pretrained_path("rigid-body-conservative"))
-        print(found["info"]["command"])
-        ```
-
-        ```text
-        python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship
+        path = dfc.learned.pretrained_path("rigid-body-conservative")
+        command = dfc.learned.read_info(path)["info"]["command"]  # that trained it
         ```
     """
     return _read(path)[0]

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
+from ..._options import check_number
 from ..._tree import unflatten, working_dtype
 from .cores import MLP, Activation, check_sizes
 from .flat import as_state, flatten, stacked_vectors
@@ -123,10 +124,9 @@ class PINN(eqx.Module):
         layer: ConservativeLayer | None = None,
     ):
         check_sizes(width=width, depth=depth, windows=windows)
+        check_number("slope", slope, above=0.0)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
-        if slope is not None and not slope > 0:
-            raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
         y0, length = as_state(y0), float(t1) - float(t0)
         self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
         dtype, n, count = working_dtype(y0), flatten(y0).size, windows

@@ -82,19 +82,15 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
     def __check_init__(self):
-        if not isinstance(self.nodes, int) or self.nodes < 2:
-            raise ValueError(f"`nodes` must be an integer of at least 2, but is {self.nodes!r}.")
+        for name, value, least in (("nodes", self.nodes, 2), ("corrections", self.corrections, 0)):
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` is {value!r}, but must be an integer from {least} on.")
         domains = self.flow_map.domain, args_domain_of(self.flow_map)
         check_policy(self.outside, self.max_error, any(d is not None for d in domains))
-        if not isinstance(self.corrections, int) or self.corrections < 0:
-            raise ValueError(
-                f"`corrections` is {self.corrections!r}, but it must be a number of sweeps."
-            )
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         del terms
-        # Order 0 implies no convergence, so report `None`.
-        return self._local_order(self.corrections) - 1 or None
+        return self._local_order(self.corrections) - 1 or None  # 0 is no convergence
 
     def error_order(self, terms: dfx.AbstractTerm) -> int:
         del terms
@@ -187,10 +183,9 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if the flow map has another signature or returns another structure than
-that of the state, if a number is invalid, or if `outside` needs a domain that it does not have. At
-run time a solve backwards in time or of another equation, a step that is too long, and a state that
-is not finite end with a failed [`result`][diffrax.RESULTS].
+`TypeError` or `ValueError` if the flow map does not map states to states, a number is invalid, or
+`outside` needs a domain. A solve backwards in time or of another equation, a step that is too long
+and a state that is not finite end with a failed [`result`][diffrax.RESULTS].
 """
 
 # An alias, named after the usual flow map.

@@ -51,10 +51,6 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         term = diffrax.ODETerm(system.vector_field)
         solution = diffrax.diffeqsolve(term, solver, 0.0, 1.75, 0.05, system.y0)
         ```
-
-    ??? cite "Reference"
-
-        M. Raissi, P. Perdikaris and G. E. Karniadakis, J. Comput. Phys. 378 (2019).
     """
 
     pinn: PINN

@@ -171,11 +171,7 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         term = diffrax.ODETerm(system.vector_field)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
         sol = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0, saveat=saveat)
-        print(dfc.learned.domain_statistics(sol).num_outside)
-        ```
-
-        ```text
-        0
+        assert dfc.learned.domain_statistics(sol).num_outside == 0
         ```
     """
     check_solution(sol, "domain_statistics")
