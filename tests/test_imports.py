@@ -26,11 +26,10 @@ _TREE = _TYPES | {"_tree"}
 _MANIFOLD = _TREE | {"_options", "_manifold"}
 _PROJECTION = _MANIFOLD | {"_balance"} | _PRINTING | {"_projection"}
 _CORE = _PROJECTION | {"_interpolation", "_solver", "_diagnostics"}
-_GUESTS = {"_replace_file", "learned", "systems"}
+_GUESTS = {"learned", "systems"}
 MAY_IMPORT = {
     "_custom_types": set(),
     "_printing": set(),
-    "_replace_file": set(),
     "_options": set(),
     "_tree": _TYPES,
     "_manifold": _TREE | {"_options"},
@@ -39,7 +38,7 @@ MAY_IMPORT = {
     "_interpolation": _PROJECTION,
     "_solver": _PROJECTION | {"_interpolation"},
     "_diagnostics": _PROJECTION,
-    "learned": _CORE | {"_replace_file", "systems"},
+    "learned": _CORE | {"systems"},
     "systems": _CORE,
     "testing": _CORE | {"systems"},
     PACKAGE: _CORE | _GUESTS,

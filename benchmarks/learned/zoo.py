@@ -261,7 +261,7 @@ def train_flow_map(system, spec, seed, key):
 
 def reaching(network, states):
     """The same network, with these states in its domain."""
-    seen = jax.vmap(lambda y: network.frame(y)[0])(states)
+    seen = jax.vmap(lambda y: network.domain.frame(y).inputs)(states)
     corners = lambda m: (m.domain.box.lower[0], m.domain.box.upper[0])  # noqa: E731
     lower, upper = corners(network)
     wider = jnp.minimum(lower, seen.min(axis=0)), jnp.maximum(upper, seen.max(axis=0))

@@ -28,21 +28,7 @@ def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
 
 def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
     """Whether every term is a `diffrax.ODETerm`, whose control is time."""
-    return not _others(terms)
-
-
-def check_ode(terms: PyTree[dfx.AbstractTerm], name: str) -> None:
-    """Raises unless every term is a `diffrax.ODETerm`."""
-    for term in _others(terms):
-        raise TypeError(
-            f"`{name}` solves ordinary differential equations, but is given a "
-            f"`{type(term).__name__}`. Pass a `diffrax.ODETerm`; for a stochastic equation take a "
-            "solver of diffrax, for example `diffrax.Heun()`."
-        )
-
-
-def _others(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:
-    return [x for x in _nested(terms) if not isinstance(x, (dfx.ODETerm, *_COMPOSED))]
+    return all(isinstance(x, (dfx.ODETerm, *_COMPOSED)) for x in _nested(terms))
 
 
 _COMPOSED = dfx.MultiTerm, WrapTerm, AdjointTerm

@@ -3,10 +3,10 @@
 A file is a line `diffrax-conserve network <version> <SHA-256 of all that follows>`, a line of JSON
 with the description of the network, and the bytes of its arrays.
 
-In a description numbers, strings and `None` are themselves. Everything else is an object with one
-entry: a container (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation`
-by name, a `method` of a system of the catalogue, a part that must be `given` again, or a class of
-this package with its fields. Reading calls only the checks of these classes.
+In a description numbers, strings and `None` are themselves. All else is an object with one entry: a
+container (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation` by name, a
+`method` of a system of the catalogue, a part that must be `given` again, or a class of this package
+with its fields. Reading calls only the checks of these classes.
 """
 
 import contextlib
@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._manifold import Constraint, FirstIntegral
-from .._replace_file import replace_file
 from ..systems import AbstractSystem
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
@@ -36,6 +35,7 @@ from ._networks.layer import ConservativeLayer
 from ._networks.pinn import PINN
 from ._networks.taylor import Taylor
 from ._networks.wrappers import BoxCox, Repeated, Transformed
+from ._replace_file import replace_file
 
 PathLike = str | os.PathLike[str]
 Network = PINN | DeepONet | Transformed | Repeated
@@ -64,11 +64,10 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     **Arguments:**
 
     - `path`: where to write.
-    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][]; the latter also
-        in a [`diffrax_conserve.learned.Transformed`][] with a
-        [`diffrax_conserve.learned.BoxCox`][], and in a [`diffrax_conserve.learned.Repeated`][]. The
-        functions in its layer, polynomial and frame are stored by name if they are those of a
-        system of the catalogue; others must be passed to [`diffrax_conserve.load`][] again.
+    - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter also
+        in [`diffrax_conserve.learned.Transformed`][] (with a `BoxCox`) or `Repeated`. Functions in
+        its layer, polynomial and frame are stored by name if they are those of a system of the
+        catalogue; others must be passed to [`diffrax_conserve.load`][] again.
     - `info`: what JSON can express, for [`diffrax_conserve.learned.read_info`][].
 
     **Raises:**
@@ -91,8 +90,8 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     path, arrays = _file(path), []
     header = {"network": _describe(model, arrays), "info": info or {}}
     _check(model)
-    text = json.dumps(header, allow_nan=False).encode()
-    rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
+    text = json.dumps(header, allow_nan=False).encode() + b"\n"
+    rest = b"".join([text, *(x.tobytes() for x in arrays)])
     first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
     replace_file(path, lambda temporary: temporary.write_bytes(first + rest))
 
@@ -109,8 +108,7 @@ def load(
     **Arguments:**
 
     - `path`: the file.
-    - `layer`, `taylor`, `frame`: the conservative layer, the Taylor polynomial, and the function
-        that finds the frame, if they are not in the file: see [`diffrax_conserve.save`][].
+    - `layer`, `taylor`, `frame`: the parts of the network that are not in the file.
 
     **Returns:**
 
@@ -118,8 +116,8 @@ def load(
 
     **Raises:**
 
-    `ValueError` if the file was not written by this version of `save`, is truncated or damaged, or
-    needs a `layer`, `taylor` or `frame`; `OSError` if it cannot be read.
+    `ValueError` if the file is not of this version, is truncated or damaged, or needs a `layer`,
+    `taylor` or `frame`; `OSError` if it cannot be read.
     """
     header, body = _read(path)
     given = {"layer": layer, "taylor": taylor, "make": frame}
@@ -134,11 +132,7 @@ def load(
 
 
 def read_info(path: PathLike) -> dict[str, Any]:
-    """What a file says about its network, without building it.
-
-    **Arguments:**
-
-    - `path`: the file.
+    """What the file `path` says about its network, without building it.
 
     **Returns:**
 
@@ -153,28 +147,16 @@ def read_info(path: PathLike) -> dict[str, Any]:
         ```python
         import diffrax_conserve as dfc
 
-        found = dfc.learned.read_info(dfc.learned.pretrained_path("rigid-body-conservative"))
-        print(found["info"]["command"])
-        ```
-
-        ```text
-        python benchmarks/learned/paper.py --system rigid-body --seed 0 --ship
+        path = dfc.learned.pretrained_path("rigid-body-conservative")
+        command = dfc.learned.read_info(path)["info"]["command"]  # that trained it
         ```
     """
     return _read(path)[0]
 
 
 def pretrained_path(name: str) -> Path:
-    """The file of a network that comes with the package.
-
-    **Arguments:**
-
-    - `name`: as for [`diffrax_conserve.load_pretrained`][].
-
-    **Raises:**
-
-    `ValueError` for an unknown name; the message lists the known names.
-    """
+    """The file of a network that comes with the package, of a `name` as for
+    [`diffrax_conserve.load_pretrained`][]. Raises a `ValueError` for another name."""
     folder = Path(__file__).parents[1] / "pretrained"
     known = {file.stem: file for file in sorted(folder.glob("*.network"))}
     if name not in known:
@@ -187,11 +169,11 @@ def pretrained_path(name: str) -> Path:
 def load_pretrained(name: str) -> Network:
     """A network that comes with the package.
 
-    For each of the paper's five systems there are `SYSTEM-standard` and `SYSTEM-conservative`,
-    trained by the paper's recipe, the latter with a conservative layer; and `SYSTEM`, small and
-    trained by [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of
-    eccentricities up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of
-    stiff chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
+    For each of the paper's five systems there are `SYSTEM-standard` and, with a conservative layer,
+    `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
+    [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
+    up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
+    chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
 
     **Arguments:**
 
@@ -206,8 +188,7 @@ def load_pretrained(name: str) -> Network:
         ```python
         import diffrax_conserve as dfc
 
-        pinn = dfc.load_pretrained("rigid-body")
-        pinn(1.0)
+        dfc.load_pretrained("rigid-body")(1.0)
         ```
     """
     return load(pretrained_path(name))
@@ -223,14 +204,11 @@ def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
         raise ValueError(f"{path} holds no network that `save` wrote, or is truncated.")
     if version != b"%d" % _VERSION:
         raise ValueError(
-            f"The file {path} has format {version.decode()[:9]}, but this version of "
-            f"diffrax-conserve reads {_VERSION}. Upgrade diffrax-conserve, or convert an older "
-            "file as the changelog says."
+            f"The file {path} has format {version.decode()[:9]}, but this version reads "
+            f"{_VERSION}. Upgrade diffrax-conserve, or convert the file as the changelog says."
         )
     if hashlib.sha256(rest).hexdigest().encode() != digest:
-        raise ValueError(
-            f"The file {path} is truncated or damaged: its contents do not match its checksum."
-        )
+        raise ValueError(f"The file {path} is truncated or damaged: its checksum is another.")
     text, _, body = rest.partition(b"\n")
     with _well_formed(path):
         header = json.loads(text)
@@ -249,7 +227,7 @@ def _well_formed(path: PathLike) -> Iterator[None]:
     except Exception as error:
         raise ValueError(
             f"The file {path} is malformed, though its checksum is right: "
-            f"{type(error).__name__}, {str(error)[:300]}. `save` does not write such files."
+            f"{type(error).__name__}, {str(error)[:300]}."
         ) from error
 
 
@@ -287,9 +265,8 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
         return {type(x).__name__: {f: _describe_field(x, f, arrays) for f in _fields(type(x))}}
     raise TypeError(
         f"The network holds {x!r:.200}, which a file cannot describe. It can hold a `PINN` or a "
-        "`DeepONet`, also `Transformed` by a `BoxCox` or `Repeated`, with a named activation "
-        "function, and a state of tuples, lists and dictionaries with strings as keys. For others "
-        "use `equinox.tree_serialise_leaves`."
+        "`DeepONet`, also `Transformed` by a `BoxCox` or `Repeated`, a named activation function, "
+        "and tuples, lists and dictionaries. Else use `equinox.tree_serialise_leaves`."
     )
 
 
@@ -339,10 +316,8 @@ def _build(described: Any, body: io.BytesIO, given: dict[str, Any]) -> Any:
             attribute, argument = _GIVEN[field]
             part, given[field] = given[field], None
             if part is None or getattr(part, attribute, None) != number:
-                raise _NotGiven(
-                    "The network has functions that no file can hold. Give them again: "
-                    f"`load(path, {argument.format(str(number)[:20])})`."
-                )
+                call = f"load(path, {argument.format(str(number)[:20])})"
+                raise _NotGiven(f"A file cannot hold all functions. Give them again: `{call}`.")
             return part
     return _module(_CLASSES[kind], {f: _build(x, body, given) for f, x in content.items()})
 

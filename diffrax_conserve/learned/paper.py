@@ -18,24 +18,15 @@ from ._training.recipe import Recipe, staged
 
 
 def pinn(y0: Y, t0: RealScalarLike, t1: RealScalarLike, **options: Any) -> PINN:
-    """A [`diffrax_conserve.PINN`][] of the paper's size: one window of four layers of 40 units.
-
-    **Arguments:**
-
-    - those of [`diffrax_conserve.PINN`][].
-    """
+    """A [`diffrax_conserve.PINN`][] of the paper's size, one window of four layers of 40 units,
+    with its other arguments."""
     sizes: dict[str, Any] = dict(windows=1, width=40, depth=4, slope=None)
     return PINN(y0, t0, t1, **(sizes | options))
 
 
 def deeponet(states: Y, max_step: RealScalarLike, **options: Any) -> DeepONet:
-    """A [`diffrax_conserve.DeepONet`][] of the paper's kind and size: 20 products of a branch and a
-    trunk for each component, both of four layers of 40 units.
-
-    **Arguments:**
-
-    - those of [`diffrax_conserve.DeepONet`][].
-    """
+    """A [`diffrax_conserve.DeepONet`][] of the paper's kind and size, 20 products of a branch and a
+    trunk for each component, both of four layers of 40 units, with its other arguments."""
     sizes: dict[str, Any] = dict(core=Product, width=40, depth=4, latent=20)
     return DeepONet(states, max_step, **(sizes | options))
 
@@ -44,11 +35,9 @@ def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) 
     """The recipe of the paper, with changes where it fails as published.
 
     From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
-    map 5,000 pairs of an initial state and a time and the projection schedule.
-
-    Changed, as "The paper, reproduced" explains: a PINN is projected from the first epoch on; the
-    weight of the last iteration rises within each stage; the loss of a flow map is bounded at each
-    point; gradients are clipped.
+    map 5,000 pairs of an initial state and a time and the projection schedule. Changed: a PINN is
+    projected from the first epoch on; the weight of the last iteration rises within each stage; the
+    loss of a flow map is bounded at each point; gradients are clipped.
 
     **Arguments:**
 

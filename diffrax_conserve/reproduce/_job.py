@@ -10,11 +10,11 @@ from typing import Any
 import diffrax as dfx
 import jax.tree_util as jtu
 
-from .._replace_file import replace_file
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
 from .._tree import tree_size
 from ..learned._files import save
+from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
 from ._solve import reason, run, state_errors
 from ._tables import metrics, table

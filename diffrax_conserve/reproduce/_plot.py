@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from .._replace_file import replace_file
+from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
 from ._solve import COMPARED_MAX, Run
 from ._trained import Learned

@@ -155,7 +155,7 @@ NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
 @pytest.mark.parametrize(
     ("make", "error", "text"),
     [
-        (lambda: Box(jnp.zeros(2), jnp.ones(3)), ValueError, "Both must be those of a state"),
+        (lambda: Box(jnp.zeros(2), jnp.ones(3)), ValueError, "but `upper` has"),
         (lambda: Box.around({"q": jnp.array(1.0)}), ValueError, "stacked along a leading axis"),
         (lambda: Box.around(states()).contains(DRIVEN0), ValueError, "for states of the structure"),
         (lambda: Box.around(1j * jnp.ones((3, 2))), TypeError, "real"),

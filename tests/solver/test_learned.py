@@ -179,7 +179,7 @@ STILL = dfx.ODETerm(lambda t, y, args: y), FOLLOW, 0.0, 1.0, 0.25
     [
         (lambda: unchecked(lambda y0, h: y0), TypeError, None),
         (lambda: dfc.PINNSolver(DEEPONET), TypeError, None),
-        (lambda: unchecked(DEEPONET, nodes=1), ValueError, "`nodes` must be an integer"),
+        (lambda: unchecked(DEEPONET, nodes=1), ValueError, "`nodes` is 1, but must be"),
         (lambda: unchecked(DEEPONET, corrections=-1), ValueError, "`corrections` is -1"),
         (
             lambda: dfx.diffeqsolve(*STILL, (LORENZ.y0, LORENZ.y0)),

@@ -1,7 +1,6 @@
 """A training tells the truth; it stops and goes on, bit for bit as if it had not stopped."""
 
 import dataclasses
-import time
 
 import equinox as eqx
 import jax
@@ -184,21 +183,31 @@ def same(found, expected):
     assert log.error == other_log.error
 
 
-@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
-def test_an_interrupted_training_goes_on(make):
-    network, options = make()
+def test_a_training_goes_on_from_a_file(tmp_path):
+    network, options = small_flow_map()
+    whole, path = dfc.fit(network, **options), tmp_path / "training"
+    # It ends before its first update.
+    like, log = dfc.fit(network, **options, seconds=1e-9)
+    like = like, log.state
+    model, log = dfc.fit(network, **options, progress=Interrupt(4))
+    for stop in (12, 99):
+        eqx.tree_serialise_leaves(path, (model, log.state))
+        model, state = eqx.tree_deserialise_leaves(path, like)
+        model, log = dfc.fit(model, **options, state=state, progress=Interrupt(stop))
+    assert log.ended == "epochs"
+    same((model, log), whole)
+
+
+def test_an_interrupted_training_goes_on():
+    network, options = small_pinn()
     whole = dfc.fit(network, **options)
     state, stops = None, Interrupt(4, 12, 45)
     for _ in range(4):
         model, log = dfc.fit(network, **options, state=state, progress=stops)
         state = log.state
-        if log.ended != "interrupt":
-            break
-        assert np.isfinite(log.criteria.min())
-        assert isinstance(model, type(network))
+    assert log.ended == "epochs"
     same((model, log), whole)
-    if isinstance(model, dfc.PINN):
-        assert model.windows > network.windows
+    assert model.windows > network.windows
 
 
 def test_it_ends_at_a_target_and_after_a_time():
@@ -216,34 +225,3 @@ def test_it_ends_at_a_target_and_after_a_time():
         _, log = dfc.fit(network, **options, seconds=1e-6)
     assert log.ended == "seconds"
     assert np.isinf(log.errors[1])
-
-
-@pytest.mark.parametrize("make", [small_flow_map, pytest.param(small_pinn, marks=pytest.mark.slow)])
-def test_a_checkpoint_is_the_state(make, tmp_path):
-    network, options = make()
-    path = tmp_path / "training.checkpoint"
-    whole = dfc.fit(network, **options)
-    _, log = dfc.fit(network, **options, checkpoint=path, progress=Interrupt(12))
-    assert log.ended == "interrupt"
-    again = dfc.fit(network, **options, checkpoint=path)
-    same(again, whole)
-    # Finished, it is read and nothing more is trained.
-    begun = time.perf_counter()
-    same(dfc.fit(network, **options, checkpoint=path), whole)
-    assert time.perf_counter() - begun < 10
-    with pytest.raises(ValueError, match="of another training"):
-        dfc.fit(network, **(options | dict(key=jr.key(6))), checkpoint=path)
-    for other in (
-        dict(args=jnp.array(1.0)),
-        dict(
-            recipe=dataclasses.replace(
-                options["recipe"], loss=lambda q, typical: jnp.mean(q) / typical
-            )
-        ),
-    ):
-        with pytest.raises(ValueError, match="of another training"):
-            dfc.fit(network, **(options | other), checkpoint=path)
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(ValueError, match="holds no checkpoint"):
-        dfc.fit(network, **options, checkpoint=path)
-    assert list(tmp_path.iterdir()) == [path]

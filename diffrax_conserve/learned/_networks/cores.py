@@ -181,10 +181,8 @@ class Concatenated(AbstractCore):
 
 @final
 class Gated(AbstractCore):
-    """A network of both inputs, whose hidden layers interpolate between two encodings of them.
-
-    `z ← a * z̃ + b * (1 - z̃)` with the output `z̃` of the layer for `z`. The input thus enters
-    every layer multiplicatively.
+    """A network of both inputs, whose hidden layers interpolate between two encodings of them,
+    `z ← a * z̃ + b * (1 - z̃)` with the output `z̃` of the layer for `z`.
 
     ??? cite "Reference"
 

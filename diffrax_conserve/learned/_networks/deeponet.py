@@ -27,10 +27,9 @@ class DeepONet(AbstractFlowMap):
     $$u(h) = u_0 + \frac{h}{\Delta} S N(u_0, h)$$
 
     with steps $h$ up to $\Delta$ = `max_step`; $u(0) = u_0$ for all weights. With `taylor`, which
-    [`diffrax_conserve.fit`][] adds by default, it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$:
-    see [`diffrax_conserve.learned.Taylor`][]. With a `layer` the output is projected to the
-    manifold of the conserved values at $u_0$. With a `frame` it commutes with the symmetries of the
-    equations: see [`diffrax_conserve.learned.Frame`][].
+    [`diffrax_conserve.fit`][] adds by default, it is $u(h) = T_q(u_0, h) + (h/\Delta)^{q+1} S N$.
+    With a `layer` the output is projected to the manifold of the conserved values at $u_0$. With a
+    `frame` it commutes with the symmetries of the equations.
 
     Train it by [`diffrax_conserve.fit`][], and step it by [`diffrax_conserve.DeepONetSolver`][].
 
@@ -90,8 +89,7 @@ class DeepONet(AbstractFlowMap):
             )
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
-                f"`core` is {core!r}, but it must be `diffrax_conserve.learned.Concatenated`, "
-                "`Gated` or `Product`."
+                f"`core` is {core!r}, but it must be `learned.Concatenated`, `Gated` or `Product`."
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
@@ -127,10 +125,7 @@ class DeepONet(AbstractFlowMap):
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
-            raise ValueError(
-                f"This `DeepONet` is for states of {size} numbers, but was given one of "
-                f"{start.size}."
-            )
+            raise ValueError(f"This `DeepONet` is for states of {size} numbers, not {start.size}.")
         h = jnp.asarray(h).astype(start.dtype)
         known = self._known(args)
         if isinstance(self.domain, Box):
@@ -174,10 +169,6 @@ class DeepONet(AbstractFlowMap):
         """A state such as the network expects."""
         return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
 
-    @property
-    def frame(self) -> MakeFrame | None:
-        return None if isinstance(self.domain, Box) else self.domain.make
-
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         return rate if isinstance(self.domain, Box) else self.domain.frame(y0).measure(rate)
 
@@ -194,26 +185,25 @@ class DeepONet(AbstractFlowMap):
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
-- `states`: representative initial states, stacked along a leading axis: any PyTree of real arrays.
-    $N$ gets $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to
-    $[-1, 1]$. The box around them is the `domain` of the flow map.
+- `states`: initial states, stacked along a leading axis: any PyTree of real arrays. $N$ gets
+    $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to $[-1, 1]$. The
+    box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `core`: $N$, one fully connected network of the state and the step,
-    [`diffrax_conserve.learned.Concatenated`][]; or [`diffrax_conserve.learned.Gated`][], which
-    feeds the input into each of its layers; or as in the literature, and less accurate at the same
-    size, [`diffrax_conserve.learned.Product`][].
+- `core`: one network of the state and the step, [`diffrax_conserve.learned.Concatenated`][]; or
+    [`diffrax_conserve.learned.Gated`][], which feeds the input into each layer; or as in the
+    literature, and less accurate at the same size, [`diffrax_conserve.learned.Product`][].
 - `latent`: the number $L$ of products in each component of a `Product`.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
 - `frame`: a function from a state to its [`diffrax_conserve.learned.Frame`][], whose inputs $N$
-    then gets. The domain consists of all states whose inputs are in the box around those of
-    `states` and whose clock is not faster than theirs.
+    then gets. The domain is all states with inputs in the box around those of `states` and a clock
+    that is not faster than theirs.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
-- `args_domain`: the smallest and the largest `args` of the vector field, as a
-    [`diffrax_conserve.learned.Box`][]. The network and its polynomial then take `args` as inputs.
+- `args_domain`: a [`diffrax_conserve.learned.Box`][] of the `args` of the vector field, which the
+    network and its polynomial then take as inputs.
 
 **Raises:**
 

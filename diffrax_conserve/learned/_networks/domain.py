@@ -19,8 +19,6 @@ from .flat import as_state, as_states, flatten
 class Box(eqx.Module):
     r"""The states between two corners, $l \le y \le u$ in every component.
 
-    As the `domain` of a flow map it can be replaced by any Module with a method `contains(y)`.
-
     !!! example
 
         ```python
@@ -29,9 +27,7 @@ class Box(eqx.Module):
 
         system = dfc.systems.get("conservative-lorenz")
         states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
-        box = dfc.learned.Box.around(states)
-        assert box.contains(states[0])
-        assert not box.contains(100 * states[0])
+        assert not dfc.learned.Box.around(states).contains(100 * states[0])
         ```
     """
 
@@ -41,10 +37,7 @@ class Box(eqx.Module):
     def __check_init__(self):
         lower, upper = tree_shapes(self.lower), tree_shapes(self.upper)
         if lower != upper:
-            raise ValueError(
-                f"`lower` has the structure {lower}, but `upper` has {upper}. Both must be those "
-                "of a state."
-            )
+            raise ValueError(f"`lower` has the structure {lower}, but `upper` has {upper}.")
 
     @classmethod
     def around(cls, states: Y) -> "Box":
@@ -96,9 +89,8 @@ class Frame(eqx.Module):
     $$u(h) = T_q(u_0, h) + (\tau / \tau_{\max})^{q+1} B(u_0) N(\text{inputs}, \tau),$$
 
     and commutes with the symmetries for all weights. $\tau_{\max}$ is the largest own time of
-    `max_step` among the states with which it was built. Examples are the methods `frame` of
-    [`diffrax_conserve.systems.PointVortices`][] and of [`diffrax_conserve.systems.Kepler`][], which
-    return the three as a tuple.
+    `max_step`. See `frame` of [`diffrax_conserve.systems.PointVortices`][] and of
+    [`diffrax_conserve.systems.Kepler`][], which return the three as a tuple.
 
     !!! example
 
@@ -140,10 +132,9 @@ Frame.__init__.__doc__ = r"""**Arguments:**
 
 - `inputs`: a vector of $k$ invariants of the symmetries, which differ for two states unless a
     symmetry maps one to the other.
-- `basis`: a matrix $B$ with a row for each component of the state, whose $m$ columns are
-    transformed like the state and span all directions in which a solution can leave it.
-- `clock`: the number of the frame's own units of time per unit of time; 1 unless the symmetries
-    include a change of scale.
+- `basis`: a matrix $B$ of shape $(n, m)$, whose columns are transformed like the state and span all
+    directions in which a solution can leave it.
+- `clock`: own time per unit of time; 1 unless the symmetries include a change of scale.
 """
 
 # A function from a state to its `Frame`, or to the tuple `(inputs, basis, clock)`.

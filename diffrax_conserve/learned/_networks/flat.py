@@ -41,9 +41,8 @@ def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "
     lengths = {shape[:1] for shape in shapes}
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(
-            "`states` must be at least one state, stacked along a leading axis, but its leaves "
-            f"have shapes {shapes}. For a single state write "
-            "`jax.tree.map(lambda x: x[None], y0)`."
+            "`states` must be one state or more, stacked along a leading axis, but the leaves have "
+            f"shapes {shapes}. For a single one write `jax.tree.map(lambda x: x[None], y0)`."
         )
     return states
 

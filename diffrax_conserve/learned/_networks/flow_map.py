@@ -21,9 +21,8 @@ from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 class AbstractFlowMap(AbstractTrainable):
     r"""A map from an initial state and a step to the state after the step, $(u_0, h) \mapsto u(h)$.
 
-    [`diffrax_conserve.DeepONet`][] is a flow map. Solvers and [`diffrax_conserve.fit`][] make one
-    from a Module `(y0, h) -> y` with an attribute `max_step`, and optionally `order`, `domain` and
-    `args_domain`.
+    Solvers and [`diffrax_conserve.fit`][] also take a Module `(y0, h) -> y` with an attribute
+    `max_step`, and optionally `order`, `domain` and `args_domain`.
 
     **Attributes:**
 
@@ -42,10 +41,8 @@ class AbstractFlowMap(AbstractTrainable):
 
     @abc.abstractmethod
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`.
-
-        `fit` passes the `schedule` of the conservative layer.
-        """
+        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`. `fit` passes
+        the `schedule` of the conservative layer."""
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
         """A rate of change of the solution through `y0`, in the units of the loss."""
@@ -90,10 +87,7 @@ class AbstractFlowMap(AbstractTrainable):
 
 @final
 class FlowMap(AbstractFlowMap):
-    """A function `(y0, h) -> y` with an attribute `max_step`, and perhaps others of a flow map.
-
-    `fit` trains all its arrays.
-    """
+    """A function `(y0, h) -> y` with an attribute `max_step`, and perhaps others of a flow map."""
 
     function: Callable[..., Any]
     max_step: RealScalarLike
@@ -108,8 +102,7 @@ class FlowMap(AbstractFlowMap):
         if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
             raise TypeError(
                 f"The `domain` of the flow map is {self.domain!r}, which has no method "
-                "`contains(y)`. Make it a `diffrax_conserve.learned.Box`, or a Module with that "
-                "method."
+                "`contains(y)`, as `diffrax_conserve.learned.Box` has."
             )
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
@@ -144,9 +137,7 @@ def args_domain_of(model: Any) -> Box | None:
 def checked_box(args_domain: Any) -> Box | None:
     """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
     if not isinstance(args_domain, Box | None):
-        raise TypeError(
-            f"`args_domain` is {args_domain!r}, but it must be a `diffrax_conserve.learned.Box`."
-        )
+        raise TypeError(f"`args_domain` is {args_domain!r}, but it must be a `learned.Box`.")
     return args_domain
 
 

@@ -31,11 +31,9 @@ class ConservativeLayer(eqx.Module):
 
     This is Newton's method in $\lambda$, with rows scaled to norm one and a damping
     $\mu = \min(10^{-2}, |g|^2)$ that vanishes with the residual relative to its scale. An iteration
-    moves a state by at most the size of a state. Derivatives of the network include the layer, by
-    the implicit function theorem for $g(y) = r$ with the remaining residual $r$.
-
-    For a state on the manifold to roundoff, wrap the solver in
-    [`diffrax_conserve.ManifoldProjection`][].
+    moves a state by at most the size of a state. Derivatives include the layer, by the implicit
+    function theorem for $g(y) = r$ with the remaining residual $r$. For a state on the manifold to
+    roundoff, wrap the solver in [`diffrax_conserve.ManifoldProjection`][].
 
     !!! example
 
@@ -79,15 +77,11 @@ class ConservativeLayer(eqx.Module):
     ) -> Y:
         """The state after all iterations; or `(1 - s) P_{p-1} y + s P_p y` for `schedule = (p, s)`,
         where `P_k y` is the state after `k` iterations, and those beyond the `p`-th are not
-        computed. An iteration moves the state by at most the norm of `scale`.
-        """
-        start = ravel(candidate)
-        dtype = start.dtype
+        computed. An iteration moves the state by at most the norm of `scale`."""
+        start, dtype = ravel(candidate), ravel(candidate).dtype
         numbers = ravel(values).astype(dtype)
         equations = equations_of(self.manifold, numbers, t, candidate, self.args)
-        if schedule is None:
-            schedule = (jnp.asarray(self.steps), jnp.ones((), dtype))
-        p, s = schedule
+        p, s = (jnp.asarray(self.steps), jnp.ones((), dtype)) if schedule is None else schedule
         start = _stored(start, p)
 
         def residual(y: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -151,10 +145,9 @@ def _conserve(
 
 @_conserve.def_jvp
 def _conserve_jvp(primals, tangents, *, steps):
-    """`λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`, where `ġ` is the tangent of the residual at constant `λ`.
-
-    Where the first iteration is not complete (`p = 0`, or `p = 1` with `s < 1`) the multipliers are
-    `s` times those of a complete one, and so is their tangent.
+    """`λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`, where `ġ` is the tangent of the residual at constant `λ`. Where
+    the first iteration is not complete (`p = 0`, or `p = 1` with `s < 1`) the multipliers are `s`
+    times those of a complete one, and so is their tangent.
 
     The linear solve is differentiated implicitly too. Second derivatives, which every loss with a
     time derivative needs, then cost products with `G` instead of derivatives of its rows.
@@ -188,8 +181,7 @@ def _conserve_jvp(primals, tangents, *, steps):
         transpose_solve=lambda _, b: gram_solve(gram.T, b),
     )
     _, _, p, s = fixed
-    share = jnp.where(p == 0, 0, jnp.where(p == 1, s, 1))
-    t_multipliers = -share * t_multipliers
+    t_multipliers = -jnp.where(p == 0, 0, jnp.where(p == 1, s, 1)) * t_multipliers
     return (y, multipliers), (t_y + vjp(t_multipliers)[0], t_multipliers)
 
 

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
+from ..._options import check_number
 from ..._tree import unflatten, working_dtype
 from .cores import MLP, Activation, check_sizes
 from .flat import as_state, flatten, stacked_vectors
@@ -77,12 +78,11 @@ class PINN(eqx.Module):
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
     with a fully connected network $N$ of time scaled to $[-1, 1]$, and the largest component $S$ of
-    each leaf of $u_0$, so that $u(t_0) = u_0$ for all weights. With a `layer`, the
-    output is projected to the manifold of the conserved values at $(t_0, u_0)$.
+    each leaf of $u_0$. With a `layer`, the output is projected to the manifold of the conserved
+    values at $(t_0, u_0)$. A long interval is divided into `windows`, each with its own network
+    that starts where the last one ends: small networks on short intervals are easier to train.
 
-    A long interval is divided into `windows`, each with its own network that starts where the last
-    one ends: small networks on short intervals are far easier to train. Train it by
-    [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
+    Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
     [`diffrax_conserve.PINNSolver`][].
 
     !!! example
@@ -124,10 +124,9 @@ class PINN(eqx.Module):
         layer: ConservativeLayer | None = None,
     ):
         check_sizes(width=width, depth=depth, windows=windows)
+        check_number("slope", slope, above=0.0)
         if not t0 < t1:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
-        if slope is not None and not slope > 0:
-            raise ValueError(f"`slope` must be positive, or `None`, but is {slope}.")
         y0, length = as_state(y0), float(t1) - float(t0)
         self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
         dtype, n, count = working_dtype(y0), flatten(y0).size, windows
@@ -201,8 +200,7 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `slope`: the standard deviation of the initial slopes of the first layer, whose units have centres
-    spread over the interval. `None` for Glorot initialisation, with which they are nearly the same
-    function of time; Levenberg-Marquardt needs about 2.
+    spread over the interval; Levenberg-Marquardt needs about 2. `None` for Glorot initialisation.
 - `layer`: a [`diffrax_conserve.learned.ConservativeLayer`][].
 
 **Raises:**

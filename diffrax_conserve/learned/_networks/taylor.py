@@ -21,8 +21,8 @@ class Taylor(eqx.Module):
     u'(0) = f(u_0), \quad u''(0) = f'(u_0) f(u_0), \quad \dots$$
 
     A [`diffrax_conserve.DeepONet`][] with it learns the remainder, $u(h) = T_q(u_0, h) +
-    (h/\Delta)^{q+1} S N(u_0, h)$, and is a method of order $q$ for all weights. The cost doubles
-    with each order, which pays only if $h$ times the rate of change of $f$ is not much above one.
+    (h/\Delta)^{q+1} S N(u_0, h)$, and is a method of order $q$. The cost doubles with each order,
+    which pays only if $h$ times the rate of change of $f$ is not much above one.
 
     !!! example
 
@@ -57,7 +57,7 @@ class Taylor(eqx.Module):
         derivative, terms = field, []
         for j in range(1, self.order + 1):
             terms.append(jtu.tree_map(lambda x, d=j: x / math.factorial(d), derivative(y0)))
-            derivative = _along(field, derivative)
+            derivative = lambda y, g=derivative: jax.jvp(g, (y,), (field(y),))[1]  # noqa: E731
         y = terms[-1]
         for term in reversed(terms[:-1]):
             y = jtu.tree_map(lambda a, b: a + h * b, term, y)
@@ -70,7 +70,3 @@ Taylor.__init__.__doc__ = r"""**Arguments:**
 - `order`: the degree $q$, a positive integer; otherwise a `ValueError`.
 - `args`: passed to `vector_field`.
 """
-
-
-def _along(field: Callable[[Y], Y], function: Callable[[Y], Y]) -> Callable[[Y], Y]:
-    return lambda y: jax.jvp(function, (y,), (field(y),))[1]

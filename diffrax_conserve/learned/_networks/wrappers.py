@@ -70,19 +70,16 @@ class Repeated(AbstractWrapper):
     \Phi_{h/k}(u_0)$.
 
     A flow is easier to learn over shorter steps. Train the inner flow map: the repeated one has no
-    weights of its own, and costs `count` steps of the inner one.
+    weights of its own.
 
     !!! example
 
         ```python
         import diffrax_conserve as dfc
-        import jax
 
-        system = dfc.systems.get("conservative-lorenz")
-        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
-        half = dfc.DeepONet(states, 0.125, key=jax.random.key(1))
+        half = dfc.load_pretrained("conservative-lorenz-standard")
         flow_map = dfc.learned.Repeated(half, 2)
-        assert flow_map.max_step == 0.25
+        assert flow_map.max_step == 2 * half.max_step
         ```
     """
 
@@ -90,32 +87,27 @@ class Repeated(AbstractWrapper):
     count: int = eqx.field(static=True)
 
     def __init__(self, flow_map: AbstractFlowMap | Callable[..., Any], count: int):
-        self.flow_map = as_flow_map(flow_map)
-        self.count = count
+        self.flow_map, self.count = as_flow_map(flow_map), count
 
     def __check_init__(self):
         check_sizes(count=self.count)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
-
-        def once(y: Y, each: Any) -> tuple[Y, None]:
-            return self.flow_map(y, *each, schedule=schedule), None
-
-        return self._scan(once, y0, step)
+        return self._scan(lambda y, *each: self.flow_map(y, *each, schedule=schedule), y0, step)
 
     def inside(self, y0: Y, *step: Any) -> Bool[Array, ""]:
 
-        def once(carry: tuple[Y, Array], each: Any) -> tuple[tuple[Y, Array], None]:
+        def once(carry: tuple[Y, Array], *each: Any) -> tuple[Y, Array]:
             y, inside = carry
-            return (self.flow_map(y, *each), inside & self.flow_map.inside(y, *each)), None
+            return self.flow_map(y, *each), inside & self.flow_map.inside(y, *each)
 
         return self._scan(once, (y0, True), step)[1]
 
     def _scan(self, once: Callable[..., Any], start: Any, step: Any) -> Any:
         each = (*step[:-1], jnp.asarray(step[-1]) / self.count)
         start = jtu.tree_map(jnp.asarray, start)
-        return lax.scan(lambda carry, _: once(carry, each), start, length=self.count)[0]
+        return lax.scan(lambda y, _: (once(y, *each), None), start, length=self.count)[0]
 
     def slope(self, y0: Y, *args: Args) -> Y:
         return self.flow_map.slope(y0, *args)
@@ -130,8 +122,7 @@ class Repeated(AbstractWrapper):
 
 Repeated.__init__.__doc__ = r"""**Arguments:**
 
-- `flow_map`: a [`diffrax_conserve.DeepONet`][], or any Module that
-    [`diffrax_conserve.DeepONetSolver`][] takes.
+- `flow_map`: any that [`diffrax_conserve.DeepONetSolver`][] takes.
 - `count`: the number of inner steps in one step, a positive integer; otherwise a `ValueError`.
 """
 
@@ -141,8 +132,7 @@ class BoxCox(eqx.Module):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
-    of zero is finite. With an exponent of 0 it is the logarithm. Powers of 1/2 are ten times as
-    fast as other exponents.
+    of zero is finite; 0 is the logarithm. Powers of 1/2 are ten times as fast as others.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -185,8 +175,7 @@ class Transformed(AbstractWrapper):
     r"""A flow map in other coordinates, $u(h) = T^{-1}(\Phi(T(u_0), h))$.
 
     Concentrations that span ten orders of magnitude are learned as powers or logarithms, so that
-    small ones count and none is negative. The initial state is exact. The loss is measured in these
-    coordinates.
+    small ones count and none is negative. The loss is measured in these coordinates.
 
     !!! example
 
@@ -207,8 +196,7 @@ class Transformed(AbstractWrapper):
     transformation: Any
 
     def __init__(self, flow_map: AbstractFlowMap | Callable[..., Any], transformation: Any):
-        self.flow_map = as_flow_map(flow_map)
-        self.transformation = transformation
+        self.flow_map, self.transformation = as_flow_map(flow_map), transformation
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
@@ -218,8 +206,7 @@ class Transformed(AbstractWrapper):
         there = self.transformation.inverse(z1)
 
         def component(y0: Array, y: Array, z0: Array, z1: Array) -> Array:
-            # Where the step changes nothing, the roundoff of the transformation and its inverse is
-            # removed. The derivatives are those of `y`.
+            # Where the step changes nothing there is no roundoff. The derivatives are those of `y`.
             exact = lax.stop_gradient(y0) + (y - lax.stop_gradient(y))
             return jnp.where(z0 == z1, exact, y).astype(y0.dtype)
 

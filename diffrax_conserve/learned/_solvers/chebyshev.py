@@ -108,8 +108,7 @@ def _integration(count: int) -> np.ndarray:
 
 
 def _clenshaw(coefficients: Array, x: Array) -> Array:
-    zero = jnp.zeros_like(coefficients[0])
-    b1, b2 = zero, zero
+    b1 = b2 = jnp.zeros_like(coefficients[0])
     for c in coefficients[:0:-1]:
         b1, b2 = c + 2 * x * b1 - b2, b1
     return coefficients[0] + x * b1 - b2

@@ -14,6 +14,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
+from jax.numpy.linalg import norm
 from jaxtyping import Array, Int, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
@@ -38,7 +39,7 @@ _BACKWARDS = register(
 _ANOTHER_FIELD = register(
     "the flow map was not trained for this vector field: at the initial state its slope for h -> 0 "
     "is another. Solve the equation that it was trained for, with the same parameters, or pass "
-    "`check_field=False` to the solver to use it all the same."
+    "`check_field=False`."
 )
 _NOT_FINITE = register(
     "a state is not finite: the initial one, or that of the flow map after a step. Start where the "
@@ -98,20 +99,16 @@ def refused_from_start(
         slope, field, later = (
             lax.stop_gradient(x).astype(start.dtype) for x in (slope, field, later)
         )
-        size = jnp.maximum(_norm(slope), _norm(field))
+        size = jnp.maximum(norm(slope), norm(field))
         allowed = _EXACT * size
         if flow_map.order == 0:
-            little = _LITTLE * _norm(start) / flow_map.max_step
-            allowed = _LEARNED * size + _CHANGE * _norm(later - field) + little
+            little = _LITTLE * norm(start) / flow_map.max_step
+            allowed = _LEARNED * size + _CHANGE * norm(later - field) + little
         # False if that is not known.
-        another = _norm(slope - field) > allowed
+        another = norm(slope - field) > allowed
         finite &= tree_all_finite((slope, field))
     refused = jnp.where(finite, jnp.where(another, _ANOTHER_FIELD, 0), _NOT_FINITE)
     return jnp.where(h * time_direction(terms, h) >= 0, refused, _BACKWARDS)
-
-
-def _norm(x: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(jnp.abs(x))))
 
 
 def judged(

@@ -18,8 +18,7 @@ from .chebyshev import chebyshev_points, to_coefficients
 _DEGREES = 80
 # The number of exact directions: the constant (a bias) and the linear function (a skip connection).
 _EXACT = 2
-# The number of neurons drawn for each direction: with fewer, the directions would depend on the
-# draw.
+# The number of neurons drawn for each direction: with fewer, these would depend on the draw.
 _NEURONS = 4
 
 
@@ -47,14 +46,11 @@ def feature_basis(count: int) -> FeatureBasis:
 def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureBasis:
     """The tables of a basis with the given Legendre coefficients, in `2 s - 1`."""
     integrated = legendre.legint(members, lbnd=-1, axis=0) / 2
-
     points, weights = legendre.leggauss(2 * count)
     slopes = legendre.legval(points, members).T
     root = np.sqrt(weights / 2)[:, None]
-    # The members are orthonormal for the Gauss rule up to roundoff, which the pseudoinverse
-    # removes.
+    # The members are orthonormal for the Gauss rule up to roundoff, which the inverse removes.
     fit = np.linalg.pinv(root * slopes) * root.T
-
     nodes = 2 * count + 8
     values = legendre.legval(2 * chebyshev_points(nodes) - 1, integrated).T
     return FeatureBasis(

@@ -16,13 +16,7 @@ from ..._projection.options import option
 from ..._tree import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
-from .checks import (
-    Refused,
-    check_learned_terms,
-    check_output,
-    judged,
-    refused_from_start,
-)
+from .checks import Refused, check_learned_terms, check_output, judged, refused_from_start
 from .policies import DomainStatistics, Policy, StepResult, check_policy, outcome, step_of
 from .sweeps import Increment, correct, estimate, increment
 
@@ -40,22 +34,18 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     controller (pass it `dtmax=flow_map.max_step`) and fails with fixed steps, as does a solve
     backwards in time.
 
-    **Correction sweeps.** With `corrections=k` the flow map only predicts. Its path
-    $u$ at the `nodes` Chebyshev points of the step is corrected by `k` Picard sweeps
+    With `corrections=k` the flow map only predicts. Its path $u$ at the `nodes` Chebyshev points of
+    the step is corrected by `k` Picard sweeps with the vector field of the term,
 
-    $$u \leftarrow y_n + h \int f(t, u, args)$$
+    $$u \leftarrow y_n + h \int f(t, u, args),$$
 
-    with the vector field of the term, at all points in parallel. The $j$-th sweep multiplies the
-    error by about $h \|\partial f\| / j$.
+    at all points in parallel. The $j$-th sweep multiplies the error by about
+    $h \|\partial f\| / j$.
 
-    **Error estimate.** Without sweeps it solves the differential equation of the error, driven by
-    the defect $u' - f(u)$, by 28 evaluations of $f$; with sweeps it is the change by the last one.
-    With fixed steps it is not computed. Smaller steps reduce the error of a solve with sweeps, or
-    with a flow map of order 1 or more.
-
-    **Leaving the domain.** `outside` determines what happens to a step that starts outside
-    `flow_map.domain` or with `args` outside its `args_domain`, or whose estimated error has a
-    component larger than `max_error`.
+    The error estimate without sweeps solves the differential equation of the error, driven by the
+    defect $u' - f(u)$, by 28 evaluations of $f$; with sweeps it is the change by the last one. With
+    fixed steps it is not computed. Smaller steps reduce the error of a solve with sweeps, or with a
+    flow map of order 1 or more.
 
     Dense output is the polynomial through the (corrected) states at the `nodes` points, which are
     computed only if something needs them. Derivatives are those of the computed solution.
@@ -92,19 +82,15 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
     def __check_init__(self):
-        if not isinstance(self.nodes, int) or self.nodes < 2:
-            raise ValueError(f"`nodes` must be an integer of at least 2, but is {self.nodes!r}.")
+        for name, value, least in (("nodes", self.nodes, 2), ("corrections", self.corrections, 0)):
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` is {value!r}, but must be an integer from {least} on.")
         domains = self.flow_map.domain, args_domain_of(self.flow_map)
         check_policy(self.outside, self.max_error, any(d is not None for d in domains))
-        if not isinstance(self.corrections, int) or self.corrections < 0:
-            raise ValueError(
-                f"`corrections` is {self.corrections!r}, but it must be a number of sweeps."
-            )
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         del terms
-        # Order 0 implies no convergence, so report `None`.
-        return self._local_order(self.corrections) - 1 or None
+        return self._local_order(self.corrections) - 1 or None  # 0 is no convergence
 
     def error_order(self, terms: dfx.AbstractTerm) -> int:
         del terms
@@ -148,13 +134,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
                 inside &= box.contains(*known)
             accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
             statistics = statistics.add(t0, inside & accurate)
-            step = outcome(
-                self.outside,
-                step,
-                inside,
-                accurate,
-                lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args),
-            )
+            by = lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args)  # noqa: E731
+            step = outcome(self.outside, step, inside, accurate, by)
         step = judged(step, refused, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, _State(refused, statistics), step.result
@@ -185,17 +166,16 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
 
 FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
-- `flow_map`: a [`diffrax_conserve.DeepONet`][], another
-    [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module that is called as `(y0, h) -> y` and
-    has an attribute `max_step`, and optionally `order` and `domain`.
+- `flow_map`: a [`diffrax_conserve.learned.AbstractFlowMap`][] such as
+    [`diffrax_conserve.DeepONet`][], or a Module `(y0, h) -> y` with an attribute `max_step`.
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
-- `outside`: the policy for steps outside the domain. [`diffrax_conserve.learned.Report`][]`()`
-    counts them, for [`diffrax_conserve.learned.domain_statistics`][];
-    [`diffrax_conserve.learned.Refuse`][]`()` fails at the first; a diffrax solver takes them itself
-    (in a batch of lanes both compute every step). Default: nothing happens.
-- `max_error`: the largest estimated error of a component, in its own units, of a step that counts
-    as inside. Default: only the domain decides.
+- `outside`: the policy for steps that start outside `flow_map.domain`, or with `args` outside its
+    `args_domain`. [`diffrax_conserve.learned.Report`][]`()` counts them, for
+    [`diffrax_conserve.learned.domain_statistics`][]; [`diffrax_conserve.learned.Refuse`][]`()`
+    fails at the first; a diffrax solver takes them itself (in a batch of lanes both compute every
+    step). Default: nothing happens.
+- `max_error`: a step with a larger estimated error of a component counts as outside too.
 - `check_field`: whether to fail if the vector field at the initial state differs from the slope of
     the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order` at least 1). A
     learned slope may differ by 75 %, and by more where the field changes much within `max_step`, as
@@ -203,10 +183,9 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if the flow map has another signature or returns another structure than
-that of the state, if a number is invalid, or if `outside` needs a domain that it does not have. At
-run time a solve backwards in time or of another equation, a step that is too long, and a state that
-is not finite end with a failed [`result`][diffrax.RESULTS].
+`TypeError` or `ValueError` if the flow map does not map states to states, a number is invalid, or
+`outside` needs a domain. A solve backwards in time or of another equation, a step that is too long
+and a state that is not finite end with a failed [`result`][diffrax.RESULTS].
 """
 
 # An alias, named after the usual flow map.

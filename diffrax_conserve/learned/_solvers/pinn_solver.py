@@ -25,8 +25,6 @@ _ANOTHER_START = register(
     "`y0` is not the state that the PINN has at the initial time. A PINN is one solution: start "
     "with `y0=pinn.y0` at `t0=pinn.t0`, train one for this `y0`, or use a `DeepONet`."
 )
-
-
 # The number of states in a step that dense output interpolates.
 _NODES = 12
 
@@ -35,13 +33,11 @@ _NODES = 12
 class PINNSolver(dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
-    The vector field of the term is not evaluated. Steps may have any length; they determine where
-    states are saved, projected or tested for events. The solve must start on the network's
-    solution, $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. There is no error
-    estimate, so use fixed steps ([`diffrax.ConstantStepSize`][], [`diffrax.StepTo`][]).
-
-    Dense output is the polynomial through the states at 12 Chebyshev points of the step, which are
-    computed only if something needs them. The derivative with respect to `y0` is zero.
+    The vector field is not evaluated. Steps may have any length; they determine where states are
+    saved, projected or tested for events. The solve must start on the network's solution,
+    $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. There is no error estimate,
+    so use fixed steps. Dense output is the polynomial through the states at 12 Chebyshev points of
+    the step. The derivative with respect to `y0` is zero.
 
     !!! example
 
@@ -55,10 +51,6 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         term = diffrax.ODETerm(system.vector_field)
         solution = diffrax.diffeqsolve(term, solver, 0.0, 1.75, 0.05, system.y0)
         ```
-
-    ??? cite "Reference"
-
-        M. Raissi, P. Perdikaris and G. E. Karniadakis, J. Comput. Phys. 378 (2019).
     """
 
     pinn: PINN
@@ -127,7 +119,7 @@ PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state. At run
-time the [`result`][diffrax.RESULTS] is a failure if a time is outside the interval, or `y0` is not
-the state of the network at the initial time, to the square root of roundoff.
+`TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state. The
+[`result`][diffrax.RESULTS] is a failure if a time is outside the interval, or `y0` is not the state
+of the network at the initial time, to the square root of roundoff.
 """

@@ -59,10 +59,7 @@ class Report(eqx.Module):
 
 @final
 class Refuse(eqx.Module):
-    """Fails at the first such step.
-
-    A step that is not accurate enough is first rejected by an adaptive controller.
-    """
+    """Fails at the first such step, an inaccurate one after an adaptive controller rejected it."""
 
 
 # A solver takes the step itself.
@@ -115,28 +112,23 @@ def step_of(
 
 def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
     check_number("max_error", max_error, above=0.0)
-    choices = (
-        "`diffrax_conserve.learned.Report()`, `Refuse()`, or a diffrax solver, such as "
-        "`diffrax.Tsit5()`"
-    )
+    choices = "`diffrax_conserve.learned.Report()`, `Refuse()`, or a solver: `diffrax.Tsit5()`"
+    if policy is None and max_error is not None:
+        raise ValueError(
+            "`max_error` says which steps count as outside, but these are ignored: pass "
+            f"`outside`, {choices}, too."
+        )
     if policy is None:
-        if max_error is not None:
-            raise ValueError(
-                "`max_error` says which steps count as outside, but these are ignored: pass "
-                f"`outside`, {choices}, too."
-            )
         return
     if not isinstance(policy, Policy):
         raise TypeError(f"`outside` is {policy!r}, but it must be {choices}.")
     if max_error is None and not has_domain:
         raise ValueError(
-            f"`outside` is {policy!r}, but the flow map does not know what that is: it has no "
-            "`domain`. Give it `diffrax_conserve.learned.Box.around(states)`, with the states that "
-            "it was trained on, or pass `max_error`."
+            f"`outside` is {policy!r}, but the flow map cannot tell: it has no `domain`. "
+            "Give it `diffrax_conserve.learned.Box.around(states)`, with the states that it was "
+            "trained on, or pass `max_error`."
         )
-    if not isinstance(policy, dfx.AbstractSolver):
-        return
-    if policy.term_structure is not dfx.AbstractTerm:
+    if getattr(policy, "term_structure", dfx.AbstractTerm) is not dfx.AbstractTerm:
         raise ValueError(
             f"`outside` is {policy!r}, which needs several terms, but a learned solver has one. "
             "Pass a solver of one, for example `diffrax.Tsit5()`."
@@ -155,16 +147,13 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
 
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve` with a solver that has a policy `outside`, and
-        with `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
+    - `sol`: the solution of a solver with a policy `outside`, solved with
+        `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
 
     **Returns:**
 
-    A named tuple of
-
-    - `num_outside`: the number of accepted steps that started outside the flow map's `domain`, or
-        had an estimated error above `max_error`;
-    - `first_outside`: the time at which the first of them started; infinity if there is none.
+    A named tuple of `num_outside`, the number of accepted steps that count as outside, and
+    `first_outside`, the time at which the first of them started; infinity if there is none.
 
     **Raises:**
 
@@ -182,11 +171,7 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         term = diffrax.ODETerm(system.vector_field)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
         sol = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0, saveat=saveat)
-        print(dfc.learned.domain_statistics(sol).num_outside)
-        ```
-
-        ```text
-        0
+        assert dfc.learned.domain_statistics(sol).num_outside == 0
         ```
     """
     check_solution(sol, "domain_statistics")

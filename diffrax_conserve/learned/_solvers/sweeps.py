@@ -25,8 +25,7 @@ def increment(
     terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, like: Y, args: Args
 ) -> Increment:
     """The vector field of the term times the length of the step."""
-    control = terms.contr(t0, t1)
-    length = jnp.asarray(t1 - t0)
+    control, length = terms.contr(t0, t1), jnp.asarray(t1 - t0)
     _, unravel = ravel_pytree(like)
 
     def evaluate(fraction: Array, vector: Array) -> Array:

@@ -13,7 +13,7 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold
-from ..._options import check_number
+from ..._options import check_number, is_real
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
@@ -30,14 +30,13 @@ from .recipe import Recipe, second_order
 
 def check_types(key: Any, recipe: Any, **limits: Any) -> None:
     """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
-    is_key = eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)
-    if not is_key:
+    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
         raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
     if not isinstance(recipe, Recipe | None):
-        raise TypeError(
-            f"`recipe` is {recipe!r}, but it must be a `diffrax_conserve.learned.Recipe`."
-        )
+        raise TypeError(f"`recipe` is {recipe!r}, but it must be a `learned.Recipe`.")
     for name, value in limits.items():
+        if value is not None and not (is_real(value) and np.ndim(value) == 0):
+            raise TypeError(f"`{name}` is {value!r}, but it must be one real number, or `None`.")
         check_number(name, value, above=0.0)
 
 
@@ -90,7 +89,7 @@ def _of_flow_map(
         if not isinstance(flow_map.domain, Box):
             raise ValueError(
                 "This flow map has no `domain` to draw initial states from: pass `sample`, states "
-                "or a function from a random key to one, for example `sample=system.sample`."
+                "or a function from a random key to one."
             )
         sample = flow_map.domain.sample
     if domain is not None:
@@ -103,8 +102,8 @@ def _of_flow_map(
         field = None if field is None else eqx.Partial(field_of_pairs, field)
         sample = None if sample is None else eqx.Partial(pair, sample, domain)
     found = None if data is None else as_data(data, flow_map)
-    if found is not None and field is not None and sample is None:
-        sample = found.sample
+    if found is not None and field is not None:
+        sample = sample or found.sample
     return flow_map, Problem(field, args, sample, found, recipe)
 
 
@@ -115,15 +114,11 @@ def _with_taylor(network: Any, problem: Problem, vector_field: VectorField) -> A
     if not (order and isinstance(inner, DeepONet) and inner.taylor is None):
         return network
     # The polynomial helps only if the field changes by little in a step, at most of the states.
-    if not inner.max_step * _rate_of_change(problem) <= _SLOW:
+    if not inner.max_step * _rate_of_change(problem) <= 3.0:
         return network
     taylor = Taylor(vector_field, order, args=problem.args)
     inner = eqx.tree_at(lambda m: m.taylor, inner, taylor, is_leaf=lambda x: x is None)
     return OfPairs(inner) if isinstance(network, OfPairs) else inner
-
-
-# In units of the field itself.
-_SLOW = 3.0
 
 
 @eqx.filter_jit
@@ -148,8 +143,8 @@ def _check_manifold(model: Any, manifold: Manifold | None) -> None:
     refuse_rates(manifold, "a training")
     if not isinstance(model, PINN):
         raise ValueError(
-            "`manifold` is for the windows of a `PINN`. To conserve its integrals give the network "
-            "a `layer`, or wrap its solver in `ManifoldProjection`."
+            "`manifold` is for the windows of a `PINN`. Give the network a `layer`, or wrap its "
+            "solver in `ManifoldProjection`."
         )
 
 

@@ -32,9 +32,8 @@ def reachable_states(
 ) -> PyTree[Array]:
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
-    In a solve, each step of a flow map starts at the end of the last one, so train it on such
-    states: pass them as `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to
-    [`diffrax_conserve.fit`][].
+    In a solve, each step of a flow map starts at the end of the last one. So pass such states as
+    `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to [`diffrax_conserve.fit`][].
 
     **Arguments:**
 
@@ -43,16 +42,13 @@ def reachable_states(
     - `duration`: the longest time.
     - `key`: a random key, for the times.
     - `args`: passed to `vector_field`.
-    - `keep`: a function of one state that tells whether to keep it: exclude those that change too
-        fast for the step that is to be learned.
-    - `solver`, `dt0`: the diffrax solver, and its fixed step: if `vector_field` is expensive, the
-        solver of a partly trained flow map. Default: [`diffrax.Dopri8`][] at a tolerance of
-        $10^{-6}$.
+    - `keep`: a function that tells whether to keep a state: exclude those that change too fast.
+    - `solver`, `dt0`: a diffrax solver and its fixed step, such as that of a partly trained flow
+        map. Default: [`diffrax.Dopri8`][] at a tolerance of $10^{-6}$.
 
     **Returns:**
 
-    The states, stacked along a leading axis: as many as `y0s`, minus those whose solve failed or
-    that `keep` excludes.
+    The states, stacked along a leading axis, without those whose solve failed.
 
     **Raises:**
 
@@ -97,10 +93,10 @@ def trajectories(
     - `vector_field`, `args`: as for [`diffrax_conserve.learned.reachable_states`][].
     - `y0s`: states at time 0, stacked along a leading axis.
     - `ts`: increasing times of shape `(k,)`, or one row for each state, `(n, k)`.
-    - `solver`, `dt0`: any diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and
-        its fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
-    - `rtol`, `atol`: the tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
-        component of all `y0s`.
+    - `solver`, `dt0`: a diffrax solver, such as [`diffrax.Kvaerno5`][] for stiff equations, and its
+        fixed step. Default: [`diffrax.Dopri8`][] with adaptive steps.
+    - `rtol`, `atol`: tolerances of adaptive steps. Default of `atol`: `rtol` times the largest
+        component of `y0s`.
 
     **Returns:**
 
@@ -197,9 +193,8 @@ class Data(eqx.Module):
         starts = (self.last > jnp.arange(self.ts.shape[1])).reshape(-1).astype(self.ts.dtype)
         place = jr.choice(first_key, starts.size, (count,), p=starts / jnp.sum(starts))
         i, j = jnp.divmod(place, self.ts.shape[1])
-        end = (
-            j + 1 + jnp.floor(jr.uniform(second_key, (count,)) * (self.last[i, j] - j)).astype(int)
-        )
+        ahead = jr.uniform(second_key, (count,)) * (self.last[i, j] - j)
+        end = j + 1 + jnp.floor(ahead).astype(int)
         take = lambda k: jtu.tree_map(lambda y: y[i, k], self.ys)  # noqa: E731
         return Pairs(self.ts[i, end] - self.ts[i, j], take(j), take(end))
 
@@ -236,7 +231,7 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     if not places.size:
         raise ValueError(
             "No two times of a trajectory in `data` are within the `max_step` of the flow map, "
-            f"{flow_map.max_step}. Give it a longer one, or data with shorter steps."
+            f"{flow_map.max_step}. Give it a longer one."
         )
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
     pairs = whole.draw(_MANY, jr.key(0))

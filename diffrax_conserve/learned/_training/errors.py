@@ -30,12 +30,9 @@ from .objective import Problem
 
 
 class PathErrors(NamedTuple):
-    """For each path and component: the largest modulus of the error, the error at the end, and the
-    largest modulus of the state."""
-
-    largest: Float[Array, "paths n"]
-    end: Float[Array, "paths n"]
-    size: Float[Array, "paths n"]
+    largest: Float[Array, "paths n"]  # the largest modulus of the error
+    end: Float[Array, "paths n"]  # the error at the end
+    size: Float[Array, "paths n"]  # the largest modulus of the state
 
 
 @eqx.filter_jit
@@ -97,8 +94,8 @@ def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArra
         y0s = jax.vmap(problem.sample)(jr.split(key, _STATES))
         start = stacked_vectors(y0s)
         dtype = jnp.result_type(start, np.float16)
-        lengths = jnp.full(_STATES, flow_map.max_step, dtype)
         paths = Points(jnp.zeros(_STATES, dtype), y0s)
+        lengths = jnp.full(_STATES, flow_map.max_step, dtype)
         found = path_errors(flow_map, problem, paths, lengths, jnp.zeros_like(start), _SUBSTEPS)
         errors, sizes = found.end, found.size
     example = jtu.tree_map(lambda x: x[0], y0s)
@@ -111,10 +108,8 @@ _STATES, _SUBSTEPS = 64, 32
 
 
 def relative(errors: Any, sizes: Any, example: Y) -> float:
-    """The largest of `errors`, each relative to the largest component of its leaf.
-
-    Infinity if any error is not finite.
-    """
+    """The largest of `errors`, each relative to the largest component of its leaf; infinity if any
+    is not finite."""
     errors, sizes = (unflatten(jnp.asarray(x), example) for x in (errors, sizes))
 
     def of_leaf(error: Array, size: Array) -> float:

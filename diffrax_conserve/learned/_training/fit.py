@@ -1,10 +1,7 @@
 """`fit`: trains a network from the vector field alone, or from data."""
 
-import dataclasses
 import math
-import os
 import time
-from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -17,9 +14,9 @@ from .._networks.wrappers import OfPairs
 from .checks import check_types, checked
 from .errors import flow_map_error
 from .loop import FitLog, Loop, Progress
-from .objective import Carry, VectorField
+from .objective import VectorField
 from .recipe import Recipe
-from .state import FitState, fingerprint
+from .state import FitState
 from .windows import train_windows
 
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -38,29 +35,23 @@ def fit(
     state: FitState | None = None,
     target: float | None = None,
     seconds: float | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
     progress: bool | Progress = False,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone, or a flow map from data, or from both.
 
-    Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$, where $u$ is the output
-    of the network, with the iterations of its conservative layer that the recipe's schedule
-    prescribes, and $u'$ is computed by forward-mode automatic differentiation.
-
-    From `data` a flow map learns pairs of states along the trajectories, one step of any length
-    apart. The loss is that of the differences, each component relative to the root mean square
-    change by a step. With a vector field the squared defect is added, relative to the median of
-    $|f|^2$.
+    Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$ for the output $u$ of the
+    network, with $u'$ by forward-mode automatic differentiation. From `data` a flow map learns
+    pairs of states along the trajectories, one step of any length apart: the loss is that of the
+    differences, each component relative to the root mean square change by a step. With a vector
+    field the squared defect is added, relative to the median of $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
-    estimates the error of its solution. A `DeepONet` gets the Taylor polynomial that its recipe
-    prescribes.
+    estimates the error of its solution. A `DeepONet` gets the Taylor polynomial of its recipe.
 
     A `PINN` is trained window by window; each starts at the end of the previous one, projected to
     the manifold if one is given. A window whose estimated error is too large is cut in halves, as
     often as the recipe's `retries` allow. If the whole solution misses the `target`, the windows
-    are trained again, to smaller errors. If it is still wrong, a warning names the window and the
-    error.
+    are trained again, to smaller errors. If it is still wrong, a warning names window and error.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
     same arguments, or with a recipe of more epochs; the result is the same, bit for bit, as without
@@ -68,34 +59,32 @@ def fit(
 
     **Arguments:**
 
-    - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.DeepONet`][], any other
-        [`diffrax_conserve.learned.AbstractFlowMap`][], or a Module `(y0, h) -> y` with an attribute
-        `max_step`, of which all arrays are trained.
+    - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.learned.AbstractFlowMap`][] such
+        as [`diffrax_conserve.DeepONet`][], or a Module `(y0, h) -> y` with an attribute `max_step`,
+        of which all arrays are trained.
     - `vector_field`: $f(t, y, args)$. For a flow map it must not depend on time; with `data` it is
         optional.
     - `key`: a random key. The same key gives the same result.
     - `sample`: for a flow map, initial states, stacked along a leading axis, or a function from a
         random key to one of them. Default: the states of `data`, or else all of the `domain`, if
         that is a [`diffrax_conserve.learned.Box`][].
-    - `data`: for a flow map, trajectories `(ts, ys)`: increasing times of shape `(n, k)`, and
-        states with leading axes `(n, k)`. [`diffrax_conserve.learned.trajectories`][] computes
-        some.
+    - `data`: for a flow map, trajectories `(ts, ys)`, such as those of
+        [`diffrax_conserve.learned.trajectories`][]: increasing times of shape `(n, k)`, and states
+        with leading axes `(n, k)`.
     - `args`: passed to `vector_field`. Omit them for a flow map that takes `args` itself: they are
         drawn from its `args_domain`, and the states of `data` are pairs `(y, args)`.
     - `recipe`: a [`diffrax_conserve.learned.Recipe`][]. Default:
         [`diffrax_conserve.learned.second_order`][]`(model)`.
-    - `manifold`: for a `PINN`, the manifold to which the ends of the windows are
-        projected, with the conserved values at the initial state. Default: that of its layer.
-    - `state`: the `state` in the log of a training that is to be continued.
+    - `manifold`: for a `PINN`, the manifold to which the ends of the windows are projected, with
+        the conserved values at the initial state. Default: that of its layer.
+    - `state`: the `state` in the log of a training that is to be continued. That of a flow map can
+        be kept in a file, by `equinox.tree_serialise_leaves`.
     - `target`: for a flow map, the loss at which the training ends; default: none. For a `PINN`,
-        the accepted estimated error of its solution, relative to its largest component. Default:
-        windows are cut until the error is about 1e-7 (1e-4 in single precision), and a solution
-        with an error above 1e-4 counts as wrong.
+        the accepted error of its solution, relative to its largest component; default: windows are
+        cut until it is about 1e-7 (1e-4 in single precision), and above 1e-4 the solution is wrong.
     - `seconds`: ends the training after this wall time, without the compilation.
-    - `checkpoint`: a file for the state of the training, which is updated regularly; if it exists,
-        the training continues from it.
-    - `progress`: whether to print a line on standard error, or a function that is called regularly
-        with the number of epochs done, the total number, the last loss and the best criterion.
+    - `progress`: whether to print lines on standard error, or a function of the number of epochs
+        done, the total number, the last loss and the best criterion.
 
     **Returns:**
 
@@ -103,9 +92,9 @@ def fit(
 
     **Raises:**
 
-    `ValueError` or `TypeError` before the training if the arguments do not fit, for example if the
-    vector field is not finite at an initial state, or for a flow map depends on time;
-    `FloatingPointError` if no update was finite.
+    `ValueError` or `TypeError` before the training if the arguments do not fit, or the vector field
+    is not finite at an initial state, or for a flow map depends on time; `FloatingPointError` if no
+    update was finite.
 
     !!! example
 
@@ -133,8 +122,6 @@ def fit(
         target=None if target is None else float(target),
         seconds=math.inf if seconds is None else seconds,
         progress=progress,
-        checkpoint=None if checkpoint is None else Path(checkpoint),
-        mark=fingerprint((model, key, args, vector_field), problem.recipe),
         created=created,
     )
     if isinstance(model, PINN):
@@ -151,14 +138,11 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
     def error(network: Any) -> float:
         return flow_map_error(network, loop.problem, loop.key)
 
-    def close(carry: Carry) -> bool:
-        return loop.target is not None and float(carry.best) <= loop.target
-
-    carry, ended = state.carry, "epochs"
-    if not state.finished:
-        state, carry, ended = loop.train(objective, state, close, error)
-        finished = int(state.done >= loop.problem.recipe.epochs)
-        state = dataclasses.replace(state, finished=finished)
-    loop.save(state, always=True)
+    state, carry, ended = loop.train(
+        objective,
+        state,
+        lambda carry: loop.target is not None and float(carry.best) <= loop.target,
+        error,
+    )
     trained = objective.best(carry)
     return trained, loop.log(state, carry, ended, error(trained))

@@ -5,17 +5,17 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .objective import Carry, Objective, Problem, advance, start
-from .state import FitState, read_checkpoint, write_checkpoint
+from .state import FitState
 
 # Called with the number of epochs done, the total number, the last loss and the best criterion.
 Progress = Callable[[int, int, float, float], None]
@@ -27,15 +27,13 @@ class FitLog(eqx.Module):
 
     **Attributes:**
 
-    - `error`: the estimated error of the solution, for each leaf of the state relative to its
-        largest component: for a `PINN` the largest in the whole interval, for a flow map the root
-        mean square for its longest step, over states from `sample`. Infinity if there is no
-        estimate, or a window was not trained.
+    - `error`: the estimated error, for each leaf of the state relative to its largest component: of
+        a `PINN` the largest in the interval, of a flow map the root mean square for its longest
+        step, over states from `sample`. Infinity if it is unknown, or a window was not trained.
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        the compared values: the loss on the first collocation points with all iterations of the
-        conservative layer.
+        what was compared: the loss on the first collocation points with all iterations of a layer.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
@@ -66,23 +64,15 @@ class Loop:
     target: float | None
     seconds: float
     progress: bool | Progress
-    checkpoint: Path | None
-    mark: str
     created: float  # the beginning of `fit`
     compile_seconds: float = 0.0
     compiled: Any = None
     pace: float = 0.0  # seconds for an epoch; 0 if that is not known
-    saved: float = -math.inf  # time of the last save; `saving` is its duration
-    saving: float = 0.0
 
     def begin(self, networks: tuple[Any, ...], given: FitState | None) -> FitState:
-        """The first state of the training: the given one, that of a checkpoint, or a new one."""
+        """The first state of the training: the given one, or a new one."""
         _, carry = start(self.problem, networks[0], self.key)
         first = FitState(networks, (math.inf,) * len(networks), carry)
-        if given is None and self.checkpoint is not None and self.checkpoint.exists():
-            given = read_checkpoint(self.checkpoint, first, self.mark)
-            if given.finished:
-                return given
         return first if given is None else given.continued(self.problem.recipe.epochs, first)
 
     def start(self, state: FitState) -> tuple[Objective, FitState]:
@@ -123,10 +113,8 @@ class Loop:
                     ended = "target"
                 elif state.done >= recipe.epochs:
                     ended = "epochs"
-                else:
-                    self.save(state)
         except KeyboardInterrupt:
-            if not state.checked.size:
+            if state.done < 0 and not state.trained:
                 raise
             ended = "interrupt"
         skipped = int(state.carry.skipped)
@@ -142,8 +130,7 @@ class Loop:
         """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
         if math.isinf(self.seconds) or goal == 0:
             return goal
-        left = self.seconds - self.elapsed
-        if left <= self.pace / 2:
+        if (left := self.seconds - self.elapsed) <= self.pace / 2:
             return done
         # Half of the time, because the pace may change.
         return min(goal, done + max(1, int(left / (2 * self.pace)) if self.pace else 1))
@@ -153,36 +140,27 @@ class Loop:
     ) -> FitState:
         begun, done = time.perf_counter(), max(state.done, 0)
         numbers = jnp.asarray(done), jnp.asarray(stop), jnp.asarray(compare)
-        carry, criterion = self.compiled(objective, state.carry, *numbers)
-        criterion = float(criterion)  # waits for it
+        carry = jax.block_until_ready(self.compiled(objective, state.carry, *numbers))
         if stop > done:
             self.pace = (time.perf_counter() - begun) / (stop - done)
-        state = dataclasses.replace(state, carry=carry, done=stop)
-        return state.compared(criterion) if compare else state
+        return dataclasses.replace(state, carry=carry, done=stop)
 
     @property
     def elapsed(self) -> float:
         return time.perf_counter() - self.created - self.compile_seconds if self.compiled else 0.0
 
-    def save(self, state: FitState, always: bool = False) -> None:
-        """Writes a checkpoint, unless the last took a twentieth of the time since then."""
-        begun = time.perf_counter()
-        if self.checkpoint is None or not (always or begun - self.saved > 20 * self.saving):
-            return
-        write_checkpoint(self.checkpoint, state, self.mark)
-        self.saved = time.perf_counter()
-        self.saving = self.saved - begun
-
     def log(
         self, state: FitState, carry: Carry, ended: str, error: float, errors: Any = ()
     ) -> FitLog:
         found = dataclasses.replace(state, carry=carry).closed()
+        # The records of a network have one criterion more than losses.
+        compared = np.flatnonzero(~np.isnan(found.criteria))
         return FitLog(
             error=error,
             errors=np.asarray(errors),
             losses=found.losses,
-            checked=found.checked,
-            criteria=found.criteria,
+            checked=compared - compared // carry.criteria.size,
+            criteria=found.criteria[compared],
             skipped=found.skipped,
             ended=ended,
             seconds=self.elapsed,
@@ -209,15 +187,13 @@ class Loop:
         rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
         done, total = state.losses.size + state.done, state.losses.size + rest
         # Before the first epoch there is no loss yet.
-        loss = float(state.carry.losses[state.done - 1]) if state.done else state.criteria[-1]
-        best = float(state.carry.best)
+        carry = state.carry
+        loss = float(carry.losses[state.done - 1] if state.done else carry.criteria[0])
+        best = float(carry.best)
         if self.progress is not True:
-            self.progress(done, total, float(loss), best)
-            return
-        if not (done == total or done % max(total // 10, 1) == 0):
-            return
-        parts = [f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"]
-        if done and (error := estimate()):
-            parts.append(f"estimated error {error:.1e}")
-        parts.append(f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile")
-        print(", ".join(parts), file=sys.stderr, flush=True)
+            self.progress(done, total, loss, best)
+        elif done == total or done % max(total // 10, 1) == 0:
+            epoch = f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"
+            spent = f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile"
+            error = f"estimated error {estimate():.1e}"
+            print(epoch, error, spent, sep=", ", file=sys.stderr, flush=True)

@@ -75,6 +75,7 @@ class Carry(NamedTuple):
     best: Float[Array, ""]
     skipped: Int[Array, ""]
     losses: Float[Array, " epochs"]
+    criteria: Float[Array, " comparisons"]  # at 0 and after each epoch; NaN without a comparison
 
 
 @final
@@ -106,17 +107,15 @@ class Objective(eqx.Module):
 
     def criterion(self, weights: Any) -> Float[Array, ""]:
         """The loss with all iterations of the layer, as the trained model is used."""
-        loss = self.loss(weights, self.first_points, self.complete())
-        return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
-
-    def complete(self) -> LayerSchedule:
         layer = self.static.layer
-        return jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
+        complete = jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
+        loss = self.loss(weights, self.first_points, complete)
+        return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
     def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
         layer, recipe = self.static.layer, self.problem.recipe
         if layer is None:
-            return self.complete()
+            return jnp.asarray(0), jnp.ones(())
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
@@ -148,6 +147,7 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
         best=jnp.asarray(jnp.inf, dtype),
         skipped=jnp.asarray(0),
         losses=jnp.full(problem.recipe.epochs, jnp.nan, dtype),
+        criteria=jnp.full(problem.recipe.epochs + 1, jnp.nan, dtype),
     )
     # No array is weakly typed, because the compiled epochs return none that is.
     carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
@@ -170,16 +170,17 @@ def advance(
     start: Int[Array, ""],
     stop: Int[Array, ""],
     compare: Bool[Array, ""],
-) -> tuple[Carry, Float[Array, ""]]:
+) -> Carry:
     """Runs the epochs from `start` up to `stop`, and may compare the model with the best so far."""
     carry = lax.fori_loop(start, stop, lambda e, carry: _epoch(objective, carry, e), carry)
     criterion = objective.criterion(carry.weights)
     better = compare & (criterion < carry.best)
-    carry = carry._replace(
+    found = jnp.where(compare, criterion, carry.criteria[stop]).astype(carry.criteria.dtype)
+    return carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
         best=jnp.where(better, criterion, carry.best),
+        criteria=carry.criteria.at[stop].set(found),
     )
-    return carry, criterion
 
 
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:

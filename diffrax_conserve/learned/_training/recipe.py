@@ -1,6 +1,5 @@
 """Recipes: the options of a training, and the default one."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, final
 
@@ -90,15 +89,14 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
     [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3 and clipping.
-- `schedule`: for a network with a conservative layer, a function of the epoch (traced), the number
-    of epochs and the number of iterations in the layer, which returns $p$ and $s$. The network is
-    trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations.
-    Default: one more iteration in each of $P + 1$ stages, in each of which $s$ rises from 0 to 1.
+- `schedule`: for a conservative layer, a function `(epoch, epochs, steps)` of traced `epoch` that
+    returns $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$
+    is its output after $k$ iterations. Default: one more iteration in each of `steps + 1` stages,
+    in each of which $s$ rises from 0 to 1.
 - `loss`: a function from the squared norm $q$ of the defect at each point, and the median of
     $|f|^2$ over the initial states, to the loss. Default: the mean of $q$. With `lambda q, typical:
     jnp.mean(q / (1 + q / typical))` states that change too fast for the network do not dominate.
-- `times`: a function from a key, a number of points, the first and the last time to the times of
-    the points. Default: independent and uniform.
+- `times`: a function `(key, count, first, last)` to times. Default: independent and uniform.
 - `taylor`: the order of the polynomial that a [`diffrax_conserve.DeepONet`][] without one gets, if
     the vector field changes slowly enough in the longest step. Default: 0, none.
 - `refresh`: the number of epochs after which new points are drawn. Default: never.
@@ -118,17 +116,12 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
-    - `epochs`: the number of updates. The error decreases with it, down to the approximation error
-        of the network.
+    - `epochs`: the number of updates; more reduce the error, down to what the network can do.
     """
-    if isinstance(model, PINN) and tree_size(model.window(0).net) <= _LEVENBERG_MARQUARDT_MAX:
-        found = Recipe(epochs or 40, 120, LevenbergMarquardt(), complete, times=grid)
+    # With 2,000 columns a QR factorisation takes about as long as SPRING's Cholesky factorisation.
+    if isinstance(model, PINN) and tree_size(model.window(0).net) <= 2000:
         # Up to 1,024 windows in the place of one.
-        return dataclasses.replace(found, check_every=5, retries=10)
-    found = Recipe(epochs or 1000, 250, SPRING(), complete, taylor=1)
-    return dataclasses.replace(found, check_every=20, refresh=1)
-
-
-# With this many columns its QR factorisation takes about as long as SPRING's Cholesky
-# factorisation.
-_LEVENBERG_MARQUARDT_MAX = 2000
+        options: dict[str, Any] = dict(times=grid, check_every=5, retries=10)
+        return Recipe(epochs or 40, 120, LevenbergMarquardt(), complete, **options)
+    options = dict(taylor=1, check_every=20, refresh=1)
+    return Recipe(epochs or 1000, 250, SPRING(), complete, **options)

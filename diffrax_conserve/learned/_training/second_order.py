@@ -40,9 +40,6 @@ class LeastSquares(NamedTuple):
     loss: Loss
     typical: Float[Array, ""]
 
-    def value(self, defects: Float[Array, "points n"]) -> Float[Array, ""]:
-        return self.loss(squared_norms(defects), self.typical)
-
     def rows(
         self, weights: Float[Array, " weights"]
     ) -> tuple[Float[Array, " rows"], Float[Array, "rows weights"], Float[Array, ""]]:
@@ -69,9 +66,8 @@ class SPRING(eqx.Module):
     $$\delta = \zeta - J^\top (J J^\top + \lambda I)^{-1} (r + J \zeta),$$
 
     with a damping $\lambda$ proportional to the loss. The size of the matrix is the number of
-    equations, 750 for 250 points of a system of three, or that of weights, if it is smaller. After
-    two fifths of the epochs the length of the updates decreases linearly to zero, so that the noise
-    of the batches averages out.
+    equations or that of weights, if it is smaller. After two fifths of the epochs the length of the
+    updates decreases linearly to zero, so that the noise of the batches averages out.
 
     ??? cite "Reference"
 
@@ -132,12 +128,11 @@ class LevenbergMarquardt(eqx.Module):
     r"""Gauss-Newton steps with an adaptive damping, for small networks and fixed points.
 
     An update that does not reduce the loss is rejected, and the damping $\lambda$ is increased;
-    after an update that reduces the loss as the linear model predicts, it is decreased.
-
-    The weights of the last layer, in which the output is linear, are damped far less, by $10^{-12}
-    \lambda$, so that every update solves for them almost exactly, as in variable projection: with
-    equal damping the residual reaches $10^{-5}$ instead of $10^{-10}$. The problem is
-    ill-conditioned, and therefore solved by a QR factorisation of $J$.
+    after an update that reduces the loss as the linear model predicts, it is decreased. The weights
+    of the last layer, in which the output is linear, are damped by $10^{-12} \lambda$, so that
+    every update solves for them almost exactly, as in variable projection: with equal damping the
+    residual reaches $10^{-5}$ instead of $10^{-10}$. The problem is ill-conditioned, and therefore
+    solved by a QR factorisation of $J$.
 
     ??? cite "Reference"
 
@@ -151,8 +146,7 @@ class LevenbergMarquardt(eqx.Module):
         check_number("damping", self.damping, above=0.0, optional=False)
 
     def init(self, weights: Any) -> Float[Array, ""]:
-        dtype = ravel_pytree(weights)[0].dtype
-        return jnp.asarray(self.damping, dtype)
+        return jnp.asarray(self.damping, ravel_pytree(weights)[0].dtype)
 
     def update(
         self,
@@ -167,7 +161,7 @@ class LevenbergMarquardt(eqx.Module):
         units = jnp.where(linear, jnp.asarray(_FREEDOM, r.dtype), 1)
         scaled = _damped_least_squares(jacobian * units, -r, state)
         update = units * scaled
-        after = problem.value(problem.defects(weights + update))
+        after = problem.loss(squared_norms(problem.defects(weights + update)), problem.typical)
         change = jacobian @ update
         predicted = -(2 * r @ change + change @ change)
         ratio = (loss - after) / predicted

@@ -60,12 +60,10 @@ def train_windows(
                 break
             state, ended = windows.next(shown), "epochs"
             shown = state
-            loop.save(state)
     except KeyboardInterrupt:
         if not state.trained:
             raise
         ended = "interrupt"
-    loop.save(state, always=True)
     along = windows.errors_along(shown)
     if not max(along) <= windows.wrong:
         windows.warn(shown, along)
@@ -102,8 +100,7 @@ class _Windows:
         return share * (self.aim if self.retries else self.wrong) / (_GROWTH * state.tightening)
 
     def own_error(self, window: Window) -> float:
-        """The largest error of a window alone, relative to the solution in it or the initial
-        state."""
+        """The largest error of a window alone, relative to the solution or the initial state."""
         found = window_errors(window, self.loop.problem, jnp.zeros_like(self.pinn.scale))
         size = np.maximum(np.asarray(found.size[0]), np.abs(np.asarray(flatten(self.pinn.y0))))
         return relative(found.largest[0], size, self.pinn.y0)
@@ -192,7 +189,7 @@ class _Windows:
         )
 
     def warn(self, state: FitState, along: list[float]) -> None:
-        """Warns, with the first window that failed, or else the one with the largest error."""
+        """Names the first window that failed, or else the one with the largest error."""
         errors, edges = np.array(state.errors), self.edges(state)
         failed = np.flatnonzero(~(errors <= self.limits(state)))
         k = int(failed[0]) if failed.size else int(np.argmax(along))
