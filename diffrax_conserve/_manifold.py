@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
-from ._options import check_function, check_number, dtype_of, is_real
+from ._options import check_function, check_numbers, dtype_of, is_real
 from ._tree import tree_shapes, tree_size
 
 
 def _arrays(value: Values | None) -> Values | None:
-    check_number("value", value)
+    check_numbers("value", value)
     # Arrays, so that a different value does not trigger another compilation.
     return jtu.tree_map(jnp.asarray, value)
 
@@ -261,7 +261,7 @@ def conserved_values(
         elif given is None and value is None:
             value = output
         else:
-            check_number("value", value)
+            check_numbers("value", value)
             _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
         found.append(jtu.tree_map(jnp.asarray, value))
     count, unknowns = tree_size(found), tree_size(y)

@@ -31,24 +31,27 @@ def check_number(
     above: float | None = None,
     optional: bool = True,
 ) -> None:
-    """Raises unless `value` is a PyTree of real numbers, of arrays of them (for a `vmap`), and of
-    tracers, or, if `optional`, `None`. They must be at least `least` and greater than `above`; NaN
-    is rejected."""
+    """Raises unless `value` is a real number, an array of real numbers (for a `vmap`), a tracer,
+    or, if `optional`, `None`. It must be at least `least` and greater than `above`; NaN is
+    rejected."""
+    if isinstance(value, jax.core.Tracer) or (optional and value is None):
+        return
     ending = ", or `None`." if optional else "."
-    is_leaf = lambda x: x is None and not optional  # noqa: E731
-    for path, leaf in jtu.tree_leaves_with_path(value, is_leaf=is_leaf):
-        place = f"`{name}{jtu.keystr(path)}` is"
-        if isinstance(leaf, jax.core.Tracer):
-            continue
-        if not is_real(leaf):
-            raise TypeError(f"{place} {leaf!r}, but it must be a real number{ending}")
-        number, wanted = np.asarray(leaf), ""
-        if above is not None and not np.all(number > above):
-            wanted = "positive" if above == 0 else f"greater than {above:g}"
-        if least is not None and not np.all(number >= least):
-            wanted = f"at least {least:g}" if np.isfinite(least) else "a number"
-        if wanted:
-            raise ValueError(f"{place} {leaf}, but it must be {wanted}{ending}")
+    if not is_real(value):
+        raise TypeError(f"`{name}` is {value!r}, but it must be a real number{ending}")
+    number, wanted = np.asarray(value), ""
+    if above is not None and not np.all(number > above):
+        wanted = "positive" if above == 0 else f"greater than {above:g}"
+    if least is not None and not np.all(number >= least):
+        wanted = f"at least {least:g}" if np.isfinite(least) else "a number"
+    if wanted:
+        raise ValueError(f"`{name}` is {value}, but it must be {wanted}{ending}")
+
+
+def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
+    """`check_number` of every leaf of `tree`."""
+    for path, leaf in jtu.tree_leaves_with_path(tree):
+        check_number(name + jtu.keystr(path), leaf, least=least)
 
 
 def check_count(name: str, value: Any) -> None:
