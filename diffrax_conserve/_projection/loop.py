@@ -159,16 +159,20 @@ def _tested(
     now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
     left = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
     more = left > 0
-    y = jnp.where(more, _corrected(equations, kept, y, g, jacobian, on), y)
+    moves = more
+    if len(g) > 1:
+        # A component that is zero on the manifold stays so: what other constraints would move it by
+        # is roundoff, which may be all that its own constraint has.
+        moves = more & (jnp.abs(y) > jnp.where(on, jnp.zeros((), y.dtype), -1))
+    y = jnp.where(moves, _corrected(equations, kept, y, g, jacobian), y)
     return y, left, more.astype(int)
 
 
 def _corrected(
-    equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array, on: Array
+    equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array
 ) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`; `on` tells whether `y` is on the manifold. The damping is the squared
-    residual, relative to the scale at the candidate: near a state where all terms vanish it never
-    becomes small relative to theirs."""
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
+    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
     if kept.factors is not None:
         rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:
@@ -181,11 +185,11 @@ def _corrected(
     change = combined(multiplier, rows)
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
-    # A component whose true value is zero would never be small relative to itself: one that nearly
-    # vanishes does so, and one that has, on the manifold, stays zero.
+    # A component that nearly vanishes does so: if its true value is zero, it would never be small
+    # relative to itself.
     rest = y - change
     least = 2 * float(jnp.finfo(y.dtype).eps) if equations.clip is None else _VANISHES
-    return jnp.where((jnp.abs(rest) <= least * jnp.abs(y)) | (on & (y == 0)), 0, rest)
+    return jnp.where(jnp.abs(rest) <= least * jnp.abs(y), 0, rest)
 
 
 def _length(
