@@ -20,6 +20,7 @@ import jax.random as jr
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._training.objective import Problem, start
+from diffrax_conserve.learned._training.recipe import complete
 from diffrax_conserve.reproduce._trained import KINDS, build, is_flow_map, is_learned
 
 OUT = Path(__file__).parent.parent / "results" / "learned_solvers.json"
@@ -50,14 +51,14 @@ def epoch(system, kind, points):
     if isinstance(network, dfc.PINN):
         network = network.window(0)
     sample = system.sample if is_flow_map(system) else None
-    recipe = dfc.learned.Recipe(epochs=1, points=points)
+    recipe = dfc.learned.Recipe(epochs=1, points=points, schedule=complete)
     problem = Problem(system.vector_field, None, sample, None, recipe)
     objective, carry = start(problem, network, jr.key(2))
 
     def gradient(objective, carry, schedule):
-        return jax.value_and_grad(objective.loss)(carry.weights, carry.points, schedule)
+        return jax.value_and_grad(objective.loss)(carry.weights, objective.first_points, schedule)
 
-    arguments = (objective, carry, objective.complete())
+    arguments = (objective, carry, objective.schedule(jnp.asarray(0)))
     call, seconds = compiled(gradient, *arguments)
     return lambda: call(*arguments), seconds
 
