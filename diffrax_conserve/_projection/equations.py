@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import evaluate, is_entry
+from .._manifold import Constraint, evaluate, is_entry, named_entries
 from .._tree import ravel, unflatten, unravel
 
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
@@ -36,6 +36,7 @@ class Equations(eqx.Module):
     - `hidden`: the part of it that the gradients do not show.
     - `weights`: `M⁻¹`, the inverse of the metric; `None` if it is one.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
+    - `may_vanish`: whether all terms of a residual may be zero, as those of a `Constraint`.
     - `clip`: where the state is within bounds, the map to it from a vector without bounds, which is
         then the argument of all methods. The residual is the gradient of a convex function of the
         multipliers, with kinks, so that an iteration must look for the minimum along its step.
@@ -47,6 +48,7 @@ class Equations(eqx.Module):
     weights: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
+    may_vanish: bool = eqx.field(default=False, static=True)
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -136,7 +138,8 @@ def equations_of(
         parts.append(eqx.filter_closure_convert(part, vector))
         start += jax.eval_shape(part, vector).size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
-    return Equations(tuple(parts), magnitude, hidden)
+    may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
+    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish)
 
 
 @jax.custom_batching.custom_vmap

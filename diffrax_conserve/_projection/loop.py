@@ -160,7 +160,7 @@ def _tested(
     left = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
     more = left > 0
     moves = more
-    if len(g) > 1:
+    if equations.may_vanish:
         # A component that is zero on the manifold stays so: what other constraints would move it by
         # is roundoff, which may be all that its own constraint has.
         moves = more & (jnp.abs(y) > jnp.where(on, jnp.zeros((), y.dtype), -1))

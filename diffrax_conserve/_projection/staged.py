@@ -114,5 +114,6 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
         inverse_metric(projection.metric, problem.like),
+        may_vanish=problem.equations.may_vanish,
     )
     return dataclasses.replace(problem, equations=equations)
