@@ -241,8 +241,8 @@ def conserved_values(
     at most as many as the state has unknowns, and each value has the shapes of what its function
     returns.
     """
-    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
-    values = [getattr(entry, "value", None) for entry in entries]
+    entries, treedef = named_entries(manifold), jtu.tree_structure(manifold, is_leaf=is_entry)
+    values = [getattr(entry, "value", None) for _, entry in entries]
     if given is not None:
         try:
             values = treedef.flatten_up_to(given)
@@ -253,7 +253,7 @@ def conserved_values(
                 "`FirstIntegral` and `None` in the place of each `Constraint`."
             ) from error
     found = []
-    for (name, entry), value in zip(named_entries(manifold), values, strict=True):
+    for (name, entry), value in zip(entries, values, strict=True):
         output = entry.fn(t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):

@@ -29,10 +29,11 @@ _COUNTED = frozenset(_NAMES.split())
 # Sums of products, each with an error of its own.
 _PRODUCTS = {"dot_general", "conv_general_dilated"}
 # What these take from the state is still the state.
-_PARTS = """
+_PART_NAMES = """
 broadcast_in_dim concatenate convert_element_type gather reshape rev slice split squeeze stack
 transpose unstack
 """
+_PARTS = frozenset(_PART_NAMES.split())
 # How a value depends on the state: not at all, as a part of it, or as computed from it.
 _CONSTANT, _STATE, _COMPUTED = range(3)
 
@@ -81,7 +82,7 @@ def _evaluated(closed: Any, y: Array, changed: Callable[[Any, Any], Any]) -> Arr
 def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
     name, params = eqn.primitive.name, eqn.params
     inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
-    kind = _COMPUTED if kind == _STATE and name not in _PARTS.split() else kind
+    kind = _COMPUTED if kind == _STATE and name not in _PARTS else kind
     inside = ft.partial(walk, constant=_constant, equation=ft.partial(_equation, changed))
     inner = params.get("call_jaxpr")
     if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
