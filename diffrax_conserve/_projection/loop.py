@@ -50,6 +50,8 @@ class _Kept(NamedTuple):
     scale: Float[Array, " m"] | None = None
 
 
+# The residuals and the Jacobian at a state.
+_Seen = tuple[Float[Array, " m"], Float[Array, "m n"]]
 # The state, whether it is on the manifold, and the number of iterations.
 Solved = tuple[Float[Array, " n"], Bool[Array, ""], Int[Array, ""]]
 
@@ -98,28 +100,52 @@ def _solve(
     damped: bool,
     small: bool,
 ) -> Solved:
-    def start(y: Any) -> _Kept:
+    def start(y: Any) -> tuple[_Kept, _Seen | None]:
         if directions is not None:
-            return _Kept(directions / row_sizes(directions)[:, None])
+            return _Kept(directions / row_sizes(directions)[:, None]), None
         if fresh and not damped:
-            return _Kept()
-        _, jacobian = equations.linearise(y)
+            return _Kept(), None
+        g, jacobian = equations.linearise(y)
         if fresh:
-            return _Kept(scale=equations.scale(jacobian, jnp.full_like(y, jnp.max(jnp.abs(y)))))
+            far = jnp.full_like(y, jnp.max(jnp.abs(y)))
+            return _Kept(scale=equations.scale(jacobian, far)), None
         sizes = row_sizes(jacobian)
         unit = jacobian / sizes[:, None]
         rows = equations.weighted(unit)
-        many = len(rows) > WRITTEN_OUT_MAX
-        return _Kept(rows, factor(gram_matrix(unit, rows), sizes) if many else None)
+        if len(rows) <= WRITTEN_OUT_MAX:
+            return _Kept(rows), None
+        # A large Jacobian is carried, so that none is computed twice.
+        return _Kept(rows, factor(gram_matrix(unit, rows), sizes)), (g, jacobian)
 
-    def test(kept: _Kept, y: Any, left: Array) -> tuple[Array, Array, Array]:
-        return _tested(equations, max_steps, kept, y, left)
+    def judge(seen: _Seen, y: Any, left: Array) -> Array:
+        """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1. A
+        candidate on the manifold is corrected once, with a count of `max_steps + 2`; if that moves
+        it off the manifold, the candidate is the result, which -2 tells."""
+        level = equations.verdict(*seen, y)
+        on, first, second = level > 0, left == max_steps + 1, left == max_steps + 2
+        # Within the tolerance at most two more.
+        now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
+        now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
+        return jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
+
+    def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:
+        moves = left > 0
+        if equations.may_vanish:
+            # A component that is zero on the manifold stays so: what other constraints would move
+            # it by is roundoff, which may be all that its own constraint has.
+            on = equations.verdict(*seen, y) > 0
+            moves = moves & (jnp.abs(y) > jnp.where(on, jnp.zeros((), y.dtype), -1))
+        return jnp.where(moves, _corrected(equations, kept, *seen, y), y)
+
+    def test(kept: _Kept, y: Any, left: Array) -> tuple[Any, Array]:
+        seen = equations.linearise(y)
+        left = judge(seen, y, left)
+        return move(kept, seen, y, left), left
 
     y: Any = candidate
     left = jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
-    count = jnp.asarray(0)
     if small:
-        like = jax.eval_shape(start, y)
+        like, _ = jax.eval_shape(start, y)
         written: tuple[Any, ...] = in_scalars(start, y), in_scalars(test, like, y, left)
         if None not in written:
             # From here on arrays are tuples of scalars.
@@ -128,48 +154,34 @@ def _solve(
     in_arrays = not isinstance(y, tuple)
     if in_arrays:
         y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
-    kept = start(y)
-    if not in_arrays:  # the first iteration before the loop, which saves a tenth
-        y, left, count = test(kept, y, left)
+    kept, seen = start(y)
+    count = jnp.asarray(0)
+    if seen is not None:
+        left = judge(seen, y, left)
+        count = count + (left > 0).astype(int)
+    elif not in_arrays:  # the first iteration before the loop, which saves a tenth
+        y, left = test(kept, y, left)
+        count = count + (left > 0).astype(int)
 
-    def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
-        y, left, count = carry
-        y, left, more = test(kept, y, left)
-        return y, left, count + more
+    def body(carry: tuple[Any, Any, Array, Array]) -> tuple[Any, Any, Array, Array]:
+        y, seen, left, count = carry
+        if seen is None:
+            y, left = test(kept, y, left)
+        else:
+            y = move(kept, seen, y, left)
+            seen = equations.linearise(y)
+            left = judge(seen, y, left)
+        return y, seen, left, count + (left > 0).astype(int)
 
-    def unfinished(carry: tuple[Any, Array, Array]) -> Array:
-        return any_lane(carry[1] > 0)
+    def unfinished(carry: tuple[Any, Any, Array, Array]) -> Array:
+        return any_lane(carry[2] > 0)
 
-    y, left, count = lax.while_loop(unfinished, body, (y, left, count))
+    y, _, left, count = lax.while_loop(unfinished, body, (y, seen, left, count))
     return jnp.where(left == -2, candidate, joined(candidate, y)), left != -1, count
 
 
-def _tested(
-    equations: Equations, max_steps: int, kept: _Kept, y: Array, left: Array
-) -> tuple[Float[Array, " n"], Int[Array, ""], Int[Array, ""]]:
-    """The verdict at the state itself, the next state, and whether that is another one. `left`
-    counts the iterations that are left, at first `max_steps + 1`; it ends as 0, success, or -1. A
-    candidate on the manifold is corrected once, with a count of `max_steps + 2`; if that moves it
-    off the manifold, the candidate is the result, which -2 tells."""
-    g, jacobian = equations.linearise(y)
-    level = equations.verdict(g, jacobian, y)
-    on, first, second = level > 0, left == max_steps + 1, left == max_steps + 2
-    # Within the tolerance at most two more.
-    now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
-    now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
-    left = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
-    more = left > 0
-    moves = more
-    if equations.may_vanish:
-        # A component that is zero on the manifold stays so: what other constraints would move it by
-        # is roundoff, which may be all that its own constraint has.
-        moves = more & (jnp.abs(y) > jnp.where(on, jnp.zeros((), y.dtype), -1))
-    y = jnp.where(moves, _corrected(equations, kept, y, g, jacobian), y)
-    return y, left, more.astype(int)
-
-
 def _corrected(
-    equations: Equations, kept: _Kept, y: Array, g: Array, jacobian: Array
+    equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: Array
 ) -> Float[Array, " n"]:
     """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
     candidate: near a state where all terms vanish it never becomes small relative to theirs."""

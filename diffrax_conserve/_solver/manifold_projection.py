@@ -208,9 +208,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
         # A last stage that is kept belongs to the candidate. Only implicit methods need it, because
-        # a stage at the projected state amplifies the error of their root finder.
-        implicit = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver)
-        made_jump = made_jump if implicit else True
+        # a stage at the projected state amplifies the error of their root finder; `QUICSORT` keeps
+        # none, and cannot be told of a jump.
+        keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
+        made_jump = made_jump if keeps else True
         state = solver_state
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, state.inner, made_jump
