@@ -18,14 +18,16 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
 from .._tree import tree_tangents
-from .equations import Equations, any_lane, relative
-from .gram import (
+from .equations import (
     WRITTEN_OUT_MAX,
+    Equations,
     Factors,
+    any_lane,
     combined,
     factor,
     gram_matrix,
     gram_solve,
+    relative,
     row_sizes,
     solve_factored,
 )
@@ -205,11 +207,7 @@ def _corrected(
 
 
 def _length(
-    equations: Equations,
-    clip: Callable[[Array], Array],
-    y: Array,
-    multiplier: Array,
-    change: Array,
+    equations: Equations, clip: Callable[[Array], Array], y: Array, multiplier: Array, change: Array
 ) -> Array:
     """The share of a step at which a convex function is least, by bisection of its slope."""
 

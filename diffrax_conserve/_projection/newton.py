@@ -11,8 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .bounded import Box, box_of, check_bounds, project_within
-from .equations import Equations
-from .gram import gram_matrix, gram_solve
+from .equations import Equations, gram_matrix, gram_solve
 from .loop import certain, solve
 from .options import NEWTON_OPTIONS, check_options, option, positive_weights
 

@@ -25,8 +25,7 @@ from .._manifold import (
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
-from .equations import equations_of
-from .gram import combined, gram_matrix, gram_solve
+from .equations import combined, equations_of, gram_matrix, gram_solve
 from .options import check_state, inverse_metric, positive_weights
 from .scalars import written_out
 

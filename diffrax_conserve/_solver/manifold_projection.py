@@ -9,22 +9,9 @@ import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .._balance import has_rates
-from .._custom_types import (
-    VF,
-    Args,
-    BoolScalarLike,
-    DenseInfo,
-    Manifold,
-    RealScalarLike,
-    Y,
-)
+from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
-from .._manifold import (
-    FirstIntegral,
-    check_manifold,
-    conserved_values,
-    named_entries,
-)
+from .._manifold import FirstIntegral, check_manifold, conserved_values, named_entries
 from .._options import check_count, check_number
 from .._projection.base import AbstractProjection, Target, check_projection
 from .._projection.options import check_state, option

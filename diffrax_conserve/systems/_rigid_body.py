@@ -178,10 +178,7 @@ class RigidBodyAttitude(AbstractIntegratedSystem):
 
     @property
     def manifold(self) -> dict[str, FirstIntegral | Constraint]:
-        return {
-            "unit quaternion": Constraint(self.squared_norm_minus_one),
-            **super().manifold,
-        }
+        return {"unit quaternion": Constraint(self.squared_norm_minus_one), **super().manifold}
 
     @property
     def y0(self) -> Pose:
