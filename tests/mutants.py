@@ -208,8 +208,8 @@ def judge_success_by_the_scale_at_the_candidate(package):
 
         return mutated
 
-    loop = sys.modules[package.find("_tested").__module__]
-    package.in_module_of("_tested", "_solve", mutate(loop._solve))
+    loop = sys.modules[package.find("_corrected").__module__]
+    package.in_module_of("_corrected", "_solve", mutate(loop._solve))
 
 
 @noticed_by("tests/laws/test_never_silent.py", "-k", "parallel")
