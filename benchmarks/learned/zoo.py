@@ -177,7 +177,7 @@ SMOKE = {
         spec,
         width=8,
         depth=1,
-        epochs=3,
+        epochs=10,
         points=20,
         pool=40,
         windows=min(spec.windows, 2),
