@@ -60,9 +60,8 @@ class ProjectionInfo(eqx.Module):
         candidate has no finite residual, divergence if only the result has none.
     - `num_steps`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
-        projected state, each relative to the scale of its constraint at the projected state:
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus the terms
-        that cancel inside `fn`.
+        projected state, relative to the scale of its constraint at the latter,
+        $|I_0| + \\sum_k |y_k \\partial g/\\partial y_k|$ plus the terms that cancel inside `fn`.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
@@ -93,8 +92,7 @@ class ProjectionInfo(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """The problem that a projection solves. States are real vectors of `n` numbers; `state` makes
-    one a state of the solve.
+    """The problem that a projection solves. States are vectors of `n` real numbers; see `state`.
 
     **Attributes:**
 
@@ -196,11 +194,9 @@ class AbstractProjection(eqx.Module):
 
 
 def check_projection(projection: Any) -> None:
-    """Raises unless `projection` is an instance of a projection, not a class."""
     if not isinstance(projection, AbstractProjection):
         raise TypeError(
-            f"`projection` is {projection!r}, which is not a projection. Pass an instance, such as "
-            "`SimplifiedNewton()`."
+            f"`projection` is {projection!r}, which is not a projection. Pass `SimplifiedNewton()`."
         )
 
 

@@ -85,7 +85,6 @@ Directional.__init__.__doc__ = """**Arguments:**
 
 **Raises:**
 
-`ValueError`, before compilation, with more than one scalar constraint, and without an error
-estimate that has a sign: in [`diffrax_conserve.project`][], with a solver that has none, and with a
-`diffrax.HalfSolver`.
+`ValueError` with more than one scalar constraint, and without an error estimate that has a sign: in
+[`diffrax_conserve.project`][], with a solver that has none, and with a `diffrax.HalfSolver`.
 """

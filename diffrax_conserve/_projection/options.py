@@ -21,7 +21,6 @@ def option(default: Any, **kwargs: Any) -> Any:
 
 
 def check_options(projection: Any) -> None:
-    """Raises unless the options common to the projections are valid."""
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):

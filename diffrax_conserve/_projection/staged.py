@@ -96,8 +96,7 @@ Staged.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` if a stage is not such a pair; `ValueError`, when it is used, if the keys are not those
-of the manifold.
+`TypeError` if a stage is not such a pair; `ValueError`, in use, if the manifold has other keys.
 """
 
 

@@ -57,8 +57,7 @@ def tangent(
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
-    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s. A `FirstIntegral` with a `rate`
-        changes at that rate.
+    - `manifold`: a PyTree of `FirstIntegral`s, which change at their `rate`, and `Constraint`s.
     - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][]; an infinite weight leaves its
         component of the field unchanged.
     - `gain`: the decay rate, in one over time; negative for a solve backward in time.

@@ -97,9 +97,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 "out `every`, or `lower` and `upper`."
             )
 
-    # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
-    # attributes from the wrapper. They are `Any` because `equinox.tree_at` replaces values by
-    # placeholders.
+    # diffrax forwards `isinstance` to the innermost solver, then reads these attributes of the
+    # wrapper. They are `Any` because `equinox.tree_at` replaces values by placeholders.
 
     @property
     def term_structure(self) -> Any:  # pyright: ignore
@@ -209,8 +208,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             target=PackedTarget(start),
             due=due,
         )
-        # An infinite error makes an adaptive solve try a smaller step; if that is hopeless, the
-        # step is accepted and its result ends the solve.
+        # An infinite error makes an adaptive solve try a smaller step; a step without hope is
+        # accepted, and its result ends the solve.
         shown = jnp.where(hopeless, 0, jnp.inf)
         error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
         result = dfx.RESULTS.where(

@@ -24,12 +24,10 @@ from .diffrax_private import register
 
 _SMALLER = (
     "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes with "
-    "candidates far from the manifold. Check by `check_invariance` that the quantity is conserved "
-    "at all. "
+    "far candidates. Check by `check_invariance` that the quantity is conserved at all. "
 )
 _ENTRY = (
-    "`diffrax_conserve.statistics(sol).worst`, of a solve with `SaveAt(solver_state=True)`, tells "
-    "the entry of the manifold."
+    "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
 )
 _FIRST = register(
     "the solve cannot start: the initial state violates a `Constraint`, or a function of the "
@@ -117,8 +115,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Raises:**
 
-    `ValueError` if `sol` holds no state of a `ManifoldProjection`; `TypeError` if `sol` is not a
-    solution.
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`, `TypeError` if no solution.
 
     !!! example
 

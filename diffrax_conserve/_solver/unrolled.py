@@ -41,8 +41,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 
     ??? cite "Reference"
 
-        Hairer, Nørsett and Wanner, *Solving Ordinary Differential Equations I*, Springer 1993,
-        Section II.1.
+        Hairer, Nørsett, Wanner, *Solving Ordinary Differential Equations I*, Springer 1993, II.1.
     """
 
     solver: Any  # an `AbstractERK`; checked below, with a remedy
