@@ -11,8 +11,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
 
 What is conserved    FirstIntegral, Constraint, check_invariance, drift
 Solvers              ManifoldProjection, RK4, Unrolled, statistics
-Projections          SimplifiedNewton (the default), Newton, ClosedForm, Directional, Staged,
-                     project
+Projections          SimplifiedNewton, Newton, ClosedForm, Directional, Staged, project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
 Your own tests       import diffrax_conserve.testing

@@ -17,7 +17,6 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 def has_rates(manifold: Manifold) -> bool:
-    """Whether an entry of the manifold has a rate, so that its conserved value changes in time."""
     return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
 
 
@@ -27,8 +26,7 @@ def refuse_rates(manifold: Manifold, user: str) -> None:
         if rate_of(entry) is not None:
             raise ValueError(
                 f"`{name}` is a balance law, a `FirstIntegral` with a `rate`, but {user} keeps "
-                "conserved values that do not change. Leave it out of this manifold; a "
-                "`ManifoldProjection` keeps it."
+                "values that do not change. Leave it to a `ManifoldProjection`."
             )
 
 
@@ -61,11 +59,9 @@ def integrated_rates(
         t = start + (1 + node) * half
         return rates(manifold, t * direction, path(t), args)
 
-    dtype = jnp.result_type(half)
-    found = jax.vmap(at)(jnp.asarray(_NODES, dtype))
-    weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
-
     def total(x: Array) -> Array:
         return jnp.sum(jax.vmap(jnp.multiply)(weights.astype(x.dtype), x), axis=0)
 
-    return jtu.tree_map(total, found)
+    dtype = jnp.result_type(half)
+    weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
+    return jtu.tree_map(total, jax.vmap(at)(jnp.asarray(_NODES, dtype)))

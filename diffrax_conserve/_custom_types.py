@@ -24,9 +24,8 @@ DenseInfo = dict[str, PyTree[Array]]
 Values = PyTree[Real[ArrayLike, "..."]]
 ConstraintFn = Callable[[RealScalarLike, Any, Any], Values]
 
-# A PyTree of `FirstIntegral`s and `Constraint`s. It is not spelled as a `PyTree[...]`, because the
-# entries are themselves PyTrees with leaves of any kind. The type rejects a bare function, as
-# `check_manifold` does.
+# A PyTree of `FirstIntegral`s and `Constraint`s, which are PyTrees themselves: so no `PyTree[...]`.
+# The type rejects a bare function, as `check_manifold` does.
 if TYPE_CHECKING:
 
     class _Entry(Protocol):

@@ -1,9 +1,7 @@
 """Dense output on the manifold: the inner solver's interpolant, projected at each evaluation.
 
-Between the ends of a step the interpolant is off the manifold by its own error, so it does not
-suffice to replace its end values. At the ends of a step the interpolant is projected too, because
-replacing it by the stored states would make its time derivative zero there, which the root finder
-of an event needs.
+It is off the manifold by its own error. At the ends of a step it is projected too: stored states in
+its place would have no time derivative, which the root finder of an event needs.
 """
 
 import dataclasses
@@ -127,8 +125,8 @@ def _projected_jvp(primals: Any, tangents: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class MakeManifoldInterpolation:
-    """The `interpolation_cls` of a projected solver. Two instances are equal if their inner classes
-    are, so that two solves with dense output share one compiled evaluation."""
+    """The `interpolation_cls` of a projected solver: equal for equal inner classes, so that two
+    solves with dense output share one compiled evaluation."""
 
     inner_cls: Callable[..., dfx.AbstractLocalInterpolation]
 

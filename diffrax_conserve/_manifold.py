@@ -26,10 +26,9 @@ class FirstIntegral(eqx.Module):
     The manifold is $\{y : I(t, y, args) = \text{conserved value}\}$. The conserved value is
     $I(t_0, y_0, args)$ of the solve in which it is used, or `value`.
 
-    With `rate`, which is $dI/dt$ along the exact solution, this is a *balance law*, such as that of
-    energy and dissipated power: the conserved value at $t$ is larger by $\int_{t_0}^t
-    \mathrm{rate}(s, y(s), args)\, ds$, which a solve computes by Gauss quadrature with four nodes
-    along the dense output of the wrapped solver. See "Balance laws" in the guide.
+    With `rate`, this is a *balance law*, such as that of energy and dissipated power: the conserved
+    value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$, by Gauss quadrature
+    with four nodes along the dense output of the wrapped solver. See "Balance laws" in the guide.
 
     !!! example
 
@@ -47,8 +46,7 @@ class FirstIntegral(eqx.Module):
     def __check_init__(self):
         check_function("`fn` of a `FirstIntegral`", self.fn, "fn(t, y, args)", "real arrays")
         if self.rate is not None:
-            returns = "the derivative of `fn` along the solution"
-            check_function("`rate` of a `FirstIntegral`", self.rate, "rate(t, y, args)", returns)
+            check_function("`rate` of a `FirstIntegral`", self.rate, "rate(t, y, args)", "dI/dt")
 
 
 FirstIntegral.__init__.__doc__ = r"""**Arguments:**
@@ -56,10 +54,9 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every element is one first integral. It
     is differentiated in reverse mode, in which JAX has no `while_loop`.
-- `value`: the conserved value at the start of a solve, a PyTree like the one that `fn` returns.
-    Default: that of the initial state.
-- `rate`: a callable `rate(t, y, args)` that returns $dI/dt$ along the exact solution,
-    $\partial_t I + \nabla I \cdot f$, shaped like what `fn` returns. Default: zero.
+- `value`: the value of `fn` at the start of a solve. Default: that of the initial state.
+- `rate`: a callable `rate(t, y, args)` that returns $dI/dt = \partial_t I + \nabla I \cdot f$ along
+    the exact solution, like what `fn` returns. Default: zero.
 """
 
 
@@ -85,9 +82,8 @@ class Constraint(eqx.Module):
     def derivative(self, vector_field: Callable[[RealScalarLike, Any, Args], Any]) -> "Constraint":
         r"""The hidden constraint $\dot g = \partial_t g + \partial_y g \cdot f = 0$.
 
-        If $g = 0$ holds for all times, so does the hidden constraint. For a constraint on the
-        positions of a mechanism it is the constraint on the velocities, and it depends only on the
-        part $q' = v$ of the field.
+        For a constraint on the positions of a mechanism it is that on the velocities, and depends
+        only on the part $q' = v$ of the field.
 
         **Arguments:**
 
@@ -165,19 +161,17 @@ def rate_of(entry: Any) -> ConstraintFn | None:
 
 
 def check_manifold(manifold: Manifold) -> None:
-    """Raises unless `manifold` is a non-empty PyTree of `FirstIntegral`s and `Constraint`s."""
     entries = named_entries(manifold)
     if not entries:
         raise ValueError(
-            f"`manifold` is {manifold!r}, which holds no `FirstIntegral` and no `Constraint`: "
-            "there is nothing to conserve. Give at least one, or use the solver without projection."
+            f"`manifold` is {manifold!r}: there is nothing to conserve. Give a `FirstIntegral` or "
+            "`Constraint`, or use the solver without projection."
         )
     for name, entry in entries:
         if not is_entry(entry):
             raise TypeError(
                 f"`{name}` is {entry!r}, which is neither a `FirstIntegral` nor a `Constraint`. "
-                "Wrap a function: `FirstIntegral(fn)` keeps `fn(t, y, args)` at its initial value, "
-                "`Constraint(fn)` keeps it at zero."
+                "Wrap a function: `FirstIntegral(fn)` keeps it constant, `Constraint(fn)` at zero."
             )
 
 
@@ -187,16 +181,12 @@ def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
 
 
 def entry_name(manifold: Manifold, position: int) -> str:
-    """The name of an entry of a manifold; the report on a failed projection gives its number.
+    """The name of an entry of a manifold, its path; a failed projection reports its number.
 
     **Arguments:**
 
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `position`: the number of the entry, in the order in which JAX flattens the PyTree.
-
-    **Returns:**
-
-    The path to the entry.
 
     **Raises:**
 
@@ -235,12 +225,7 @@ def conserved_values(
 ) -> Values:
     """`manifold` with each entry replaced by the value of `fn` that a solve started at
     `(t, y, args)` conserves: that in `given`, its own `value`, or that of the state; zero for a
-    constraint.
-
-    Raises unless the functions return real floating-point arrays, in total at least one scalar and
-    at most as many as the state has unknowns, and each value has the shapes of what its function
-    returns.
-    """
+    constraint. Raises unless all fit each other and the state."""
     entries, treedef = named_entries(manifold), jtu.tree_structure(manifold, is_leaf=is_entry)
     values = [getattr(entry, "value", None) for _, entry in entries]
     if given is not None:
@@ -269,14 +254,12 @@ def conserved_values(
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
     if count > unknowns:
         raise ValueError(
-            f"`manifold` has {count} scalar constraints, but the state has only {unknowns} "
-            "unknowns: no state can satisfy them in general. Remove dependent ones."
+            f"`manifold` has {count} scalar constraints for {unknowns} unknowns. Remove some."
         )
     if count > _CONSTRAINTS_MAX:
         raise ValueError(
-            f"`manifold` has {count} scalar constraints, but a projection solves with a full "
-            f"matrix of at most {_CONSTRAINTS_MAX} rows. Project parts of the state by solves of "
-            "their own."
+            f"`manifold` has {count} scalar constraints, but a projection can solve for at most "
+            f"{_CONSTRAINTS_MAX}. Project parts of the state by solves of their own."
         )
     return treedef.unflatten(found)
 
@@ -299,14 +282,12 @@ def _check_output(
         _check_shapes(f"`rate` of `{name}` returns", rates, output)
         if not all(map(is_real, jtu.tree_leaves(rates))):
             raise TypeError(
-                f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}, but it must return "
-                "real numbers, as `fn` does. Return their real part."
+                f"`rate` of `{name}` returns {jtu.tree_map(dtype_of, rates)}. Return real numbers."
             )
 
 
 def _check_shapes(what: str, given: Any, output: Any) -> None:
     if tree_shapes(given) != tree_shapes(output):
         raise ValueError(
-            f"{what} {tree_shapes(given)}, but its `fn(t, y, args)` returns {tree_shapes(output)}. "
-            "Both must be the same."
+            f"{what} {tree_shapes(given)}, but `fn` returns {tree_shapes(output)}: both must agree."
         )

@@ -31,9 +31,8 @@ def check_number(
     above: float | None = None,
     optional: bool = True,
 ) -> None:
-    """Raises unless `value` is a real number, an array of real numbers (for a `vmap`), a tracer,
-    or, if `optional`, `None`. It must be at least `least` and greater than `above`; NaN is
-    rejected."""
+    """Raises unless `value` is a real number or an array of them, at least `least` and greater than
+    `above`, not NaN; or a tracer; or, if `optional`, `None`."""
     if isinstance(value, jax.core.Tracer) or (optional and value is None):
         return
     ending = ", or `None`." if optional else "."
@@ -55,7 +54,6 @@ def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
 
 
 def check_count(name: str, value: Any) -> None:
-    """Raises unless `value` is a positive integer."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
     if value < 1:
@@ -78,7 +76,6 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
 
 
 def check_solution(sol: Any, user: str) -> None:
-    """Raises unless `sol` is a `diffrax.Solution`."""
     if not isinstance(sol, dfx.Solution):
         raise TypeError(
             f"`sol` is of type `{type(sol).__name__}`, but `{user}` takes the `diffrax.Solution` "

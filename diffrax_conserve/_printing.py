@@ -9,8 +9,7 @@ import numpy as np
 
 
 def printed(title: str, rows: Mapping[str, Any]) -> str:
-    """`title`, and one line for each row with its name and its number, or the range over a
-    batch."""
+    """`title`, and a line for each row with its name and its number, or the range over a batch."""
     width = max(map(len, rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {_text(x)}" for name, x in rows.items())])
 

@@ -45,7 +45,6 @@ def tree_max(a: Y) -> Real[Array, ""]:
 
 
 def tree_all_finite(a: PyTree[Array]) -> Array:
-    """Whether there is no NaN and no infinity in `a`."""
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]
     return jnp.all(jnp.stack(finite)) if finite else jnp.asarray(True)
 
@@ -63,8 +62,7 @@ def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
 
 
 def working_dtype(y: Y) -> jnp.dtype:
-    """The real dtype that represents the real and imaginary parts of every leaf of `y` without
-    loss."""
+    """The real dtype that represents the parts of every leaf of `y` without loss."""
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*jtu.tree_leaves(y))
     return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
@@ -81,7 +79,6 @@ def tree_shapes(a: Any) -> Any:
 
 
 def tree_stop_gradient(a: Any) -> Any:
-    """`a` with `stop_gradient` applied to its arrays."""
     return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, a)
 
 

@@ -54,10 +54,8 @@ class InvarianceEntry:
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceReport:
-    """The verdict of `check_invariance`; print it to read it as a table.
-
-    `ok` is true if every entry is conserved, within `rtol`, at each of the `num_states` states.
-    """
+    """The verdict of `check_invariance`, printed as a table: `ok` if every entry is conserved,
+    within `rtol`, at each of the `num_states` states."""
 
     entries: tuple[InvarianceEntry, ...]
     num_states: int
@@ -68,11 +66,9 @@ class InvarianceReport:
         return all(entry.ok for entry in self.entries)
 
     def __str__(self) -> str:
-        verdict = "conserved" if self.ok else "NOT CONSERVED"
-        title = (
-            f"{verdict}: derivatives along the flow at {self.num_states} states, "
-            f"relative tolerance {self.rtol:.1e}"
-        )
+        title = "conserved" if self.ok else "NOT CONSERVED"
+        title += f": derivatives along the flow at {self.num_states} states"
+        title += f", relative tolerance {self.rtol:.1e}"
         rows = {"": f"{'':14}  largest relative defect"}
         for entry in self.entries:
             result = "conserved" if entry.ok else f"NOT conserved, see state {entry.state}"
@@ -97,26 +93,23 @@ def check_invariance(
 
     At each state the derivative along the flow, relative to the size of its own terms, is
 
-    $$\frac{|\partial_t I + \sum_i \partial_i I\, f_i|}{|\partial_t I| + \sum_i |\partial_i I\,
-    f_i|},$$
+    $$\frac{|\partial_t I + \sum_i f_i \partial_i I|}{|\partial_t I| + \sum_i |f_i \partial_i I|},$$
 
     which is a few units of roundoff if $I$ is a first integral, and of order one at almost every
-    state if it is not: a misprint in either $I$ or $f$ is found without a solver. The derivative of
-    a [`diffrax_conserve.Constraint`][] must vanish only on the manifold, so the states must lie on
-    it. A `rate` is subtracted from the derivative, and its size is added to the denominator.
+    state if it is not: a misprint in either $I$ or $f$ is found without a solver. A `rate` is
+    subtracted from the derivative, and its size is added to the denominator.
 
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`, or a `diffrax.ODETerm` of it.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree like `y` with a leading
-        axis over the states, in general position: at an equilibrium every function is conserved.
+        axis over the states. At an equilibrium every function is conserved, so they must be in
+        general position; with a [`diffrax_conserve.Constraint`][], on the manifold.
     - `t`: the time, or one for each state. Give several for integrals that depend on time.
     - `args`: passed to `vector_field` and to the functions of the manifold.
-    - `key`, `num_states`: the seed of the sampler, by default `jax.random.key(0)`, and how many
-        states to draw from it.
-    - `rtol`: the largest relative defect that is attributed to roundoff; by default ten thousand
-        times the machine epsilon of the states.
+    - `key`, `num_states`: the seed (default: `jax.random.key(0)`) and the number of sampled states.
+    - `rtol`: the largest defect that counts as roundoff. Default: 10,000 machine epsilons.
 
     **Returns:**
 
@@ -178,17 +171,13 @@ def _batch(
     sizes = {x.shape[:1] for x in leaves}
     if len(sizes) != 1 or sizes & {(), (0,)} or not all(map(eqx.is_inexact_array, leaves)):
         raise ValueError(
-            "`states` must be a sampler `key -> y`, or a PyTree of floating point arrays with the "
-            f"same leading axis over the states, but it is {eqx.tree_pformat(states)}. "
-            + _ONE_STATE
+            "`states` must be a sampler `key -> y`, or floating-point arrays with the same leading "
+            f"axis over the states, but it is {eqx.tree_pformat(states)}. " + _ONE_STATE
         )
     (shape,) = sizes
     t = jnp.asarray(t, jnp.finfo(jnp.result_type(*leaves)).dtype)
     if t.shape not in ((), shape):
-        raise ValueError(
-            f"`t` must be one time or one for each of the {shape[0]} states, but it has shape "
-            f"{t.shape}."
-        )
+        raise ValueError(f"`t` has shape {t.shape}. Give one time, or one per state.")
     return jnp.broadcast_to(t, shape), states
 
 
@@ -231,8 +220,7 @@ def _relative_sizes(
     # Forces may cancel inside the field.
     hidden = hidden_terms(excess, vector)
     terms = jnp.where(hidden > 4 * terms, hidden, terms)
-    # An integral that is not finite at `y` counts as not conserved, although its derivative may
-    # vanish.
+    # An integral that is not finite counts as not conserved, though its derivative may vanish.
     defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)
     violation = jnp.zeros_like(residual)
     if isinstance(entry, Constraint):
@@ -254,9 +242,8 @@ def _verdict(
     if not residuals[worst] <= rtol:
         raise ValueError(
             f"The constraint `{name}` is not zero at state {worst} of `states` (relative residual "
-            f"{residuals[worst]:.1e}), so its derivative along the flow need not vanish there. "
-            "Give states on the manifold, for example `dfc.project(manifold, y)[0]`, or make it a "
-            "`FirstIntegral` if it is conserved at any value."
+            f"{residuals[worst]:.1e}). Give states on the manifold, such as `dfc.project(manifold, "
+            "y)[0]`, or make it a `FirstIntegral` if it is conserved at any value."
         )
     kind = "first integral" if rate_of(entry) is None else "balance"
     return InvarianceEntry(

@@ -1,6 +1,7 @@
 """The drift of a solution from a manifold."""
 
 from collections.abc import Callable
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -32,17 +33,14 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     $$\frac{I(t_k, y_k) - I_0}{|I_0| + \sum_i |y_{0,i}\, \partial I/\partial y_i(t_0, y_0)|},$$
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
-    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$. Roundoff is
-    proportional to this scale.
-
-    For a `FirstIntegral` with a `rate` the integral of the rate from $t_0$ to $t_k$ is subtracted
-    from the numerator, computed along the dense output, which the solution must have.
+    for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$, to which roundoff is
+    proportional. From the numerator the integral of a `rate` from $t_0$ to $t_k$ is subtracted,
+    computed along the dense output, which the solution must then have.
 
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too, as in
-        `SaveAt(t0=True, steps=True)`, for the drift from the initial state. For a batch of
-        solutions use `jax.vmap`.
+    - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too for the drift
+        from the initial state. For a batch of solutions use `jax.vmap`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
@@ -53,9 +51,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     **Raises:**
 
-    `ValueError` if `sol` is a batch, has no saved states, has a single one without a conserved
-    value to compare it with, was saved by `SaveAt(subs=...)` or `SaveAt(fn=...)`, or lacks dense
-    output for a `rate`. `TypeError` if `sol` is not a solution.
+    `ValueError` if `sol` is a batch, holds no states or one without a conserved value to compare it
+    with, was saved by `SaveAt(subs=...)` or `SaveAt(fn=...)`, or lacks dense output for a `rate`.
+    `TypeError` if `sol` is not a solution.
 
     !!! example
 
@@ -97,9 +95,8 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     for name, entry in named_entries(manifold):
         if sol.ts.size == 1 and not has_value(entry):
             raise ValueError(
-                f"`sol` holds one saved state, so the drift of `{name}` from an earlier one is "
-                "unknown. Save the initial state too, as in `SaveAt(t0=True, t1=True)`, or write "
-                "`FirstIntegral(fn, value=...)`."
+                f"`sol` holds one saved state, so the drift of `{name}` is unknown. Save the first "
+                "one too, by `SaveAt(t0=True, t1=True)`, or write `FirstIntegral(fn, value=...)`."
             )
     t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
     if sol.interpolation is not None:
@@ -114,13 +111,10 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     gained = _gained(sol, manifold, args, values)
 
     # The rates are integrated from the start of the solve, at which a given `value` holds.
-    values = jtu.tree_map(
-        lambda entry, value, gained: value if has_value(entry) else tree_sub(value, gained),
-        manifold,
-        values,
-        gained(t0),
-        is_leaf=is_entry,
-    )
+    def at_start(entry: Any, value: Values, gained: Values) -> Values:
+        return value if has_value(entry) else tree_sub(value, gained)
+
+    values = jtu.tree_map(at_start, manifold, values, gained(t0), is_leaf=is_entry)
 
     def at(t: Array, y: Y) -> Values:
         padded = jnp.isinf(t)
@@ -140,9 +134,8 @@ def _gained(
     path = sol.interpolation
     if not isinstance(path, dfx.DenseInterpolation):
         raise ValueError(
-            "`manifold` has a balance law, a `FirstIntegral` with a `rate`, whose integral is "
-            "taken along the dense output, but `sol` has none. Ask for it, for example with "
-            "`saveat=SaveAt(t0=True, steps=True, dense=True)`."
+            "`manifold` has a `rate`, whose integral is taken along the dense output, but `sol` "
+            "has none. Ask for it by `saveat=SaveAt(t0=True, steps=True, dense=True)`."
         )
 
     def until(step: RealScalarLike, end: RealScalarLike) -> Values:

@@ -33,7 +33,7 @@ class Step(eqx.Module):
 
     **Attributes:**
 
-    - `t0`, `t1`: where the step starts and ends; in a solve backwards in time `t1 < t0`.
+    - `t0`, `t1`: the ends of the step; in a solve backwards in time `t1 < t0`.
     - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
     - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
     """
@@ -46,8 +46,7 @@ class Step(eqx.Module):
     direction: RealScalarLike
 
     def evaluate(self, t: RealScalarLike) -> Float[Array, " n"]:
-        """The dense output of the wrapped solver, before any projection, at a time `t` between `t0`
-        and `t1`."""
+        """The dense output of the wrapped solver at a time in the step, before any projection."""
         return ravel(self.path.evaluate(t * self.direction))
 
 
@@ -61,15 +60,13 @@ class ProjectionInfo(eqx.Module):
         candidate has no finite residual, divergence if only the result has none.
     - `num_steps`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
-        projected state, each relative to the scale of its own constraint at the projected state,
-        $|\\text{conserved value}| + \\sum_k |y_k \\, \\partial g/\\partial y_k|$ plus the terms
-        that cancel inside `fn`.
+        projected state, relative to the scale of its constraint at the latter,
+        $|I_0| + \\sum_k |y_k \\partial g/\\partial y_k|$ plus the terms that cancel inside `fn`.
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
-    - `worst`: if the projection failed, the position of the entry of the manifold with the largest
-        relative residual (the smaller of its residuals before and after), as
-        [`diffrax_conserve.entry_name`][] takes it; otherwise 0.
+    - `worst`: after a failure the position of the entry with the largest relative residual (before
+        or after, the smaller), as [`diffrax_conserve.entry_name`][] takes it; otherwise 0.
     """
 
     ok: Bool[Array, ""]
@@ -95,15 +92,13 @@ class ProjectionInfo(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """The problem that a projection solves. States are real vectors of `n` numbers; `state` makes
-    one a state of the solve.
+    """The problem that a projection solves. States are vectors of `n` real numbers; see `state`.
 
     **Attributes:**
 
-    - `equations`: the residuals `g` and their scales; `residual(y)` is the vector of the `m`
-        residuals.
-    - `t`, `args`, `values`: the time, the parameters, and the conserved values, shaped like the
-        manifold.
+    - `equations`: the residuals `g` and their scales.
+    - `t`, `args`: the time and the parameters.
+    - `values`: the conserved values, shaped like the manifold.
     - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s.
     - `keys`: for each entry of the manifold its first key, such as a key of a dictionary.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
@@ -119,7 +114,7 @@ class Problem(eqx.Module):
     step: Step | None = None
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The residuals at a state, in the order in which the manifold is flattened."""
+        """The `m` residuals at a state, in the order in which the manifold is flattened."""
         return self.equations.residual(y)
 
     def state(self, y: Float[Array, " n"]) -> Y:
@@ -144,18 +139,12 @@ class Problem(eqx.Module):
 
         **Arguments:**
 
-        - `candidate`, `y`: the states before and after.
         - `num_steps`: the number of iterations.
         - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
-        - `ok`: the verdict, if it is known. By default it is given here.
-
-        **Returns:**
-
-        A [`diffrax_conserve.ProjectionInfo`][], successful if every residual is small at `y`.
+        - `ok`: the verdict, if it is known. By default: whether every residual is small at `y`.
         """
         # The verdict has no derivative.
-        given = self.tolerating(rtol, atol), candidate, y
-        equations, candidate, y = tree_stop_gradient(given)
+        equations, candidate, y = tree_stop_gradient((self.tolerating(rtol, atol), candidate, y))
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
@@ -205,18 +194,14 @@ class AbstractProjection(eqx.Module):
 
 
 def check_projection(projection: Any) -> None:
-    """Raises unless `projection` is an instance of a projection, not a class."""
     if not isinstance(projection, AbstractProjection):
         raise TypeError(
-            f"`projection` is {projection!r}, which is not a projection. Pass an instance, for "
-            "example `projection=SimplifiedNewton()`."
+            f"`projection` is {projection!r}, which is not a projection. Pass `SimplifiedNewton()`."
         )
 
 
 class Target(eqx.Module):
     """Everything that a projection needs except the time and the candidate.
-
-    **Attributes:**
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
@@ -235,8 +220,7 @@ class Target(eqx.Module):
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
     ) -> "Target":
-        """The target at `end`, at the end of a step or inside it, given the `path` of the solution
-        from `start`."""
+        """The target at a time `end` in a step, given the `path` of the solution from `start`."""
         if self.gained is None:
             return self
         gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)

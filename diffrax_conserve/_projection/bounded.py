@@ -59,9 +59,8 @@ def box_of(
     """The box for the options `lower` and `upper`, or `None` if neither is given."""
     if lower is None and upper is None:
         return None
-    low = _bound("lower", -np.inf if lower is None else lower, like)
-    high = _bound("upper", np.inf if upper is None else upper, like)
-    return Box(low, high)
+    low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
+    return Box(_bound("lower", low, like), _bound("upper", high, like))
 
 
 def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
@@ -85,7 +84,4 @@ def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | Non
     """Raises if a lower bound is above its upper bound, where both are known."""
     for a, b in zip(jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=False):
         if not is_traced((a, b)) and not np.all(np.asarray(a) <= np.asarray(b)):
-            raise ValueError(
-                f"`lower` is {lower}, but `upper` is {upper}. Each lower bound must be at most its "
-                "upper one."
-            )
+            raise ValueError(f"`lower` is {lower}, but it must be at most `upper`, {upper}.")

@@ -19,8 +19,8 @@ from .options import check_options, option
 class ClosedForm(AbstractProjection):
     r"""Projects by a formula: $y = \mathrm{fn}(t, \hat y, args, values)$.
 
-    For manifolds with a known projection, such as spheres, unit quaternions and rotation matrices.
-    If the returned state is not on the manifold, the projection has failed.
+    For manifolds such as spheres, unit quaternions and rotation matrices. The projection fails if
+    the returned state is not on the manifold.
 
     !!! example
 
@@ -42,9 +42,7 @@ class ClosedForm(AbstractProjection):
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
-        check_function(
-            "`fn` of a `ClosedForm`", self.fn, "fn(t, y, args, values)", "the projected state"
-        )
+        check_function("`fn` of a `ClosedForm`", self.fn, "fn(t, y, args, values)", "a state")
         check_options(self)
 
     def solve(
@@ -55,8 +53,8 @@ class ClosedForm(AbstractProjection):
         got, expected = _shapes_and_dtypes(y), _shapes_and_dtypes(state)
         if not eqx.tree_equal(got, expected):
             raise ValueError(
-                f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return a "
-                "state of the same structure, shapes and dtypes."
+                f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return the "
+                "same structure, shapes and dtypes."
             )
         y = ravel(y)
         return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)

@@ -17,14 +17,10 @@ class Directional(AbstractProjection):
     r"""Projects along the error estimate of the wrapped solver, for one integral.
 
     For the candidate $\hat y$ and the error estimate $w$ of the step (in a Runge-Kutta method the
-    difference from the embedded solution), it solves the scalar equation
-
-    $$g(\hat y + \lambda w) = 0$$
-
-    by Newton's method, from $\lambda = 0$ and with derivatives along $w$ only. Linear integrals
-    that the wrapped solver conserves, as every Runge-Kutta method does, are constant along $w$ and
-    thus also conserved after a projection on the energy, without a metric and without being listed
-    in the manifold.
+    difference from the embedded solution), it solves $g(\hat y + \lambda w) = 0$ by Newton's method
+    from $\lambda = 0$, with derivatives along $w$ only. Linear integrals that the wrapped solver
+    conserves, as every Runge-Kutta method does, are constant along $w$ and thus conserved too,
+    without a metric and without being listed in the manifold.
 
     Where $w$ is nearly tangent to the manifold, the correction is long, or does not exist and the
     projection fails. The order of the wrapped solver is kept if the angle between $w$ and the
@@ -32,7 +28,7 @@ class Directional(AbstractProjection):
     the direction is that of the step.
 
     Derivatives follow from the implicit function theorem for $\lambda$; they are NaN where the sine
-    of the angle between $w$ and the manifold is below the cube root of roundoff.
+    of that angle is below the cube root of roundoff.
 
     !!! example
 
@@ -40,15 +36,14 @@ class Directional(AbstractProjection):
         import diffrax
         import diffrax_conserve as dfc
 
-        planets = dfc.systems.OuterSolarSystem()
-        energy = planets.manifold["energy"]
+        energy = dfc.systems.OuterSolarSystem().manifold["energy"]
         solver = dfc.ManifoldProjection(diffrax.Dopri5(), energy, projection=dfc.Directional())
         ```
 
     ??? cite "Reference"
 
-        M. Calvo, D. Hernández-Abreu, J. I. Montijano and L. Rández, "On the preservation of
-        invariants by explicit Runge-Kutta methods", *SIAM J. Sci. Comput.* 28 (2006), 868-885.
+        Calvo, Hernández-Abreu, Montijano and Rández, "On the preservation of invariants by
+        explicit Runge-Kutta methods", *SIAM J. Sci. Comput.* 28 (2006), 868-885.
     """
 
     rtol: float | Array | None = option(None)
@@ -72,12 +67,11 @@ class Directional(AbstractProjection):
         error = None if problem.step is None else problem.step.error
         if error is None:
             raise ValueError(
-                "`Directional` moves along the error estimate of a step of the wrapped solver, but "
-                "there is none. In a `ManifoldProjection` wrap a solver with an embedded method, "
-                "such as `diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
+                "`Directional` moves along the error estimate of a step, but there is none. In a "
+                "`ManifoldProjection` wrap a solver with an embedded method, such as "
+                "`diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
-        # Normalised: the result does not depend on the length, and products with the gradient do
-        # not overflow or underflow.
+        # Normalised, so that products with the gradient do not overflow or underflow.
         length = lax.stop_gradient(jnp.max(jnp.abs(error)))
         direction = error[None] / jnp.where(length > 0, length, 1)
         equations = problem.tolerating(self.rtol, self.atol)
@@ -87,12 +81,10 @@ class Directional(AbstractProjection):
 
 Directional.__init__.__doc__ = """**Arguments:**
 
-- `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
-- `max_steps`: the largest number of iterations.
+- `rtol`, `atol`, `max_steps`: see `SimplifiedNewton`.
 
 **Raises:**
 
-`ValueError`, before compilation: with more than one scalar constraint, with a solver that has no
-error estimate, in [`diffrax_conserve.project`][], where there is no step, and with a
-`diffrax.HalfSolver`, whose error estimate has no sign.
+`ValueError` with more than one scalar constraint, and without an error estimate that has a sign: in
+[`diffrax_conserve.project`][], with a solver that has none, and with a `diffrax.HalfSolver`.
 """

@@ -1,9 +1,8 @@
 """A manifold at one time, as equations `g(y) = 0` for a state in one real vector.
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The *scale* of a
-residual at `y` is the size of the terms that cancel in it: `|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what is
-inside `fn` but not in its gradient, which `roundoff` finds. Roundoff is proportional to
-the scale, so success is judged relative to the scale at the state that is returned.
+residual at `y`, to which roundoff is proportional, is the size of the terms that cancel in it:
+`|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what `roundoff` finds inside `fn` but not in its gradient.
 """
 
 from collections.abc import Callable
@@ -37,12 +36,12 @@ class Equations(eqx.Module):
     - `parts`: the residual of each entry.
     - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
     - `hidden`: the part of it that the gradients do not show.
-    - `weights`: `M⁻¹`, the inverse of the metric; `None` if it is one.
+    - `weights`: `M⁻¹`; `None` if it is one.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `may_vanish`: whether all terms of a residual may be zero, as those of a `Constraint`.
-    - `clip`: where the state is within bounds, the map to it from a vector without bounds, which is
-        then the argument of all methods. The residual is the gradient of a convex function of the
-        multipliers, with kinks, so that an iteration must look for the minimum along its step.
+    - `clip`: within bounds the map to the state from a vector without bounds, then the argument of
+      all methods. The residual is the gradient of a convex function of the multipliers with kinks:
+      an iteration looks for the minimum along its step.
     """
 
     parts: tuple[Part, ...]
@@ -78,9 +77,9 @@ class Equations(eqx.Module):
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> Int[Array, ""]:
-        """0 if `y` is off the manifold; 1 if it is on it; 2 if, besides, no iteration could reduce
-        a residual but by chance, because all are within an eighth of the tolerance. A residual
-        within a tolerance that underflows says nothing."""
+        """0 if `y` is off the manifold; 1 if it is on it; 2 if all residuals are so small, within
+        an eighth of the tolerance, that only chance could reduce them. A residual within a
+        tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
@@ -126,8 +125,7 @@ def equations_of(
     args: Args,
     hidden: Float[Array, " m"] | None = None,
 ) -> Equations:
-    """The equations of a manifold with the conserved `values`, for states like `like`; `hidden` is
-    the part of the scales that the gradients do not show."""
+    """The equations of a manifold with the conserved `values`, for states like `like`."""
     hidden = jnp.zeros_like(values) if hidden is None else hidden
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
@@ -160,9 +158,8 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array
 # ---- Gram matrices `G M⁻¹ Hᵀ`, which are singular where constraints depend on each other.
 #
 # A pivot at the level of roundoff belongs to a constraint whose gradient depends linearly on the
-# earlier ones; its multiplier is zero, which is exact for consistent constraints. Gradients that
-# are only nearly parallel are all kept, because the correction needs the direction in which they
-# differ.
+# earlier ones; its multiplier is zero, which is exact for consistent constraints. Of gradients that
+# are only nearly parallel all are kept: the correction needs the direction in which they differ.
 
 
 def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
@@ -219,8 +216,7 @@ def gram_solve(
     return jnp.stack(x)
 
 
-# The inverse of the Cholesky factor of a matrix with scaled rows, and the factors of equations and
-# multipliers.
+# The inverse Cholesky factor of a scaled matrix, and the factors of equations and multipliers.
 Factors = tuple[Float[Array, "m m"], Float[Array, " m"], Float[Array, " m"]]
 
 

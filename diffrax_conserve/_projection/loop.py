@@ -68,8 +68,7 @@ def solve(
     damped: bool = False,
 ) -> Solved:
     """The state `y = ŷ + Dᵀ λ` on the manifold. The directions `D` are by default `G M⁻¹` at the
-    candidate; with `fresh` those of the last state. A damping that vanishes with the residual helps
-    far from the manifold."""
+    candidate, with `fresh` at the last state."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
     small = equations.magnitude.size <= WRITTEN_OUT_MAX
 
@@ -199,8 +198,7 @@ def _corrected(
     change = combined(multiplier, rows)
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
-    # A component that nearly vanishes does so: if its true value is zero, it would never be small
-    # relative to itself.
+    # A component that nearly vanishes does so: a true zero is never small relative to itself.
     rest = y - change
     least = 2 * float(jnp.finfo(y.dtype).eps) if equations.clip is None else _VANISHES
     return jnp.where(jnp.abs(rest) <= least * jnp.abs(y), 0, rest)
@@ -284,12 +282,9 @@ def certain(
     jacobian: Array,
     directions: Array | None = None,
 ) -> Float[Array, ""]:
-    """One if the derivative of the projected state `y` is well determined, otherwise NaN.
-
-    Where gradients are nearly parallel, multipliers are large and cancel, so that roundoff
-    dominates their derivatives. Gradients that are parallel everywhere do no harm: such a
-    constraint is redundant.
-    """
+    """One if the derivative of the projected state `y` is well determined, otherwise NaN: where
+    gradients are nearly parallel, multipliers are large and cancel, so that roundoff dominates
+    their derivatives. Constraints with gradients parallel everywhere are redundant: no harm."""
     one, eps = jnp.ones((), y.dtype), float(jnp.finfo(y.dtype).eps)
     if len(jacobian) == 1:
         if directions is None:
@@ -308,8 +303,7 @@ def certain(
 
 
 def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, " m"]:
-    """The sine of the angle between each gradient and the span of those before it, in the norm of
-    the metric."""
+    """The sine of the angle between each gradient and the span of those before, in the metric."""
     unit = jacobian / row_sizes(jacobian)[:, None]
     if equations.weights is not None:
         unit = unit * jnp.sqrt(equations.weights)[None]

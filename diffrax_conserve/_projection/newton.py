@@ -28,16 +28,15 @@ class Newton(AbstractProjection):
     $$y = \hat y + M^{-1} G(y)^\top \lambda, \qquad g(y) = 0,$$
 
     in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
-    $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: the
-    iteration can pass near points where gradients are parallel, and converges quadratically
-    elsewhere. Then the same iteration on both equations moves along the manifold to the nearest
-    point. If that fails, or with more than 512 unknowns and constraints, the result of the first
-    phase is returned: it is on the manifold, but not the nearest point, and its derivative is NaN.
-    For the close candidates of an integrator use [`diffrax_conserve.SimplifiedNewton`][].
+    $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: it
+    can pass near points where gradients are parallel, and converges quadratically elsewhere. Then
+    the same iteration on both equations moves along the manifold to the nearest point. If that
+    fails, or with more than 512 unknowns and constraints, the result is that of the first phase, on
+    the manifold but not nearest, and its derivative is NaN. For the close candidates of an
+    integrator use [`diffrax_conserve.SimplifiedNewton`][].
 
-    The result is differentiated by the implicit function theorem for both equations. The derivative
-    is NaN where the gradients of the constraints are nearly parallel at the projected state but not
-    everywhere.
+    The derivative follows from the implicit function theorem for both equations. It is NaN where
+    the gradients of the constraints are nearly parallel at the projected state but not everywhere.
 
     !!! example
 
@@ -51,8 +50,7 @@ class Newton(AbstractProjection):
 
     ??? cite "Reference"
 
-        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
-        2006, Section IV.4, equations (4.3).
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.4, (4.3).
     """
 
     rtol: float | Array | None = option(None)
@@ -72,9 +70,8 @@ class Newton(AbstractProjection):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         if jnp.finfo(candidate.dtype).bits < 32:
             raise TypeError(
-                f"`Newton` was given a state of dtype {candidate.dtype}, in which its linear "
-                "solves cannot be done. Convert the state to float32, or pass "
-                "`projection=SimplifiedNewton()`."
+                f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
+                "state to float32, or pass `projection=SimplifiedNewton()`."
             )
         equations = problem.tolerating(self.rtol, self.atol)
         box = box_of(self.lower, self.upper, problem.like)
@@ -104,8 +101,7 @@ class _Optimality(eqx.Module):
 def _nearest(
     equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
 ) -> tuple[Float[Array, " N"], Bool[Array, ""], Int[Array, ""]]:
-    """State and multipliers, whether they are those of the nearest point, and the number of
-    iterations."""
+    """State and multipliers, whether they are of the nearest point, and a count of iterations."""
     if box is None:
         y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
     else:
@@ -139,8 +135,7 @@ def _units(equations: Equations, gram: Float[Array, "m m"], n: int) -> Float[Arr
 
 @_nearest.def_jvp
 def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
-    """From `F(y, λ) = 0`, the optimality system: its tangent at constant `y` and `λ` is cancelled
-    by theirs."""
+    """The tangent of the optimality system at constant `y` and `λ` is cancelled by theirs."""
     equations, candidate, _ = primals
     unknowns, found, count = _nearest(*primals, max_steps=max_steps)
     if unknowns.size > _NEAREST_MAX:

@@ -21,7 +21,6 @@ def option(default: Any, **kwargs: Any) -> Any:
 
 
 def check_options(projection: Any) -> None:
-    """Raises unless the options common to the projections are valid."""
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):
@@ -34,34 +33,29 @@ def check_options(projection: Any) -> None:
 NEWTON_OPTIONS = r"""**Arguments:**
 
 - `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
-    state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype. Nearly
-    every projection ends well below it.
+    state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype.
 - `atol`: an absolute tolerance, added to the relative one. Default: 0.
-- `max_steps`: the largest number of iterations, with bounds twice as many. A projection that is
-    not within its tolerance by then has failed.
+- `max_steps`: the largest number of iterations, with bounds twice as many.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.
 - `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
-    PyTrees like the state of scalars or arrays. The result is
-    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, which is always within the bounds and for
-    linear constraints is the nearest such point of the manifold. If there is no such point, the
-    projection fails. In derivatives, components at a bound are constant. For a complex component
-    the bounds apply to both parts. Default: none.
+    PyTrees like the state of scalars or arrays. The result, always within the bounds, is
+    $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest such point
+    of the manifold. If there is none, the projection fails. In derivatives, components at a bound
+    are constant. Of a complex component both parts are bounded. Default: none.
 
 **Raises:**
 
 `TypeError` if an option is not a number; `ValueError` if a tolerance is negative, `max_steps` is
-less than 1, a weight is not positive, a lower bound is above its upper bound, or, when the
-projection is used, the bounds are not shaped like the state.
+less than 1, a weight is not positive, a lower bound is above its upper bound, or, in use, the
+weights or bounds are not shaped like the state.
 """
 
 
 def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
     """`metric`, checked now if its values are known, and at run time if they are tracers."""
-    message = (
-        "`metric` has a weight that is not positive. There is one for each component, not a matrix."
-    )
+    message = "`metric` has a weight that is not positive. Give one per component, not a matrix."
 
     def check(weight: ArrayLike) -> ArrayLike:
         check_number("metric", weight)
@@ -91,8 +85,8 @@ def spread(name: str, option: PyTree[ArrayLike], like: Any, remedy: str) -> Floa
     def spread_leaf(given: ArrayLike, leaf: Any, view: Any) -> Array:
         if jnp.shape(given) not in ((), leaf.shape):
             raise ValueError(
-                f"`{name}` has a leaf of shape {jnp.shape(given)} for a leaf of the state of shape "
-                f"{leaf.shape}. Give a scalar or an array of the same shape."
+                f"`{name}` has a leaf of shape {jnp.shape(given)} for one of shape {leaf.shape} of "
+                "the state. Give a scalar or an array of the same shape."
             )
         return jnp.broadcast_to(jnp.asarray(given, view.dtype), view.shape)
 

@@ -30,7 +30,7 @@ def project(
     **Arguments:**
 
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
-    - `y`: the candidate, any PyTree of floating-point arrays, real or complex.
+    - `y`: the candidate, a PyTree of floating-point arrays, real or complex.
     - `t`, `args`: passed to the functions of the manifold.
     - `value`: the conserved values: a PyTree like `manifold`, with the conserved value in the place
         of each `FirstIntegral` and `None` in the place of each `Constraint`. Not needed if each
@@ -40,8 +40,7 @@ def project(
     **Returns:**
 
     The state on the manifold, shaped like `y`, and a [`diffrax_conserve.ProjectionInfo`][], whose
-    `ok` tells whether it succeeded: nothing is raised at run time. If it did, each residual is
-    within 16 units of roundoff of its scale, unless `projection` has other tolerances.
+    `ok` tells whether each residual is within its tolerance: nothing is raised at run time.
 
     **Raises:**
 
@@ -69,8 +68,8 @@ def project(
 
 
 def _hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The part of the scales at the candidate that the gradients do not show. Nothing where it is
-    within a quarter of the tolerance anyway, because the candidate may be far away."""
+    """The part of the scales that the gradients do not show. Nothing where it is within a quarter
+    of the tolerance, because the candidate may be far away."""
     equations, y = tree_stop_gradient((equations, y))
     value, jacobian = equations.linearise(y)
     shown = jnp.abs(value) + equations.scale(jacobian, y)
@@ -85,8 +84,7 @@ def given_values(
     for name, entry in named_entries(manifold):
         if value is None and not has_value(entry):
             raise ValueError(
-                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, for "
-                "example `value=integral.fn(t, y_start, args)`, or write `FirstIntegral(fn, "
-                "value=...)`."
+                f"`{name}` has no conserved value, so every state would do. Pass `value=...`, such "
+                "as `integral.fn(t, y_start, args)`, or write `FirstIntegral(fn, value=...)`."
             )
     return conserved_values(manifold, t, y, args, value)

@@ -1,9 +1,8 @@
 """Functions of small arrays, written out in scalars.
 
 XLA does not fuse across a sum or a stack of components: in a batch of small systems nearly every
-operation becomes a separate loop, whose overhead exceeds its arithmetic. In scalars everything is
-elementwise arithmetic, which XLA fuses. The functions call those of the user, so their jaxprs are
-rewritten.
+operation becomes a loop, whose overhead exceeds its arithmetic. Elementwise arithmetic of scalars
+it fuses. The functions call those of the user, so their jaxprs are rewritten.
 """
 
 import functools as ft
@@ -154,15 +153,13 @@ _STRUCTURAL: dict[str, Callable[..., _Places]] = {
     "stack": lambda *xs, axis: np.stack(xs, axis),
     "transpose": lambda x, permutation: x.transpose(permutation),
 }
-# A requested precision or type may be ignored: the sum of products is computed in the type of the
-# state.
+# A requested precision may be ignored: sums of products are computed in the type of the state.
 _DOT = {"dimension_numbers", "precision", "preferred_element_type"}
 
 
 def _once(fn: Callable[[Array], Array], x: Array) -> Array:
-    """`fn(x)`, which XLA would compute again in each loop that uses it: a gradient has dozens of
-    them. It does not compute quotients again, so this is divided by a 1 that XLA cannot simplify
-    away."""
+    """`fn(x)`, which XLA would compute again in each loop that uses it, dozens in a gradient. It
+    does not compute quotients again, so this is divided by a 1 that it cannot simplify away."""
     return fn(x) / (lax.stop_gradient(x) * 0 + 1)
 
 

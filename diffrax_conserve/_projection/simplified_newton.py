@@ -26,11 +26,9 @@ class SimplifiedNewton(AbstractProjection):
     takes more iterations, and fails sooner. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
-    Success is judged at the returned state, relative to the scale of the constraints there.
-
-    The result is differentiated by the implicit function theorem for $\lambda$. The derivative is
-    exact for the returned state, independent of the number of iterations. It is NaN where the
-    gradients of the constraints are so nearly parallel that roundoff would dominate it.
+    The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state,
+    independent of the number of iterations. It is NaN where the gradients of the constraints are so
+    nearly parallel that roundoff would dominate it.
 
     !!! example
 
@@ -46,8 +44,8 @@ class SimplifiedNewton(AbstractProjection):
 
     ??? cite "Reference"
 
-        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
-        2006, Section IV.4, equations (4.4) to (4.6).
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, Section IV.4,
+        equations (4.4) to (4.6).
     """
 
     rtol: float | Array | None = option(None)

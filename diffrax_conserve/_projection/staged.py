@@ -19,12 +19,11 @@ from .options import inverse_metric
 class Staged(AbstractProjection):
     r"""Projects to the parts of a manifold in a given order, keeping the earlier ones satisfied.
 
-    Stage $k$ projects the result of the previous stage to the set where the parts $1, \dots, k$
-    hold, by its own projection in its own metric, where an infinite weight freezes its component.
-    For example, positions are projected with the velocities frozen, then velocities with the
-    positions frozen, so that errors of the velocities do not move the positions. Compare it with
-    the joint projection: on a pendulum at tolerance 1e-7 it is 19 times as accurate with Tsit5,
-    equally accurate with Dopri5, and less accurate with Kvaerno5.
+    Stage $k$ projects the result of the previous one to the set where the parts $1, \dots, k$ hold,
+    by its own projection in its own metric, where an infinite weight freezes its component. In the
+    example errors of the velocities do not move the positions. Compare it with the joint
+    projection: on a pendulum at tolerance 1e-7 it is 19 times as accurate with Tsit5, equally
+    accurate with Dopri5, and less accurate with Kvaerno5.
 
     Success is judged for all parts at the returned state.
 
@@ -48,8 +47,8 @@ class Staged(AbstractProjection):
 
     ??? cite "Reference"
 
-        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
-        2006, Section VII.1; CVODE's example `cvPendulum_dns`.
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, Section VII.1;
+        CVODE's example `cvPendulum_dns`.
     """
 
     names: tuple[Any, ...] = eqx.field(static=True)
@@ -67,8 +66,8 @@ class Staged(AbstractProjection):
             if not isinstance(stage[1], AbstractProjection) or stage[1].sees_step:
                 raise TypeError(
                     f"The stage `{stage[0]}` of `Staged` has {stage[1]!r}, which is not a "
-                    "projection of a state by itself: an instance of an `AbstractProjection` with "
-                    "`sees_step = False`. Pass for example `SimplifiedNewton()`."
+                    "projection of a state by itself. Pass an instance of a projection with "
+                    "`sees_step = False`, such as `SimplifiedNewton()`."
                 )
         self.names = tuple(name for name, _ in stages)
         self.projections = tuple(projection for _, projection in stages)
@@ -83,8 +82,7 @@ class Staged(AbstractProjection):
             )
         y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
-            part = _restricted(problem, self.names[:number], projection)
-            y, info = projection.solve(part, y)
+            y, info = projection.solve(_restricted(problem, self.names[:number], projection), y)
             infos.append(info)
         count = sum(info.num_steps for info in infos)
         # The last stage has judged all parts, by its own tolerances.
@@ -98,8 +96,7 @@ Staged.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`TypeError` if a stage is not such a pair; `ValueError`, when it is used and before compilation, if
-the keys are not those of the manifold.
+`TypeError` if a stage is not such a pair; `ValueError`, in use, if the manifold has other keys.
 """
 
 

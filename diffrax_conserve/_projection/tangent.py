@@ -57,12 +57,10 @@ def tangent(
     **Arguments:**
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
-    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s, called with the same arguments. A
-        `FirstIntegral` with a `rate` changes at that rate.
+    - `manifold`: a PyTree of `FirstIntegral`s, which change at their `rate`, and `Constraint`s.
     - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][]; an infinite weight leaves its
         component of the field unchanged.
-    - `gain`: the decay rate of the residual, in units of one over time; negative for a solve
-        backward in time.
+    - `gain`: the decay rate, in one over time; negative for a solve backward in time.
 
     **Returns:**
 
@@ -70,8 +68,8 @@ def tangent(
 
     **Raises:**
 
-    `TypeError` or `ValueError` if an argument does not fit, or if a `gain` is given for a
-    `FirstIntegral` without a `value` or with a `rate`; and, when it is called, if the value of the
+    `TypeError` or `ValueError` if an argument does not fit, if a `gain` is given for a
+    `FirstIntegral` without a `value` or with a `rate`, or, when it is called, if the value of the
     field is not shaped like the state.
 
     !!! example
@@ -94,11 +92,10 @@ def tangent(
 
     ??? cite "Reference"
 
-        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
-        2006, Sections IV.5 and VII.1; J. Baumgarte, "Stabilization of constraints and integrals of
-        motion in dynamical systems", *Comput. Methods Appl. Mech. Eng.* 1 (1972), 1-16; A. White et
-        al., "Stabilized neural differential equations for learning dynamics with explicit
-        constraints", NeurIPS 2023.
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.5 and VII.1;
+        J. Baumgarte, "Stabilization of constraints and integrals of motion in dynamical systems",
+        *Comput. Methods Appl. Mech. Eng.* 1 (1972), 1-16; A. White et al., "Stabilized neural
+        differential equations for learning dynamics with explicit constraints", NeurIPS 2023.
     """
     check_vector_field(vector_field)
     check_manifold(manifold)
@@ -117,8 +114,7 @@ def tangent(
 
 @final
 class TangentField(eqx.Module):
-    """A vector field made tangent to a manifold, called as any other one, `field(t, y, args)`; see
-    [`diffrax_conserve.tangent`][]."""
+    """What [`diffrax_conserve.tangent`][] returns: a vector field, called `field(t, y, args)`."""
 
     vector_field: Callable[[RealScalarLike, Any, Args], Any]
     manifold: Manifold
@@ -135,7 +131,7 @@ class TangentField(eqx.Module):
         return self._solve(t, y, args)[2]
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
-        """The given field, the correction that is added to it, and the multipliers."""
+        """The given field, its correction, and the multipliers."""
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
         values = conserved_values(self.manifold, t, y, args)
@@ -150,7 +146,6 @@ class TangentField(eqx.Module):
 
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
-        # The rate is that of a balance law, otherwise zero.
         wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (found - numbers)
         wrong = (wanted - along).astype(vector.dtype)
 

@@ -3,11 +3,9 @@
 Only by `WrapTerm` can a solver tell that `t1 < t0`, where `diffeqsolve` negates its times, and only
 by `AdjointTerm` that it is called by `BacksolveAdjoint`, whose state is not on the manifold.
 
-`register` adds messages of our own to diffrax's list of results. A step reports its failure by a
-member of `diffrax.RESULTS`, which diffrax turns into an error if the solve ends with it. The
-messages of its own members are about implicit solvers. Ours are appended to its list once, when
-this package is imported, so the list is the same in every process, and an index into it has the
-same meaning in a pickled solution and in a cached compiled program.
+A step reports its failure by a member of `diffrax.RESULTS`, whose messages are about implicit
+solvers. Ours are appended to its list when this package is imported, so that an index into it has
+the same meaning in every process, in a pickled solution and in a cached compiled program.
 """
 
 import diffrax as dfx
@@ -23,9 +21,8 @@ def register(*messages: str) -> int:
     known = getattr(dfx.RESULTS, "_index_to_message", None)
     if not isinstance(known, list):
         raise ImportError(
-            "diffrax_conserve adds its messages to the list `diffrax.RESULTS._index_to_message`, "
-            "which this version of diffrax does not have. Install a version of diffrax_conserve "
-            "that was made for it."
+            "This version of diffrax has no list `diffrax.RESULTS._index_to_message` for messages. "
+            "Install a version of diffrax_conserve that was made for it."
         )
     known.extend(f"diffrax_conserve: {message}" for message in messages)
     return len(known) - len(messages)

@@ -29,29 +29,26 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     $$\{y : I(t_{n+1}, y, args) = I(t_0, y_0, args), \quad g(t_{n+1}, y, args) = 0\}$$
 
     for the first integrals $I$ and the constraints $g$ of `manifold`. Dense output, saved times and
-    events are projected in the same way. The conserved values are computed once, at the start of
-    the solve, and carried in the solver state, so that the drift does not grow with the number of
-    steps; a solve that continues from a `solver_state` keeps the original values.
+    events are projected too. The conserved values are computed once, at the start of the solve, and
+    carried in the solver state: the drift does not grow with the number of steps, and a solve that
+    continues from a `solver_state` keeps the original values.
 
-    The projected method has the order of the wrapped one. A wrapped solver that keeps its last
-    stage for the next step (Tsit5, Dopri5, Bosh3: "first same as last") evaluates it again at the
-    projected state. diffrax otherwise evaluates it for all lanes of a batch while any lane is in
-    its first step, so that lanes would depend on each other, as they do with implicit methods:
-    these keep the stage.
+    The projected method has the order of the wrapped one. A last stage that the wrapped solver
+    keeps for the next step (Tsit5, Dopri5, Bosh3: "first same as last") is evaluated again at the
+    projected state, so that lanes of a batch do not depend on each other; implicit methods keep it.
 
     Success means that each residual is within 16 units of roundoff of $|I_0| + \sum_k |y_k
     \partial_k I|$ and the terms that cancel inside `fn`, such as the 1 of `1 - cos(q)`, unless the
     projection has other tolerances.
 
-    A solve fails at its first step if the initial state violates a `Constraint` by more than the
-    square root of roundoff, relative to the size of its terms (find a consistent state by
-    [`diffrax_conserve.project`][]), or if a function is not finite there.
+    A solve fails at its first step if a function is not finite at the initial state, or if that
+    violates a `Constraint` by more than the square root of roundoff, relative to the size of its
+    terms: find a consistent state by [`diffrax_conserve.project`][].
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
-    an adaptive solve rejects the step and tries a smaller one, until the candidate is very close to
-    the last state; then the solve ends. A solve with fixed steps ends at once. The
-    `diffrax.RESULTS` tells the cause, and [`diffrax_conserve.statistics`][] the entry of the
-    manifold.
+    an adaptive solve tries a smaller step, until the candidate is very close to the last state;
+    then it ends. A solve with fixed steps ends at once. The `diffrax.RESULTS` tells the cause, and
+    [`diffrax_conserve.statistics`][] the entry of the manifold.
 
     !!! example
 
@@ -60,33 +57,19 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         import diffrax_conserve as dfc
         import jax.numpy as jnp
 
-        def vector_field(t, y, args):
-            q, p = y
-            return p, -q
-
-        def energy(t, y, args):
-            q, p = y
-            return 0.5 * (q**2 + p**2)
-
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(vector_field),
-            dfc.ManifoldProjection(diffrax.Tsit5(), dfc.FirstIntegral(energy)),
-            t0=0.0,
-            t1=10.0,
-            dt0=0.1,
-            y0=(jnp.array(1.0), jnp.array(0.0)),
-        )
+        energy = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2) / 2)
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -y[0]]))
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
+        solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
         ```
 
     !!! warning
 
-        Conserving one integral is not always better than conserving none: see "Choosing a
-        projection".
+        Conserving one integral is not always better than none: see "Choosing a projection".
 
     ??? cite "Reference"
 
-        E. Hairer, C. Lubich and G. Wanner, *Geometric Numerical Integration*, 2nd ed., Springer
-        2006, Section IV.4.
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, Section IV.4.
     """
 
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -99,7 +82,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         if not isinstance(self.solver, dfx.AbstractSolver):
             raise TypeError(
                 f"`solver` is {self.solver!r}, which is not a diffrax solver. Pass an instance, "
-                "for example `ManifoldProjection(diffrax.Tsit5(), manifold)`."
+                "such as `diffrax.Tsit5()`."
             )
         check_nested(self.solver)
         check_manifold(self.manifold)
@@ -110,13 +93,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
         if bounds != [None, None] and self.every > 1:
             raise ValueError(
-                "`projection` has bounds, which a step that is not projected does not keep. Leave "
+                "`projection` has bounds, which a step that is not projected does not keep: leave "
                 "out `every`, or `lower` and `upper`."
             )
 
-    # diffrax forwards `isinstance` through a wrapped solver to the innermost one, then reads these
-    # attributes from the wrapper. They are `Any` because `equinox.tree_at` replaces values by
-    # placeholders.
+    # diffrax forwards `isinstance` to the innermost solver, then reads these attributes of the
+    # wrapper. They are `Any` because `equinox.tree_at` replaces values by placeholders.
 
     @property
     def term_structure(self) -> Any:  # pyright: ignore
@@ -164,10 +146,9 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     ) -> State:
         if is_backsolve(terms):
             raise ValueError(
-                "`ManifoldProjection` cannot solve the adjoint equations of "
-                "`diffrax.BacksolveAdjoint`: their state is not on the manifold. Name another "
-                "solver for them, `BacksolveAdjoint(solver=inner)` with the wrapped solver, or use "
-                "`diffrax.RecursiveCheckpointAdjoint()`."
+                "`ManifoldProjection` cannot solve the adjoint equations of `BacksolveAdjoint`, "
+                "whose state is not on the manifold. Name the wrapped solver for them, "
+                "`BacksolveAdjoint(solver=inner)`, or use `diffrax.RecursiveCheckpointAdjoint()`."
             )
         t = t0 * time_direction(terms, t0)
         check_state(y0, kind=jnp.inexact)
@@ -194,9 +175,9 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         solver_state: State,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
-        # A last stage that is kept belongs to the candidate. Only implicit methods need it, because
-        # a stage at the projected state amplifies the error of their root finder; `QUICSORT` keeps
-        # none, and cannot be told of a jump.
+        # diffrax evaluates a kept stage for all lanes while one is in its first step. A stage at
+        # the projected state amplifies the error of the root finder of an implicit method;
+        # `QUICSORT` keeps none, and cannot be told of a jump.
         keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
         made_jump = made_jump if keeps else True
         state = solver_state
@@ -227,8 +208,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             target=PackedTarget(start),
             due=due,
         )
-        # An infinite error makes an adaptive solve try a smaller step; if that is hopeless, the
-        # step is accepted and its result ends the solve.
+        # An infinite error makes an adaptive solve try a smaller step; a step without hope is
+        # accepted, and its result ends the solve.
         shown = jnp.where(hopeless, 0, jnp.inf)
         error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
         result = dfx.RESULTS.where(
@@ -251,22 +232,19 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
-- `projection`: the projection to the manifold: a `SimplifiedNewton`, a `Newton`, a `ClosedForm`, a
-    `Directional`, a `Staged`, or your own.
+- `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
     this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), each the
     sum over the components. Corrections are of the size of the local error of the wrapped solver:
-    one as long as half a step tells that the quantity is not conserved, or that the state
-    jumped to another part of the manifold. With `every`, the limit is multiplied by it. It does not
-    apply where the manifold has a `Constraint`, whose correction may do all the work of a step, to
-    stochastic equations, to learned solvers, and to the first projection to a given `value`. `None`
-    is no limit.
+    one as long as half a step tells that the quantity is not conserved, or that the state jumped to
+    another part of the manifold. `every` multiplies the limit. It does not apply with a
+    `Constraint`, whose correction may do all the work of a step, to stochastic equations, to
+    learned solvers, and to the first projection to a given `value`. `None` is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 
 **Raises:**
 
-`TypeError` or `ValueError`, before compilation, if an argument is invalid, if the manifold is empty
-or has more scalar constraints than the state has unknowns, or if the metric or a conserved value
-does not fit.
+`TypeError` or `ValueError`, before compilation, if an argument is invalid, or if the manifold, the
+metric or a conserved value does not fit the state.
 """

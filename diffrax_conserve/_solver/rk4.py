@@ -18,9 +18,8 @@ class RK4(dfx.AbstractSolver[None]):
 
     $$y_{n+1} = y_n + \tfrac{h}{6} (k_1 + 2 k_2 + 2 k_3 + k_4).$$
 
-    It has no error estimate: use it with `diffrax.ConstantStepSize` or `diffrax.StepTo`, or inside
-    `diffrax.HalfSolver` for adaptive steps. Dense output is the cubic Hermite polynomial through
-    both ends, of fourth order too.
+    It has no error estimate: for adaptive steps use it inside `diffrax.HalfSolver`. Dense output is
+    the cubic Hermite polynomial through both ends, of fourth order too.
 
     !!! example
 

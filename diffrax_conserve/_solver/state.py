@@ -24,12 +24,10 @@ from .diffrax_private import register
 
 _SMALLER = (
     "Take smaller steps, or pass `projection=diffrax_conserve.Newton()`, which copes with "
-    "candidates far from the manifold. Check by `check_invariance` that the quantity is conserved "
-    "at all. "
+    "far candidates. Check by `check_invariance` that the quantity is conserved at all. "
 )
 _ENTRY = (
-    "`diffrax_conserve.statistics(sol).worst`, of a solve with `SaveAt(solver_state=True)`, tells "
-    "the entry of the manifold."
+    "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
 )
 _FIRST = register(
     "the solve cannot start: the initial state violates a `Constraint`, or a function of the "
@@ -52,18 +50,13 @@ _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
 
 @final
 class ProjectionStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve, including those of earlier solves that it
-    continues.
+    """Totals over the accepted steps of a solve, and of earlier solves that it continues.
 
     **Attributes:**
 
     - `num_projections`: the number of projected steps.
-    - `num_iterations`, `max_iterations`: the number of iterations of all projections, and the
-        largest number of a single one.
-    - `residual_before`, `residual_after`: the largest residual of a candidate and of a projected
-        state, relative to the scale of its constraint.
-    - `correction`: the largest Euclidean norm of a projected state minus its candidate.
-    - `roundoff`: the largest share of a scale that the gradient does not show; see
+    - `num_iterations`, `max_iterations`: the number of iterations of all, and the largest of one.
+    - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in
         [`diffrax_conserve.ProjectionInfo`][].
     - `worst`: the position of the entry of the manifold that failed last, as
         [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
@@ -114,8 +107,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Arguments:**
 
-    - `sol`: the solution from `diffrax.diffeqsolve` with `saveat=SaveAt(..., solver_state=True)`,
-        or a batch of them from `jax.vmap`.
+    - `sol`: the solution from `diffrax.diffeqsolve`, or a batch of them from `jax.vmap`.
 
     **Returns:**
 
@@ -123,8 +115,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Raises:**
 
-    `ValueError` if `sol` holds no state of a `ManifoldProjection`; `TypeError` if `sol` is not a
-    solution.
+    `ValueError` if `sol` holds no state of a `ManifoldProjection`, `TypeError` if no solution.
 
     !!! example
 
@@ -154,14 +145,15 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```
     """
     check_solution(sol, "statistics")
-    leaves = jtu.tree_leaves(
-        sol.solver_state, is_leaf=lambda x: isinstance(x, ProjectionStatistics)
-    )
-    found = [x for x in leaves if isinstance(x, ProjectionStatistics)]
+
+    def is_one(x: Any) -> bool:
+        return isinstance(x, ProjectionStatistics)
+
+    found = [*filter(is_one, jtu.tree_leaves(sol.solver_state, is_leaf=is_one))]
     if not found:
         raise ValueError(
-            "`sol` holds no state of a `ManifoldProjection`. Solve with a `ManifoldProjection`, "
-            "and with `saveat=SaveAt(..., solver_state=True)`."
+            "`sol` holds no state of a `ManifoldProjection`. Solve with one, and with "
+            "`saveat=SaveAt(..., solver_state=True)`."
         )
     return found[0]
 
@@ -169,11 +161,9 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 class State(eqx.Module):
     """What later steps need.
 
-    - `inner`: the state of the wrapped solver.
-    - `values`, `hidden`: the conserved values, and the part of their scales that the gradients do
-      not show. A value that is NaN tells that the solve cannot start.
-    - `gained`: the integrals of the rates, if there are any. They are kept apart from the values,
-      because the increment of one step is small and would lose digits.
+    - `values`, `hidden`: as in a `Target`; a value is NaN if the solve cannot start.
+    - `gained`: the integrals of the rates, if there are any. The increment of one step is small and
+      would lose digits in the values.
     - `num_steps`: counted only if not every step is projected.
     - `is_first`: whether no step was made yet, if the first one may have to reach a given `value`.
     """
@@ -200,9 +190,8 @@ class State(eqx.Module):
 def started(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """The conserved values and the part of their scales that the gradients do not show. The value
-    of a `Constraint` that the initial state violates by more than the square root of roundoff,
-    relative to the size of its terms, is NaN."""
+    """The conserved values, NaN for a `Constraint` that the initial state violates, and the part of
+    their scales that the gradients do not show."""
     vector = ravel(y)
     numbers = ravel(values).astype(vector.dtype)
     equations = equations_of(manifold, numbers, t, y, args)
@@ -232,9 +221,8 @@ def verdict(
     states: tuple[Y, Y, Y],
     max_correction: RealScalarLike | None,
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """The cause of the failure of a step, 0 if it succeeded; and whether a failure is final,
-    because the candidate is already very close to the last state, the step is a roundoff of time,
-    or the solve cannot start. `states` are the last state, the candidate and the result."""
+    """The cause of the failure of a step, 0 if it succeeded, and whether a failure is final. The
+    `states` are the last one, the candidate and the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)

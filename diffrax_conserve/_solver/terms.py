@@ -37,11 +37,8 @@ _COMPOSED = dfx.MultiTerm, WrapTerm, AdjointTerm
 def _nested(terms: Any) -> list[Any]:
     """All terms, those inside `MultiTerm`, `WrapTerm` and `AdjointTerm` too."""
     found = jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, dfx.AbstractTerm))
-    parts = [
-        x.terms if isinstance(x, dfx.MultiTerm) else x.term
-        for x in found
-        if isinstance(x, _COMPOSED)
-    ]
+    composed = [x for x in found if isinstance(x, _COMPOSED)]
+    parts = [x.terms if isinstance(x, dfx.MultiTerm) else x.term for x in composed]
     return found + (_nested(parts) if parts else [])
 
 
@@ -53,21 +50,19 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
         and not eqx.is_array_like(getattr(inner.root_finder, "rtol", 0.0))
     ):
         raise ValueError(
-            f"`ManifoldProjection` is given a {type(solver).__name__} of the implicit solver "
-            f"{type(inner).__name__}, whose root finder takes its tolerances from the step-size "
-            "controller; diffrax passes these through one wrapper only. Give them explicitly, for "
-            f"example `{type(inner).__name__}(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-8, "
-            "norm=optimistix.max_norm))`."
+            f"The root finder of the implicit solver {type(inner).__name__} takes its tolerances "
+            "from the step-size controller, which diffrax passes through one wrapper only. In a "
+            f"{type(solver).__name__} give them, for example `{type(inner).__name__}(root_finder="
+            "diffrax.VeryChord(rtol=1e-8, atol=1e-8, norm=optimistix.max_norm))`."
         )
 
 
 def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
-    halved = any(type(x) is dfx.HalfSolver for x in _layers(solver))
-    if halved and isinstance(projection, Directional):
+    if isinstance(projection, Directional) and dfx.HalfSolver in map(type, _layers(solver)):
         raise ValueError(
-            "`Directional` moves along the error estimate of the wrapped solver, but "
-            "`diffrax.HalfSolver` gives it without its sign. Wrap a solver with an embedded "
-            "method, such as `diffrax.Tsit5()`, or pass `projection=SimplifiedNewton()`."
+            "`Directional` moves along the error estimate, which `diffrax.HalfSolver` gives "
+            "without its sign. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, "
+            "or pass `projection=SimplifiedNewton()`."
         )
 
 

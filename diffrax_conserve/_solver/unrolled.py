@@ -18,12 +18,11 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
     r"""An explicit Runge-Kutta method of diffrax with its stages written out.
 
     diffrax keeps the stages $k_i = f(t + c_i h, y + h \sum_j a_{ij} k_j)$ of a step in one array,
-    which a loop over the stages updates in place. In a batch every stage then goes through memory.
-    Written out, the whole step is one expression, which XLA keeps in registers: with the same
-    method, steps, error estimate and dense output, up to the order of summation, a batch of small
-    systems is about ten times as fast (`benchmarks/cost/overhead.py`). Compile time grows with the
-    number of stages times the size of the vector field. A large system or a single long solve gains
-    nothing.
+    so that in a batch every stage goes through memory. Written out, the whole step is one
+    expression, which XLA keeps in registers: with the same steps, error estimate and dense output,
+    up to the order of summation, a batch of small systems is about ten times as fast
+    (`benchmarks/cost/overhead.py`). Compile time grows with the number of stages times the size of
+    the vector field. A large system or a single long solve gains nothing.
 
     !!! example
 
@@ -36,15 +35,13 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         radius = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
         solver = dfc.ManifoldProjection(dfc.Unrolled(diffrax.Dopri8()), radius)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-
         solve = jax.vmap(lambda y0: diffrax.diffeqsolve(term, solver, 0, 9, 0.3, y0).ys)
         ys = solve(jnp.ones((1000, 2)))
         ```
 
     ??? cite "Reference"
 
-        E. Hairer, S. P. Nørsett and G. Wanner, *Solving Ordinary Differential Equations I*, 2nd
-        ed., Springer 1993, Section II.1.
+        Hairer, Nørsett, Wanner, *Solving Ordinary Differential Equations I*, Springer 1993, II.1.
     """
 
     solver: Any  # an `AbstractERK`; checked below, with a remedy
@@ -56,8 +53,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         if not explicit or not isinstance(self.solver.tableau, dfx.ButcherTableau):
             raise TypeError(
                 f"`solver` of `Unrolled` is {self.solver!r}, which is not an explicit Runge-Kutta "
-                "method with one Butcher tableau. Pass an instance of one, such as "
-                "`Unrolled(diffrax.Tsit5())`, and wrap the result: "
+                "method with one Butcher tableau. Pass an instance of one, and wrap the result: "
                 "`ManifoldProjection(Unrolled(diffrax.Tsit5()), manifold)`."
             )
 
@@ -109,8 +105,8 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
 
 Unrolled.__init__.__doc__ = """**Arguments:**
 
-- `solver`: an explicit Runge-Kutta method with one Butcher tableau, such as `diffrax.Tsit5()`,
-    `diffrax.Dopri8()`, or your own. Only its tableau is used, no other options.
+- `solver`: an explicit Runge-Kutta method with one Butcher tableau, such as `diffrax.Tsit5()` or
+    your own. Only its tableau is used, no other options.
 
 **Raises:**
 
@@ -120,11 +116,8 @@ Unrolled.__init__.__doc__ = """**Arguments:**
 
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
     """The weighted sum of the increments, without those whose weight is zero."""
-    parts = [
-        jtu.tree_map(ft.partial(operator.mul, float(weight)), k)
-        for weight, k in zip(weights, increments, strict=False)
-        if weight != 0
-    ]
+    pairs = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
+    parts = [jtu.tree_map(ft.partial(operator.mul, weight), k) for weight, k in pairs]
     return jtu.tree_map(lambda *leaves: sum(leaves), *parts)
 
 
