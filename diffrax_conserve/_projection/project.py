@@ -2,16 +2,15 @@
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
-from .._tree import ravel, tree_stop_gradient
+from .._tree import ravel
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
-from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of
+from .equations import equations_of
 from .newton import Newton
 from .options import check_state
-from .roundoff import hidden_terms
+from .roundoff import hidden_scale
 
 
 def project(
@@ -63,18 +62,8 @@ def project(
     y = jtu.tree_map(jnp.asarray, y)
     vector = ravel(y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
-    hidden = _hidden_scale(equations_of(manifold, values, t, y, args), vector)
+    hidden = hidden_scale(equations_of(manifold, values, t, y, args), vector)
     return Target(projection, manifold, values, hidden, args, jnp.asarray(1)).project(t, y)
-
-
-def _hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The part of the scales that the gradients do not show. Nothing where it is within a quarter
-    of the tolerance, because the candidate may be far away."""
-    equations, y = tree_stop_gradient((equations, y))
-    value, jacobian = equations.linearise(y)
-    shown = jnp.abs(value) + equations.scale(jacobian, y)
-    hidden = hidden_terms(equations.residual, y)
-    return jnp.where(hidden > ROUNDOFF_MULTIPLE / 4 * shown, hidden, 0)
 
 
 def given_values(

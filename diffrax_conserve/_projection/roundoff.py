@@ -17,6 +17,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._tree import tree_stop_gradient
+from .equations import Equations
 from .scalars import walk
 
 # An operation with other operations inside is taken as one function, unless it is looked into.
@@ -36,6 +38,15 @@ transpose unstack
 _PARTS = frozenset(_PART_NAMES.split())
 # How a value depends on the state: not at all, as a part of it, or as computed from it.
 _CONSTANT, _STATE, _COMPUTED = range(3)
+
+
+def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """The part of the scales at `y` that the gradients do not show; nothing where they show more,
+    because the terms that they show may be smaller at other states."""
+    equations, y = tree_stop_gradient((equations, y))
+    value, jacobian = equations.linearise(y)
+    hidden = hidden_terms(equations.residual, y)
+    return jnp.where(hidden > jnp.abs(value) + equations.scale(jacobian, y), hidden, 0)
 
 
 def hidden_terms(

@@ -17,7 +17,7 @@ from .._options import check_solution
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
 from .._projection.equations import equations_of
-from .._projection.roundoff import hidden_terms
+from .._projection.roundoff import hidden_scale
 from .._tree import ravel, tree_size, tree_stop_gradient
 from .diffrax_private import member as _member
 from .diffrax_private import register
@@ -196,7 +196,7 @@ def started(
     numbers = ravel(values).astype(vector.dtype)
     equations = equations_of(manifold, numbers, t, y, args)
     equations, vector = tree_stop_gradient((equations, vector))
-    hidden = hidden_terms(equations.residual, vector)
+    hidden = hidden_scale(equations, vector)
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
     sizes = [tree_size(part) for part in treedef.flatten_up_to(values)]
     must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], sizes)
