@@ -156,17 +156,13 @@ def pretrained_path(name: str) -> Path:
 
 
 def load_pretrained(name: str) -> Network:
-    """A network that comes with the package, such as `"rigid-body"`.
+    """A network that comes with the package; raises a `ValueError` with the names for another one.
 
     For each of the paper's five systems there are `SYSTEM-standard` and, with a conservative layer,
     `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
     [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
     up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
     chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
-
-    **Raises:**
-
-    `ValueError` for an unknown name; the message lists the known names.
 
     !!! example
 
@@ -226,11 +222,12 @@ class _NotGiven(ValueError):
 
 def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
     """The description of `x`, whose arrays are appended to `arrays`."""
-    if x is None or type(x) in (bool, int, float, str):
+    kind = type(x)
+    if x is None or kind in (bool, int, float, str):
         return x
-    if type(x) in (list, tuple):
-        return {type(x).__name__: [_describe(item, arrays) for item in x]}
-    if type(x) is dict and all(isinstance(key, str) for key in x):
+    if kind in (list, tuple):
+        return {kind.__name__: [_describe(item, arrays) for item in x]}
+    if kind is dict and all(isinstance(key, str) for key in x):
         return {"dict": {key: _describe(x[key], arrays) for key in x}}
     if isinstance(x, jax.Array) and x.dtype.name in _DTYPES:
         arrays.append(np.asarray(x))
@@ -240,9 +237,9 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
     owner, name = getattr(x, "__self__", None), getattr(x, "__name__", "")
     if owner is not None and _method(owner, name) == x:
         return {"method": [name, _describe(owner, arrays)]}
-    if _CLASSES.get(type(x).__name__) is type(x):
-        names = [field.name for field in dataclasses.fields(x)]
-        return {type(x).__name__: {f: _describe_field(f, getattr(x, f), arrays) for f in names}}
+    if _CLASSES.get(kind.__name__) is kind:
+        names = [field.name for field in dataclasses.fields(_CLASSES[kind.__name__])]
+        return {kind.__name__: {f: _describe_field(f, getattr(x, f), arrays) for f in names}}
     raise TypeError(
         f"The network holds {x!r:.200}, which a file cannot describe: neither a number, array, "
         "string, tuple, list, dictionary or named activation function, nor a part of a `PINN` or "
