@@ -3,20 +3,19 @@
 A file is a line `diffrax-conserve network <version> <SHA-256 of all that follows>`, a line of JSON
 with the description of the network, and the bytes of its arrays.
 
-In a description numbers, strings and `None` are themselves. All else is an object with one entry: a
-container (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation` by name, a
-`method` of a system of the catalogue, a part that must be `given` again, or a class of this package
-with its fields. Reading calls only the checks of these classes.
+There numbers, strings and `None` are themselves. All else is an object with one entry: a container
+(`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation` by name, a `method`
+of a system of the catalogue, a part that must be `given` again, or a class of this package with its
+fields. Reading calls only the checks of these classes.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import io
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._manifold import Constraint, FirstIntegral
-from ..systems import AbstractSystem
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
 from ._networks.deeponet import DeepONet
@@ -65,15 +63,15 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
 
     - `path`: where to write.
     - `model`: a [`diffrax_conserve.PINN`][] or a [`diffrax_conserve.DeepONet`][], the latter also
-        in [`diffrax_conserve.learned.Transformed`][] (with a `BoxCox`) or `Repeated`. Functions in
-        its layer, polynomial and frame are stored by name if they are those of a system of the
-        catalogue; others must be passed to [`diffrax_conserve.load`][] again.
+        in [`diffrax_conserve.learned.Transformed`][] (with a `BoxCox`) or `Repeated`. Methods of a
+        system of the catalogue are stored by name; a layer, polynomial or frame with other
+        functions must be passed to [`diffrax_conserve.load`][] again.
     - `info`: what JSON can express, for [`diffrax_conserve.learned.read_info`][].
 
     **Raises:**
 
-    `TypeError` or `ValueError` if `model` is another kind of network, or has an activation function
-    without a name or a state of custom PyTree nodes, or if JSON cannot express `info`.
+    `TypeError` or `ValueError` if `model` is another network, has an activation without a name or a
+    state of custom PyTree nodes, or if JSON cannot express `info`.
 
     !!! example
 
@@ -90,8 +88,8 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     path, arrays = _file(path), []
     header = {"network": _describe(model, arrays), "info": info or {}}
     _check(model)
-    text = json.dumps(header, allow_nan=False).encode() + b"\n"
-    rest = b"".join([text, *(x.tobytes() for x in arrays)])
+    text = json.dumps(header, allow_nan=False).encode()
+    rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
     first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
     replace_file(path, lambda temporary: temporary.write_bytes(first + rest))
 
@@ -103,44 +101,37 @@ def load(
     taylor: Taylor | None = None,
     frame: MakeFrame | None = None,
 ) -> Network:
-    """Reads a network that [`diffrax_conserve.save`][] wrote.
+    """Reads a network that [`diffrax_conserve.save`][] wrote; in float32 without `jax_enable_x64`.
 
     **Arguments:**
 
     - `path`: the file.
     - `layer`, `taylor`, `frame`: the parts of the network that are not in the file.
 
-    **Returns:**
-
-    The network; in float32 if `jax_enable_x64` is off.
-
     **Raises:**
 
     `ValueError` if the file is not of this version, is truncated or damaged, or needs a `layer`,
     `taylor` or `frame`; `OSError` if it cannot be read.
     """
-    header, body = _read(path)
     given = {"layer": layer, "taylor": taylor, "make": frame}
-    with _well_formed(path):
+
+    def build(header: Any, body: io.BytesIO) -> Any:
         model = _build(header["network"], body, given)
         if body.read(1):
             raise ValueError("it has data after the last array")
         _check(model)
+        return model
+
+    model = _read(path, build)
     if unused := [_GIVEN[name][1] for name, part in given.items() if part is not None]:
         raise ValueError(f"The file {path} has parts of its own: leave `{unused[0]}` out.")
     return model
 
 
 def read_info(path: PathLike) -> dict[str, Any]:
-    """What the file `path` says about its network, without building it.
-
-    **Returns:**
-
-    A dictionary: the `info` that was given to [`diffrax_conserve.save`][], and the `network`.
-
-    **Raises:**
-
-    As [`diffrax_conserve.load`][].
+    """What the file `path` says about its network, without building it: a dictionary of the `info`
+    that was given to [`diffrax_conserve.save`][], and the `network`. Raises as
+    [`diffrax_conserve.load`][].
 
     !!! example
 
@@ -151,7 +142,7 @@ def read_info(path: PathLike) -> dict[str, Any]:
         command = dfc.learned.read_info(path)["info"]["command"]  # that trained it
         ```
     """
-    return _read(path)[0]
+    return _read(path, lambda header, body: header)
 
 
 def pretrained_path(name: str) -> Path:
@@ -160,28 +151,18 @@ def pretrained_path(name: str) -> Path:
     folder = Path(__file__).parents[1] / "pretrained"
     known = {file.stem: file for file in sorted(folder.glob("*.network"))}
     if name not in known:
-        raise ValueError(
-            f"There is no pretrained network called {name!r}. There are: {', '.join(known)}."
-        )
+        raise ValueError(f"There is no pretrained network {name!r}. Known: {', '.join(known)}.")
     return known[name]
 
 
 def load_pretrained(name: str) -> Network:
-    """A network that comes with the package.
+    """A network that comes with the package; raises a `ValueError` with the names for another one.
 
     For each of the paper's five systems there are `SYSTEM-standard` and, with a conservative layer,
     `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
     [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
     up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
     chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
-
-    **Arguments:**
-
-    - `name`: such as `"rigid-body"` or `"rigid-body-conservative"`.
-
-    **Raises:**
-
-    `ValueError` for an unknown name; the message lists the known names.
 
     !!! example
 
@@ -197,7 +178,8 @@ def load_pretrained(name: str) -> Network:
 # ---- The file ----
 
 
-def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
+def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
+    """What `use` makes of the description and the bytes of the arrays."""
     first, _, rest = _file(path).read_bytes().partition(b"\n")
     version, _, digest = first.removeprefix(_MAGIC).partition(b" ")
     if not first.startswith(_MAGIC) or not version.isdigit():
@@ -210,21 +192,14 @@ def _read(path: PathLike) -> tuple[Any, io.BytesIO]:
     if hashlib.sha256(rest).hexdigest().encode() != digest:
         raise ValueError(f"The file {path} is truncated or damaged: its checksum is another.")
     text, _, body = rest.partition(b"\n")
-    with _well_formed(path):
+    try:
         header = json.loads(text)
         if set(header) != {"network", "info"}:
             raise ValueError("its second line does not describe a network")
-    return header, io.BytesIO(body)
-
-
-@contextlib.contextmanager
-def _well_formed(path: PathLike) -> Iterator[None]:
-    """Whatever goes wrong inside, the contents of the file are the cause."""
-    try:
-        yield
+        return use(header, io.BytesIO(body))
     except _NotGiven:
         raise
-    except Exception as error:
+    except Exception as error:  # whatever it is, the contents of the file are the cause
         raise ValueError(
             f"The file {path} is malformed, though its checksum is right: "
             f"{type(error).__name__}, {str(error)[:300]}."
@@ -247,11 +222,12 @@ class _NotGiven(ValueError):
 
 def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
     """The description of `x`, whose arrays are appended to `arrays`."""
-    if x is None or type(x) in (bool, int, float, str):
+    kind = type(x)
+    if x is None or kind in (bool, int, float, str):
         return x
-    if type(x) in (list, tuple):
-        return {type(x).__name__: [_describe(item, arrays) for item in x]}
-    if type(x) is dict and all(isinstance(key, str) for key in x):
+    if kind in (list, tuple):
+        return {kind.__name__: [_describe(item, arrays) for item in x]}
+    if kind is dict and all(isinstance(key, str) for key in x):
         return {"dict": {key: _describe(x[key], arrays) for key in x}}
     if isinstance(x, jax.Array) and x.dtype.name in _DTYPES:
         arrays.append(np.asarray(x))
@@ -259,19 +235,20 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
     if names := [name for name, function in ACTIVATIONS.items() if function is x]:
         return {"activation": names[0]}
     owner, name = getattr(x, "__self__", None), getattr(x, "__name__", "")
-    if isinstance(owner, AbstractSystem) and _method(owner, name) == x:
+    if owner is not None and _method(owner, name) == x:
         return {"method": [name, _describe(owner, arrays)]}
-    if _CLASSES.get(type(x).__name__) is type(x):
-        return {type(x).__name__: {f: _describe_field(x, f, arrays) for f in _fields(type(x))}}
+    if _CLASSES.get(kind.__name__) is kind:
+        names = [field.name for field in dataclasses.fields(_CLASSES[kind.__name__])]
+        return {kind.__name__: {f: _describe_field(f, getattr(x, f), arrays) for f in names}}
     raise TypeError(
-        f"The network holds {x!r:.200}, which a file cannot describe. It can hold a `PINN` or a "
-        "`DeepONet`, also `Transformed` by a `BoxCox` or `Repeated`, a named activation function, "
-        "and tuples, lists and dictionaries. Else use `equinox.tree_serialise_leaves`."
+        f"The network holds {x!r:.200}, which a file cannot describe: neither a number, array, "
+        "string, tuple, list, dictionary or named activation function, nor a part of a `PINN` or "
+        "`DeepONet` of this package. Use `equinox.tree_serialise_leaves`."
     )
 
 
-def _describe_field(x: Any, field: str, arrays: list[np.ndarray]) -> Any:
-    value, count = getattr(x, field), len(arrays)
+def _describe_field(field: str, value: Any, arrays: list[np.ndarray]) -> Any:
+    count = len(arrays)
     try:
         return _describe(value, arrays)
     except TypeError:
@@ -279,10 +256,6 @@ def _describe_field(x: Any, field: str, arrays: list[np.ndarray]) -> Any:
             raise
         del arrays[count:]
         return {"given": [field, getattr(value, _GIVEN[field][0], None)]}
-
-
-def _fields(kind: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(kind)]
 
 
 def _method(system: Any, name: str) -> Any:
@@ -334,7 +307,8 @@ def _array(body: io.BytesIO, name: str, *shape: int) -> jax.Array:
 
 def _module(kind: Any, fields: dict[str, Any]) -> Any:
     # Files of earlier versions tell that the inputs are normalised, as they always are.
-    if fields.pop("normalise", True) is not True or list(fields) != _fields(kind):
+    names = [field.name for field in dataclasses.fields(kind)]
+    if fields.pop("normalise", True) is not True or list(fields) != names:
         raise ValueError(f"a {kind.__name__} has other fields")
     module = object.__new__(kind)
     for name, value in fields.items():
@@ -353,16 +327,11 @@ def _check(model: Any) -> None:
     if isinstance(model, PINN):
         if any(len(x) != model.windows for x in jax.tree.leaves((model.nets, model.y0s))):
             raise ValueError("it has not one network for each window")
-        like, arguments = model.y0, (model.t0,)
-        candidate = lambda pinn, t: pinn.window(0).candidate(t)  # noqa: E731
+        eqx.filter_eval_shape(lambda pinn: pinn.window(0).candidate(pinn.t0), model)
     elif isinstance(model, DeepONet):
         # A polynomial of high order takes long to trace.
         model = eqx.tree_at(lambda m: m.taylor, model, None, is_leaf=lambda x: x is None)
         known = () if model.args_domain is None else (model.args_domain.lower,)
-        like, arguments = model.state, (model.state, *known, model.max_step)
-        candidate = DeepONet.candidate
+        eqx.filter_eval_shape(DeepONet.candidate, model, model.state, *known, model.max_step)
     else:
         raise TypeError(f"`model` is a {type(model).__name__}, but must be a `PINN` or `DeepONet`")
-    found = eqx.filter_eval_shape(candidate, model, *arguments)
-    if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, like):
-        raise ValueError("the output is not of the shape of a state")

@@ -118,12 +118,8 @@ def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[st
 def check_times(system: AbstractSystem, t1: float, dt: float, states: int) -> None:
     """Raises unless the solve from 0 to `t1` in steps of `dt` is valid and fits into memory."""
     if not 0 < dt <= t1 < math.inf:
-        raise SetupError(
-            f"--t1 {t1:g} and --dt {dt:g} must be positive numbers, and dt at most t1. Choose "
-            "others."
-        )
-    unknowns = states * tree_size(system.y0)
-    steps_max = _BYTES_MAX // (8 * unknowns)
+        raise SetupError(f"--t1 {t1:g} and --dt {dt:g} must be positive, and dt at most t1.")
+    steps_max = _BYTES_MAX // (8 * states * tree_size(system.y0))
     if t1 / dt > steps_max:
         raise SetupError(
             f"{t1 / dt:.3g} steps are too many to hold in memory; {system.name} can have "

@@ -71,9 +71,8 @@ def draw(
         paths = {name: system.trajectories(ys) for name, ys in first.items()}
         exact = None
         if errors:
-            exact = system.trajectories(
-                system.reference(np.linspace(ts[0], ts[-1], COMPARED_MAX + 1))
-            )
+            times = np.linspace(ts[0], ts[-1], COMPARED_MAX + 1)
+            exact = system.trajectories(system.reference(times))
             # The initial state has neither error nor drift.
             medians = {k: (ts[1:], np.median(v, axis=0)[1:]) for k, v in errors.items()}
             figures["state_error"] = _one_panel(medians, "$t$", "state error")
@@ -96,9 +95,8 @@ def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure
     panels = figure.subplots(1, len(integrals), squeeze=False, sharey=True)[0]
     for ax, integral in zip(panels, integrals, strict=True):
         ax.axhline(_EPS, **_ROUNDOFF)
-        _lines(
-            ax, {k: (ts[1:], np.maximum(v.drift[integral], _FLOOR)[1:]) for k, v in runs.items()}
-        )
+        drifts = {k: np.maximum(v.drift[integral], _FLOOR) for k, v in runs.items()}
+        _lines(ax, {k: (ts[1:], drift[1:]) for k, drift in drifts.items()})
         ax.set(title=integral, xlabel="$t$")
     panels[0].set_ylabel("relative drift")
     _legend(figure, panels[0])

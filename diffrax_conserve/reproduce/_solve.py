@@ -22,8 +22,7 @@ COMPARED_MAX = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What one solver found; without a failure also at `ts`, evenly spread steps from the initial
-    time on."""
+    """What one solver found; without a failure also at `ts`, evenly spread steps from 0 on."""
 
     failure: str | None
     steps: int = 0
@@ -57,12 +56,8 @@ def state_errors(system: AbstractSystem, y0s: Any, runs: dict[str, Run]) -> dict
         return {}
     # Every solver takes the same steps.
     ts = next(iter(succeeded.values())).ts
-    exact = eqx.filter_vmap(lambda y0: system.reference(ts, y0))(y0s)
-
-    return {
-        name: np.linalg.norm(_components(run.ys) - _components(exact), axis=2)
-        for name, run in succeeded.items()
-    }
+    exact = _components(eqx.filter_vmap(lambda y0: system.reference(ts, y0))(y0s))
+    return {k: np.linalg.norm(_components(v.ys) - exact, axis=2) for k, v in succeeded.items()}
 
 
 def _components(values: Any) -> np.ndarray:
@@ -73,12 +68,7 @@ def _components(values: Any) -> np.ndarray:
 
 @eqx.filter_jit
 def _solve(
-    system: AbstractSystem,
-    solver: dfx.AbstractSolver,
-    y0s: Any,
-    t1: jax.Array,
-    dt: jax.Array,
-    max_steps: int,
+    system: AbstractSystem, solver: dfx.AbstractSolver, y0s: Any, t1: Any, dt: Any, max_steps: int
 ) -> dfx.Solution:
     def one(y0: Any) -> dfx.Solution:
         term, saveat = dfx.ODETerm(system.vector_field), dfx.SaveAt(t0=True, steps=True)

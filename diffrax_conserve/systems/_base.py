@@ -1,5 +1,4 @@
-"""The base classes of the systems of the catalogue: equations, manifold, states, a reference; and
-random points for initial states."""
+"""The base classes of the systems of the catalogue, and random points for initial states."""
 
 import abc
 from collections.abc import Sequence
@@ -23,6 +22,10 @@ else:
     from equinox import AbstractClassVar
 
 _System = TypeVar("_System", bound="AbstractSystem")
+Curves = dict[str, Float[Array, "times coordinates"]]
+# The beginnings of citations.
+PAPER = "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023)"
+HAIRER = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration"
 
 
 class Reduced(NamedTuple):
@@ -101,7 +104,7 @@ class AbstractSystem(eqx.Module):
         integrals; `None` if the system does not need any."""
         return None
 
-    def trajectories(self, ys: Any) -> dict[str, Float[Array, "times coordinates"]]:
+    def trajectories(self, ys: Any) -> Curves:
         """Named curves in two or three coordinates, for a phase picture of the states `ys`; by
         default one of the first components of the state."""
         return {self.title: jtu.tree_leaves(ys)[0][:, : len(self.axes)]}

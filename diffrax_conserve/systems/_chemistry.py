@@ -1,7 +1,7 @@
 """Stiff chemistry: the problems of Robertson and of Verwer."""
 
 import abc
-from typing import Any, final
+from typing import final
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, real
+from ._base import AbstractIntegratedSystem, Curves, real
 from ._mechanism import Mechanism
 
 State = Float[Array, " species"]
@@ -39,7 +39,7 @@ class AbstractChemistry(AbstractIntegratedSystem):
         factors = jnp.exp(jr.uniform(key, self.y0.shape, self.y0.dtype, -1, 1) * jnp.log(2.0))
         return self.y0 * factors
 
-    def trajectories(self, ys: Float[Array, "times species"]) -> dict[str, Any]:
+    def trajectories(self, ys: Float[Array, "times species"]) -> Curves:
         """The concentrations of the two species that `axes` names."""
         places = [self.mechanism.species.index(name) for name in self.axes]
         return {"concentrations": ys[:, jnp.array(places)]}
@@ -80,10 +80,7 @@ class Robertson(AbstractChemistry):
         return self.mechanism.state({"A": 1.0})
 
 
-Robertson.__init__.__doc__ = """**Arguments:**
-
-- `rates`: the three rate constants.
-"""
+Robertson.__init__.__doc__ = "**Arguments:**\n\n- `rates`: the three rate constants."
 
 
 _SPECIES = (
@@ -155,7 +152,4 @@ class Pollu(AbstractChemistry):
         return self.mechanism.state(_INITIAL)
 
 
-Pollu.__init__.__doc__ = """**Arguments:**
-
-- `rates`: the 25 rate constants.
-"""
+Pollu.__init__.__doc__ = "**Arguments:**\n\n- `rates`: the 25 rate constants."

@@ -28,11 +28,7 @@ def hamiltonian_vector_field(hamiltonian: ScalarFn) -> Callable[[RealScalarLike,
     **Returns:**
 
     A callable `vector_field(t, y, args)`, a PyTree that holds `hamiltonian`: the parameters of an
-    [`equinox.Module`][] remain differentiable.
-
-    **Raises:**
-
-    `TypeError`, when called, if `y` has neither of these two forms.
+    [`equinox.Module`][] remain differentiable. It raises a `TypeError` if `y` has another form.
 
     !!! example
 
@@ -66,11 +62,8 @@ def nambu_vector_field(h: ScalarFn, l: ScalarFn) -> Callable[[RealScalarLike, An
 
     **Returns:**
 
-    A callable `vector_field(t, y, args)`, a PyTree that holds `h` and `l`.
-
-    **Raises:**
-
-    `TypeError`, when called, if `y` is not an array of shape `(3,)`.
+    A callable `vector_field(t, y, args)`, a PyTree that holds `h` and `l`. It raises a `TypeError`
+    if `y` is not an array of shape `(3,)`.
 
     !!! example
 

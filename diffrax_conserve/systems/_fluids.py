@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, Reduced, annulus, real
+from ._base import PAPER, AbstractIntegratedSystem, Curves, Reduced, annulus, real
 
 State = Float[Array, "3"]
 
@@ -43,8 +43,8 @@ class ConservativeLorenz(AbstractIntegratedSystem):
     name = "conservative-lorenz"
     title = "Conservative Lorenz-1963 model"
     citation = (
-        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); E. N. Lorenz, J. Atmos. Sci. 20 "
-        "(1963); P. Névir and R. Blender, Beitr. Phys. Atmosph. 67 (1994)."
+        f"{PAPER}; E. N. Lorenz, J. Atmos. Sci. 20 (1963); P. Névir and R. Blender, Beitr. Phys. "
+        "Atmosph. 67 (1994)."
     )
     t1 = 125.0
     dt = 0.25
@@ -113,10 +113,7 @@ class PointVortices(AbstractIntegratedSystem):
 
     name = "point-vortices"
     title = "Point vortices"
-    citation = (
-        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
-        "P. K. Newton, The N-Vortex Problem, Springer (2001)."
-    )
+    citation = f"{PAPER}; P. K. Newton, The N-Vortex Problem, Springer (2001)."
     t1 = 250.0
     dt = 0.5
     axes = ("x", "y")
@@ -201,9 +198,7 @@ class PointVortices(AbstractIntegratedSystem):
         basis = jnp.stack(columns, axis=1).astype(y.dtype)
         return Reduced(jnp.stack(inputs), basis, 1 / d**2)
 
-    def trajectories(
-        self, ys: Float[Array, "times vortices 2"]
-    ) -> dict[str, Float[Array, "times 2"]]:
+    def trajectories(self, ys: Float[Array, "times vortices 2"]) -> Curves:
         return {f"vortex {i + 1}": ys[:, i] for i in range(self.strengths.size)}
 
 
@@ -332,7 +327,7 @@ class KortewegDeVries(AbstractIntegratedSystem):
         angles = jnp.outer(jnp.arange(5.0), 2 * jnp.pi * self.x / self.length)
         return amplitudes[0] @ jnp.cos(angles) + amplitudes[1] @ jnp.sin(angles)
 
-    def trajectories(self, ys: Float[Array, "times points"]) -> dict[str, Float[Array, "times 2"]]:
+    def trajectories(self, ys: Float[Array, "times points"]) -> Curves:
         """The first Fourier mode, which moves on a circle for a travelling wave."""
         mode = 2 * jnp.fft.rfft(ys)[:, 1] / self.points
         return {"wave": jnp.stack([mode.real, -mode.imag], axis=1)}

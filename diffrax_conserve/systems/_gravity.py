@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from ._base import AbstractIntegratedSystem, AbstractSystem, Reduced, real
+from ._base import HAIRER, AbstractIntegratedSystem, AbstractSystem, Curves, Reduced, real
 
 Pair = Float[Array, "2"]
 State = tuple[Pair, Pair]
@@ -24,10 +24,9 @@ class Kepler(AbstractSystem):
 
     **Manifold**: energy $H = \tfrac12 |p|^2 - \mu / |q|$ and angular momentum
     $L = q_1 p_2 - q_2 p_1$, which are dependent on a circular orbit. The Laplace-Runge-Lenz vector
-    `laplace_runge_lenz`, of length $\mu e$, is conserved too, but redundant:
-    $|A|^2 = \mu^2 + 2 H L^2$.
-    **Reference**: exact, by Kepler's equation; bound orbits only ($H < 0$). **Samples**: ellipses
-    of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, with any
+    `laplace_runge_lenz`, of length $\mu e$, is conserved too, but redundant: $|A|^2 = \mu^2 + 2 H
+    L^2$. **Reference**: exact, by Kepler's equation; bound orbits only ($H < 0$). **Samples**:
+    ellipses of semi-major axis in $[\tfrac12, \tfrac32]$ and eccentricity in $[0, 0.8]$, with any
     orientation, direction of motion and eccentric anomaly, all uniform.
 
     Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", I.2.2. The default state
@@ -38,7 +37,7 @@ class Kepler(AbstractSystem):
 
     name = "kepler"
     title = "Kepler's problem"
-    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.2."
+    citation = f"{HAIRER}, I.2.2."
     t1 = 20.0
     dt = 0.2
     axes = ("q₁", "q₂")
@@ -136,10 +135,7 @@ class Kepler(AbstractSystem):
         return -self.mu / (2 * energy)
 
 
-Kepler.__init__.__doc__ = r"""**Arguments:**
-
-- `mu`: the strength $\mu$ of the attraction.
-"""
+Kepler.__init__.__doc__ = "**Arguments:**\n\n- `mu`: the strength $\\mu$ of the attraction."
 
 
 def _turn(x: Pair, angle: Float[Array, ""]) -> Pair:
@@ -165,7 +161,6 @@ def _eccentric_anomaly(
 
 Vectors = Float[Array, "bodies 3"]
 Bodies = tuple[Vectors, Vectors]
-BodiesAtTimes = tuple[Float[Array, "times bodies 3"], Float[Array, "times bodies 3"]]
 
 # Relative to the Sun; the mass of the Sun includes the four inner planets.
 _MASSES = {
@@ -217,7 +212,7 @@ class OuterSolarSystem(AbstractIntegratedSystem):
 
     name = "outer-solar-system"
     title = "Outer solar system"
-    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.2.4."
+    citation = f"{HAIRER}, I.2.4."
     t1 = 200_000.0
     dt = 100.0
     axes = ("x [AU]", "y [AU]", "z [AU]")
@@ -286,7 +281,7 @@ class OuterSolarSystem(AbstractIntegratedSystem):
         q, v = jax.vmap(perturbed, in_axes=(0, 1))(jr.split(key), jnp.array(_STATES))
         return self.barycentric((q, v))
 
-    def trajectories(self, ys: BodiesAtTimes) -> dict[str, Float[Array, "times 3"]]:
+    def trajectories(self, ys: tuple[Float[Array, "times bodies 3"], ...]) -> Curves:
         return {name: ys[0][:, i] for i, name in enumerate(_MASSES)}
 
 

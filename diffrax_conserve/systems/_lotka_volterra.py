@@ -8,7 +8,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from ._base import AbstractIntegratedSystem, real
+from ._base import HAIRER, AbstractIntegratedSystem, real
 
 State = Float[Array, "2"]
 
@@ -36,7 +36,7 @@ class LotkaVolterra(AbstractIntegratedSystem):
 
     name = "lotka-volterra"
     title = "Lotka-Volterra model"
-    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, I.1.1."
+    citation = f"{HAIRER}, I.1.1."
     t1 = 50.0
     dt = 0.2
     axes = ("predators", "prey")

@@ -1,5 +1,4 @@
-"""Chemical kinetics: the differential equations of reactions with given rates, and their
-balances."""
+"""Chemical kinetics: the differential equations of reactions with given rates, and balances."""
 
 import functools as ft
 import re
@@ -73,8 +72,7 @@ class Mechanism(eqx.Module):
         *,
         species: Sequence[str] | None = None,
     ):
-        self.reactions = tuple(reactions)
-        self.rates = real(rates)
+        self.reactions, self.rates = tuple(reactions), real(rates)
         found = dict.fromkeys(name for r in self.reactions for side in _sides(r) for name in side)
         self.species = tuple(found) if species is None else tuple(species)
         if self.rates.shape != (len(self.reactions),):
@@ -99,8 +97,7 @@ class Mechanism(eqx.Module):
 
     @property
     def balances(self) -> dict[str, Balance]:
-        """The conserved quantities, a basis of the left null space of $S$, each under its
-        formula."""
+        """The conserved quantities, a basis of the left null space of $S$, by their formulas."""
         return {_formula(w, self.species): Balance(w) for w in self._tables.balances}
 
     @property

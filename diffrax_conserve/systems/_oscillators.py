@@ -8,7 +8,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
-from ._base import AbstractIntegratedSystem, AbstractSystem, annulus, real
+from ._base import PAPER, AbstractIntegratedSystem, AbstractSystem, Curves, annulus, real
 
 Pair = Float[Array, "2"]
 
@@ -30,7 +30,7 @@ class HarmonicOscillator(AbstractSystem):
 
     name = "harmonic-oscillator"
     title = "Harmonic oscillator"
-    citation = "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023)."
+    citation = f"{PAPER}."
     t1 = 30.0
     dt = 0.25
     axes = ("q", "p")
@@ -63,10 +63,7 @@ class HarmonicOscillator(AbstractSystem):
         return 2 * jnp.pi / self.omega
 
 
-HarmonicOscillator.__init__.__doc__ = r"""**Arguments:**
-
-- `omega`: the angular frequency $\omega$.
-"""
+HarmonicOscillator.__init__.__doc__ = "**Arguments:**\n\n- `omega`: the angular frequency."
 
 
 Planar = tuple[Pair, Pair]
@@ -123,10 +120,7 @@ class HenonHeiles(AbstractIntegratedSystem):
         return annulus(q_key, inner=0.0, outer=0.3), annulus(p_key, inner=0.0, outer=0.4)
 
 
-HenonHeiles.__init__.__doc__ = r"""**Arguments:**
-
-- `coupling`: the strength $\lambda$ of the cubic terms.
-"""
+HenonHeiles.__init__.__doc__ = "**Arguments:**\n\n- `coupling`: the strength of the cubic terms."
 
 
 Vector = Float[Array, " particles"]
@@ -220,9 +214,7 @@ class TodaLattice(AbstractIntegratedSystem):
         q, p = jr.uniform(key, (2, self.particles), minval=-1.0)
         return q, p
 
-    def trajectories(
-        self, ys: tuple[Float[Array, "times particles"], Float[Array, "times particles"]]
-    ) -> dict[str, Float[Array, "times 2"]]:
+    def trajectories(self, ys: tuple[Float[Array, "times particles"], ...]) -> Curves:
         """Each particle relative to the mean, which moves uniformly."""
         points = jnp.stack(ys, axis=2)
         points = points - jnp.mean(points, axis=1, keepdims=True)

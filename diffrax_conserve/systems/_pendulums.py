@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, AbstractSystem, real
+from ._base import HAIRER, PAPER, AbstractIntegratedSystem, AbstractSystem, real
 from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
 
 Pair = Float[Array, "2"]
@@ -43,7 +43,7 @@ class CartesianPendulum(AbstractSystem):
 
     name = "cartesian-pendulum"
     title = "Pendulum in Cartesian coordinates"
-    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, IV.4, VII.1."
+    citation = f"{HAIRER}, IV.4, VII.1."
     t1 = 30.0
     dt = 0.1
     axes = ("q₁", "q₂")
@@ -177,10 +177,7 @@ class DoublePendulum(AbstractIntegratedSystem):
 
     name = "double-pendulum"
     title = "Double pendulum"
-    citation = (
-        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
-        "L. D. Landau and E. M. Lifshitz, Mechanics, §5."
-    )
+    citation = f"{PAPER}; L. D. Landau and E. M. Lifshitz, Mechanics, §5."
     t1 = 10.0
     dt = 0.5
     axes = ("θ₁", "θ₂")

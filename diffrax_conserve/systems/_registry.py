@@ -29,18 +29,12 @@ def names(*, stiff: bool = False) -> tuple[str, ...]:
 def get(name: str) -> AbstractSystem:
     """The system called `name`, with its default parameters.
 
+    For other parameters, call the class itself: `Kepler(mu=2.0)`.
+
     **Arguments:**
 
-    - `name`: one of `names()` or of `names(stiff=True)`, such as `"kepler"`.
-
-    **Returns:**
-
-    An instance of the system's class. For other parameters, call the class itself:
-    `Kepler(mu=2.0)`.
-
-    **Raises:**
-
-    `ValueError` for an unknown name; the message suggests similar names.
+    - `name`: one of `names()` or of `names(stiff=True)`, such as `"kepler"`; for others a
+        `ValueError` that suggests similar names.
 
     !!! example
 

@@ -1,6 +1,6 @@
 """The free rigid body: its angular momentum, and its attitude as a unit quaternion."""
 
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._custom_types import Args, RealScalarLike
 from .._manifold import Constraint, FirstIntegral
-from ._base import AbstractIntegratedSystem, AbstractSystem, direction, real, shell
+from ._base import HAIRER, PAPER, AbstractIntegratedSystem, AbstractSystem, direction, real, shell
 from ._elliptic import complete_elliptic, incomplete_elliptic, jacobi_elliptic
 
 State = Float[Array, "3"]
@@ -39,10 +39,7 @@ class RigidBody(AbstractSystem):
 
     name = "rigid-body"
     title = "Free rigid body"
-    citation = (
-        "E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131 (2023); "
-        "L. D. Landau and E. M. Lifshitz, Mechanics, §36-37."
-    )
+    citation = f"{PAPER}; L. D. Landau and E. M. Lifshitz, Mechanics, §36-37."
     t1 = 1.75
     dt = 0.05
     axes = ("w₁", "w₂", "w₃")
@@ -91,15 +88,12 @@ def _rates(inertia: Float[Array, "3"]) -> tuple[Array, Array, Array]:
     return (i2 - i3) / (i2 * i3), (i3 - i1) / (i3 * i1), (i1 - i2) / (i1 * i2)
 
 
-def _elliptic_form(
-    inertia: Float[Array, "3"], y0: State
-) -> tuple[Array, Array, Array, Array, Array]:
+def _elliptic_form(inertia: Float[Array, "3"], y0: State) -> tuple[Array, ...]:
     r"""The solution as $(w_a, w_b, w_c) = (A\,dn, B\,sn, C\,cn)(\lambda t + u_0)$.
 
-    Here $b$ is the axis of the middle moment of inertia. With $w_i' = k_i w_j w_k$,
-    inserting this form gives $\lambda^2 = -k_b k_c A^2$, $B = k_b A C / \lambda$ and
-    $m = k_a C^2 / k_c A^2$. Of the two outer axes, $a$ is the one for which $m \le 1$, about which
-    $w$ rotates.
+    Here $b$ is the axis of the middle moment of inertia. With $w_i' = k_i w_j w_k$, inserting this
+    form gives $\lambda^2 = -k_b k_c A^2$, $B = k_b A C / \lambda$ and $m = k_a C^2 / k_c A^2$. Of
+    the two outer axes, $a$ is the one for which $m \le 1$, about which $w$ rotates.
     """
     order = jnp.argsort(inertia)
     k = jnp.stack(_rates(inertia))
@@ -146,7 +140,7 @@ class RigidBodyAttitude(AbstractIntegratedSystem):
 
     name = "rigid-body-attitude"
     title = "Attitude of a free rigid body"
-    citation = "E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration, VII.5."
+    citation = f"{HAIRER}, VII.5."
     t1 = 20.0
     dt = 0.1
     axes = ("x", "y", "z")
@@ -188,18 +182,13 @@ class RigidBodyAttitude(AbstractIntegratedSystem):
         attitude_key, omega_key = jr.split(key)
         return direction(attitude_key, 4), shell(omega_key, inner=0.5, outer=2.0)
 
-    def trajectories(
-        self, ys: tuple[Float[Array, "times 4"], Float[Array, "times 3"]]
-    ) -> dict[str, Float[Array, "times 3"]]:
+    def trajectories(self, ys: Any) -> dict[str, Float[Array, "times 3"]]:
         attitudes, _ = ys
         third = jnp.zeros((attitudes.shape[0], 3), attitudes.dtype).at[:, 2].set(1)
         return {"third axis of the body": _rotate(attitudes, third)}
 
 
-RigidBodyAttitude.__init__.__doc__ = r"""**Arguments:**
-
-- `inertia`: the principal moments of inertia $(I_1, I_2, I_3)$.
-"""
+RigidBodyAttitude.__init__.__doc__ = RigidBody.__init__.__doc__
 
 
 def _rotate(attitude: Float[Array, "*s 4"], v: Float[Array, "*s 3"]) -> Float[Array, "*s 3"]:

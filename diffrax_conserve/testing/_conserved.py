@@ -73,16 +73,10 @@ def assert_conserved(
         import diffrax_conserve.testing as dct
 
         system = dfc.systems.RigidBody()
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(system.vector_field),
-            dfc.ManifoldProjection(diffrax.Tsit5(), system.manifold),
-            t0=0.0,
-            t1=1.0,
-            dt0=0.1,
-            y0=system.y0,
-            saveat=diffrax.SaveAt(t0=True, steps=True),
-        )
-        dct.assert_conserved(solution, system.manifold)
+        term, saveat = diffrax.ODETerm(system.vector_field), diffrax.SaveAt(t0=True, steps=True)
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), system.manifold)
+        sol = diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, system.y0, saveat=saveat)
+        dct.assert_conserved(sol, system.manifold)
         ```
     """
     check_manifold(manifold)
@@ -96,7 +90,12 @@ def assert_conserved(
 
     if y0 is None:
         _, ts, ys = sampled[0]
-        _check_comparable(ts, manifold)
+        alone = [name for name, entry in named_entries(manifold) if not has_value(entry)]
+        if ts.shape[-1] == 1 and alone:
+            raise ValueError(
+                f"`solution` holds one saved state, with nothing to compare `{alone[0]}` with. "
+                "Pass `y0=...`, or save the initial state too, as in `SaveAt(t0=True, t1=True)`."
+            )
         start = jtu.tree_map(lambda x: jnp.take(x, 0, axes), (ts, ys))
     else:
         start = solution.t0, y0
@@ -201,15 +200,6 @@ def _dense(solution: dfx.Solution, num: int) -> tuple[Array, Any]:
     return lane(solution.interpolation)
 
 
-def _check_comparable(ts: Array, manifold: Manifold) -> None:
-    for name, entry in named_entries(manifold):
-        if ts.shape[-1] == 1 and not has_value(entry):
-            raise ValueError(
-                f"`solution` holds one saved state, with nothing to compare `{name}` with. Pass "
-                "`y0=...`, or save the initial state too, as in `SaveAt(t0=True, t1=True)`."
-            )
-
-
 # ---- What is there ----
 
 
@@ -231,8 +221,7 @@ class _Samples(NamedTuple):
     @property
     def precision(self) -> Any:
         """That of the coarsest dtype in the state."""
-        infos = (jnp.finfo(x.dtype) for x in jtu.tree_leaves(self.ys))
-        return max(infos, key=lambda info: info.eps)
+        return max((jnp.finfo(x.dtype) for x in jtu.tree_leaves(self.ys)), key=lambda i: i.eps)
 
     @property
     def limit(self) -> Real[np.ndarray, "rows m"]:

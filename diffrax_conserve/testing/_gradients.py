@@ -98,13 +98,12 @@ def assert_gradients(
             got["forward mode"] = float(cotangent @ pushforward(x, v))
         if reverse:
             got["reverse mode"] = float(by_reverse @ v)
-        for mode, found in got.items():
-            if not abs(found - expected) <= limit:
-                lines.append(
-                    f"  with respect to `{name}`, {mode} gives {found:.9g}, finite differences "
-                    f"{expected:.9g}: they differ by {abs(found - expected):.2e}, tolerance "
-                    f"{limit:.2e}"
-                )
+        lines += [
+            f"  with respect to `{name}`, {mode} gives {found:.9g}, finite differences "
+            f"{expected:.9g}: they differ by {abs(found - expected):.2e}, tolerance {limit:.2e}"
+            for mode, found in got.items()
+            if not abs(found - expected) <= limit
+        ]
     if lines:
         raise AssertionError(
             "Derivatives along random directions are wrong.\n"

@@ -63,16 +63,13 @@ def assert_order(
         jax.config.update("jax_enable_x64", True)
         system = dfc.systems.RigidBody()
         solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
-        dct.assert_order(
-            solver, diffrax.ODETerm(system.vector_field), system.y0, t1=1.0, dt0=0.1
-        )
+        term = diffrax.ODETerm(system.vector_field)
+        dct.assert_order(solver, term, system.y0, t1=1.0, dt0=0.1)
         ```
     """
     order = solver.order(terms) if order is None else order
     if order is None:
-        raise ValueError(
-            f"{type(solver).__name__} states no order for these terms. Pass `order=...`."
-        )
+        raise ValueError(f"{type(solver).__name__} states no order for these terms. Pass `order=`.")
     span = jnp.asarray(t1, float) - t0
     count = int(np.ceil(float(jnp.abs(span / dt0)) - 1e-6))
     problem = (terms, jnp.asarray(t0, span.dtype), span, y0, args)
@@ -84,8 +81,8 @@ def assert_order(
         reference = _final(best, problem, n, n)
     errors = np.array([float(tree_max(tree_sub(y, reference))) for y in finals])
     steps = float(span) / counts
-    table = "\n".join(f"    {abs(h):<12.6g} {e:.3e}" for h, e in zip(steps, errors, strict=True))
-    table = f"    step         error\n{table}"
+    rows = [f"    {abs(h):<12.6g} {e:.3e}" for h, e in zip(steps, errors, strict=True)]
+    table = "\n".join(["    step         error", *rows])
     if not np.all(np.isfinite(errors)):
         raise AssertionError(
             f"A solve did not succeed (its error is NaN):\n{table}\n"

@@ -69,18 +69,14 @@ def quadratic_systems(dimension: int, *, integrals: int = 1) -> st.SearchStrateg
 
     **Arguments:**
 
-    - `dimension`: the dimension of the state; greater than `integrals`.
-    - `integrals`: the number of integrals, 1 or 2.
+    - `dimension`: the dimension of the state; greater than `integrals`, or a `ValueError`.
+    - `integrals`: the number of integrals, 1 or 2; otherwise a `ValueError`.
 
     **Returns:**
 
     A strategy of systems with positive definite forms, so that solutions stay bounded, and initial
     states with components in [-2, 2], not all zero. It shrinks to diagonal forms, a vector field of
     zero, and a state with a single 1 and otherwise zeros.
-
-    **Raises:**
-
-    `ValueError` for other numbers of integrals, or if the dimension is too small.
 
     !!! example
 

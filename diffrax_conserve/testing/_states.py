@@ -34,16 +34,13 @@ def step_sizes(
     **Arguments:**
 
     - `largest`: the largest step size, in the units of time.
-    - `smallest`: the smallest. Default: a hundredth of `largest`.
+    - `smallest`: the smallest; a `ValueError` unless `0 < smallest <= largest`. Default: a
+        hundredth of `largest`.
 
     **Returns:**
 
     A strategy of positive NumPy `float64`s, because [`equinox.filter_jit`][] compiles again for
     each Python float. It shrinks to `largest`, with which counterexamples have the fewest steps.
-
-    **Raises:**
-
-    `ValueError` unless `0 < smallest <= largest`.
 
     !!! example
 
@@ -75,17 +72,13 @@ def times(
 
     **Arguments:**
 
-    - `t0`, `t1`: the ends; `t1` may be smaller than `t0`.
-    - `size`: the number of times, which is fixed so that a solve is compiled once.
+    - `t0`, `t1`: the ends, which must be finite; `t1` may be smaller than `t0`.
+    - `size`: the number of times, at least 1, which is fixed so that a solve is compiled once.
 
     **Returns:**
 
     A strategy of float64 arrays of shape `(size,)`, multiples of a thousandth of the interval, both
-    ends and repeated times included. It shrinks to `t0`.
-
-    **Raises:**
-
-    `ValueError` if an end is not finite, or `size` not positive.
+    ends and repeated times included. It shrinks to `t0`. Other arguments raise a `ValueError`.
 
     !!! example
 
@@ -116,17 +109,14 @@ def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.Se
 
     **Arguments:**
 
-    - `like`: a PyTree of floating-point arrays, which defines structure, shapes and dtypes.
-    - `magnitude`: the largest absolute value of a component.
+    - `like`: a PyTree of floating-point arrays (otherwise a `TypeError`), which defines structure,
+        shapes and dtypes.
+    - `magnitude`: the largest absolute value of a component, positive; otherwise a `ValueError`.
 
     **Returns:**
 
     A strategy of PyTrees like `like`, of NumPy arrays. No component is infinite or NaN, or so small
     that its square underflows in float32. It shrinks to zero.
-
-    **Raises:**
-
-    `TypeError` if a leaf is not floating-point; `ValueError` unless `magnitude` is positive.
 
     !!! example
 
@@ -145,20 +135,19 @@ def states(like: PyTree[ArrayLike], *, magnitude: RealScalarLike = 1.0) -> st.Se
     if not 0 < magnitude < float("inf"):
         raise ValueError(f"`magnitude` must be positive and finite, but it is {magnitude}.")
     leaves, treedef = jtu.tree_flatten(like)
-    for leaf in leaves:
-        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+    for dtype in map(jnp.result_type, leaves):
+        if not jnp.issubdtype(dtype, jnp.floating):
             raise TypeError(
-                f"`like` has a leaf of dtype {jnp.result_type(leaf)}. States are floating-point: "
-                "write for example `np.zeros(3)`."
+                f"`like` has a leaf of dtype {dtype}. States are floating-point: write for example "
+                "`np.zeros(3)`."
             )
-    # Drawn in float64 and then rounded, so that a float32 component is at most the rounded bound.
-    arrays = (
-        hnp.arrays(np.float64, jnp.shape(x), elements=rounded(magnitude)).map(
-            lambda a, dtype=jnp.result_type(x): a.astype(dtype)
-        )
-        for x in leaves
-    )
-    return st.tuples(*arrays).map(lambda drawn: jtu.tree_unflatten(treedef, drawn))
+
+    def array(leaf: ArrayLike) -> st.SearchStrategy[Any]:
+        # Drawn in float64 and then rounded, so that float32 is at most the rounded bound.
+        drawn = hnp.arrays(np.float64, jnp.shape(leaf), elements=rounded(magnitude))
+        return drawn.map(lambda a: a.astype(jnp.result_type(leaf)))
+
+    return st.tuples(*map(array, leaves)).map(lambda drawn: jtu.tree_unflatten(treedef, drawn))
 
 
 def system_states(
@@ -212,8 +201,7 @@ def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[A
 
     A strategy of [`diffrax_conserve.systems.AbstractSystem`][]s. It shrinks to the first name.
 
-    Solves are compiled again for every system: prefer `pytest.mark.parametrize` where there are
-    any.
+    Solves are compiled again for every system: prefer `pytest.mark.parametrize` for them.
 
     !!! example
 

@@ -18,8 +18,7 @@ from .._tree import unflatten
 
 @final
 class Restructuring(eqx.Module):
-    """The components of a state in another PyTree, with other nesting and shapes and the same
-    numbers.
+    """The components of a state in another PyTree, with other nesting and shapes.
 
     Code that handles any PyTree must give the same numbers for both.
 
@@ -89,17 +88,13 @@ def restructurings(
 
     **Arguments:**
 
-    - `like`: a PyTree of floating-point arrays, all of one dtype.
+    - `like`: a PyTree of floating-point arrays, all of one dtype, or a `ValueError`: a repacked
+        leaf could contain several of them.
     - `max_depth`: the largest nesting depth of tuples, lists and dictionaries.
 
     **Returns:**
 
     A strategy of [`diffrax_conserve.testing.Restructuring`][]s. It shrinks to a single vector.
-
-    **Raises:**
-
-    `ValueError` if the leaves of `like` have different dtypes, because a repacked leaf could
-    contain several of them.
     """
     dtypes = {jnp.result_type(x) for x in jtu.tree_leaves(like)}
     if len(dtypes) != 1:

@@ -68,9 +68,12 @@ class MLP(eqx.Module):
         self.weights = tuple(initialise(k, s, dtype) for k, s in zip(keys, shapes, strict=True))
         self.biases = tuple(jnp.zeros(size, dtype) for size in sizes[1:])
         if slope is not None:
-            weight, bias = _spread(slope, in_size, width, dtype, keys[0])
+            # The units have uniformly distributed centres in [-1, 1] and random slopes.
+            slope_key, centre_key = jr.split(keys[0])
+            weight = slope * jr.normal(slope_key, (in_size, width), dtype)
+            centres = jr.uniform(centre_key, (in_size, width), dtype, minval=-1, maxval=1)
             self.weights = (weight, *self.weights[1:])
-            self.biases = (bias, *self.biases[1:])
+            self.biases = (-jnp.sum(weight * centres, axis=0), *self.biases[1:])
         self.activation = find_activation(activation)
 
     def __call__(self, x: Float[Array, "*batch in"]) -> Float[Array, "*batch out"]:
@@ -94,16 +97,6 @@ def fresh(net: MLP, slope: float | None, size: Float[Array, ""], key: PRNGKeyArr
     (in_size, width), out_size, depth = first.shape, last.shape[1], len(net.weights) - 1
     new = MLP(in_size, out_size, width, depth, net.activation, first.dtype, key=key, slope=slope)
     return eqx.tree_at(lambda net: net.weights[-1], new, size * new.weights[-1])
-
-
-def _spread(
-    slope: float, in_size: int, width: int, dtype: jnp.dtype, key: PRNGKeyArray
-) -> tuple[Float[Array, "in width"], Float[Array, " width"]]:
-    """A first layer whose units have uniformly distributed centres in [-1, 1] and random slopes."""
-    slope_key, centre_key = jr.split(key)
-    weight = slope * jr.normal(slope_key, (in_size, width), dtype)
-    centres = jr.uniform(centre_key, (in_size, width), dtype, minval=-1, maxval=1)
-    return weight, -jnp.sum(weight * centres, axis=0)
 
 
 def check_sizes(**sizes: int) -> None:

@@ -69,11 +69,8 @@ class Box(eqx.Module):
 
 Box.__init__.__doc__ = """**Arguments:**
 
-- `lower`, `upper`: the corners, two PyTrees like a state.
-
-**Raises:**
-
-`ValueError` or `TypeError` if their structures or shapes differ, or if they are not real.
+- `lower`, `upper`: the corners, two real PyTrees of the structure and shapes of a state; others
+    raise a `ValueError` or `TypeError`.
 """
 
 

@@ -100,9 +100,7 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 - `steps`: the number $P$ of iterations.
 - `args`: passed to the functions of the manifold.
 
-**Raises:**
-
-`TypeError` or `ValueError` if `manifold` or `steps` is invalid.
+An invalid `manifold` or number raises a `TypeError` or `ValueError`.
 """
 
 # The magnitude of the conserved values, the radius, p and s.

@@ -164,10 +164,7 @@ def _root(x: Array, exponent: float) -> Array:
     return x
 
 
-BoxCox.__init__.__doc__ = r"""**Arguments:**
-
-- `exponent`: $\lambda$, from 0 to 1; otherwise a `ValueError`.
-"""
+BoxCox.__init__.__doc__ = "**Arguments:**\n\n- `exponent`: from 0 to 1; otherwise a `ValueError`."
 
 
 @final

@@ -153,11 +153,8 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
     **Returns:**
 
     A named tuple of `num_outside`, the number of accepted steps that count as outside, and
-    `first_outside`, the time at which the first of them started; infinity if there is none.
-
-    **Raises:**
-
-    `ValueError` if `sol` holds no such statistics.
+    `first_outside`, the time at which the first of them started; infinity if there is none. Raises
+    a `ValueError` if `sol` holds no such statistics.
 
     !!! example
 

@@ -53,7 +53,14 @@ def checked(
     """The flow map, or the first window of a PINN, and the problem; raises unless they fit."""
     if vector_field is None and data is None:
         raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
-    _check_manifold(model, manifold)
+    if manifold is not None:
+        check_manifold(manifold)
+        refuse_rates(manifold, "a training")
+        if not isinstance(model, PINN):
+            raise ValueError(
+                "`manifold` is for the windows of a `PINN`. Give the network a `layer`, or wrap "
+                "its solver in `ManifoldProjection`."
+            )
     recipe = second_order(model) if recipe is None else recipe
     if isinstance(model, PINN):
         if sample is not None or data is not None:
@@ -134,18 +141,6 @@ def _rate_of_change(problem: Problem) -> Array:
         return after / jnp.maximum(before, 1e-30)
 
     return jnp.median(jax.vmap(at)(jr.split(jr.key(0), 64)))
-
-
-def _check_manifold(model: Any, manifold: Manifold | None) -> None:
-    if manifold is None:
-        return
-    check_manifold(manifold)
-    refuse_rates(manifold, "a training")
-    if not isinstance(model, PINN):
-        raise ValueError(
-            "`manifold` is for the windows of a `PINN`. Give the network a `layer`, or wrap its "
-            "solver in `ManifoldProjection`."
-        )
 
 
 def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:

@@ -48,10 +48,7 @@ def reachable_states(
 
     **Returns:**
 
-    The states, stacked along a leading axis, without those whose solve failed.
-
-    **Raises:**
-
+    The states, stacked along a leading axis, without those whose solve failed. Raises a
     `ValueError` if no state is left.
 
     !!! example
@@ -101,10 +98,7 @@ def trajectories(
     **Returns:**
 
     Times of shape `(m, k)` and states with leading axes `(m, k)`, without solves that failed.
-
-    **Raises:**
-
-    `ValueError` if all solves failed.
+    Raises a `ValueError` if all failed.
 
     !!! example
 
@@ -126,20 +120,13 @@ def trajectories(
 
     def solution(y0: Any, ts: Array) -> tuple[Any, Array]:
         adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
+        controller = adaptive if dt0 is None else dfx.ConstantStepSize()
+        by = dfx.Dopri8() if solver is None else solver
         found = dfx.diffeqsolve(
-            dfx.ODETerm(vector_field),
-            dfx.Dopri8() if solver is None else solver,
-            0.0,
-            ts[-1],
-            dt0,
-            y0,
-            args,
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=adaptive if dt0 is None else dfx.ConstantStepSize(),
-            max_steps=_MAX_STEPS,
-            adjoint=dfx.ForwardMode(),
+            dfx.ODETerm(vector_field), by, 0.0, ts[-1], dt0, y0, args, saveat=dfx.SaveAt(ts=ts),
+            stepsize_controller=controller, adjoint=dfx.ForwardMode(), max_steps=_MAX_STEPS,
             throw=False,
-        )
+        )  # fmt: skip
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
     ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)

@@ -14,7 +14,7 @@ from .._networks.wrappers import OfPairs
 from .checks import check_types, checked
 from .errors import flow_map_error
 from .loop import FitLog, Loop, Progress
-from .objective import VectorField
+from .objective import Carry, VectorField
 from .recipe import Recipe
 from .state import FitState
 from .windows import train_windows
@@ -116,14 +116,9 @@ def fit(
     created = time.perf_counter()
     check_types(key, recipe, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
-    loop = Loop(
-        problem,
-        key,
-        target=None if target is None else float(target),
-        seconds=math.inf if seconds is None else seconds,
-        progress=progress,
-        created=created,
-    )
+    target = None if target is None else float(target)
+    seconds = math.inf if seconds is None else seconds
+    loop = Loop(problem, key, target, seconds, progress, created)
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)
     trained, log = _train_flow_map(loop, network, state)
@@ -135,14 +130,12 @@ def fit(
 def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[Any, FitLog]:
     objective, state = loop.start(loop.begin((flow_map,), given))
 
+    def close_enough(carry: Carry) -> bool:
+        return loop.target is not None and float(carry.best) <= loop.target
+
     def error(network: Any) -> float:
         return flow_map_error(network, loop.problem, loop.key)
 
-    state, carry, ended = loop.train(
-        objective,
-        state,
-        lambda carry: loop.target is not None and float(carry.best) <= loop.target,
-        error,
-    )
+    state, carry, ended = loop.train(objective, state, close_enough, error)
     trained = objective.best(carry)
     return trained, loop.log(state, carry, ended, error(trained))

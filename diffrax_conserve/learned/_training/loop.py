@@ -174,8 +174,7 @@ class Loop:
         if self.compiled is not None:
             return
         numbers = jnp.asarray(0), jnp.asarray(0), jnp.asarray(False)
-        compilable = eqx.filter_jit(advance)
-        lowered = compilable.lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
+        lowered = eqx.filter_jit(advance).lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
         self.compiled = lowered.compile()
         estimate(objective.best(state.carry))
         self.compile_seconds = time.perf_counter() - self.created

@@ -159,8 +159,7 @@ class LevenbergMarquardt(eqx.Module):
         del fraction
         r, jacobian, loss = problem.rows(weights)
         units = jnp.where(linear, jnp.asarray(_FREEDOM, r.dtype), 1)
-        scaled = _damped_least_squares(jacobian * units, -r, state)
-        update = units * scaled
+        update = units * _damped_least_squares(jacobian * units, -r, state)
         after = problem.loss(squared_norms(problem.defects(weights + update)), problem.typical)
         change = jacobian @ update
         predicted = -(2 * r @ change + change @ change)
@@ -171,10 +170,7 @@ class LevenbergMarquardt(eqx.Module):
         return jnp.where(better, weights + update, weights), damping, loss
 
 
-LevenbergMarquardt.__init__.__doc__ = r"""**Arguments:**
-
-- `damping`: $\lambda$ of the first update.
-"""
+LevenbergMarquardt.__init__.__doc__ = "**Arguments:**\n\n- `damping`: that of the first update."
 
 # The unit of the weights of the last layer. In these units they are damped like all others.
 _FREEDOM = 1e6
