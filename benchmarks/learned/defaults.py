@@ -99,8 +99,9 @@ def reference(field, y0s, ts):
     return jax.jit(jax.vmap(one))(y0s)
 
 
-def flow_map(name, before, seed, smoke):
-    field, lower, upper, duration, step = FLOW_MAPS[name]
+def flow_map_data(system, smoke):
+    """States to train on, others along other solutions, and these after the longest step."""
+    field, lower, upper, duration, step = system
     box = dfc.learned.Box(jnp.array(lower), jnp.array(upper))
     states, others = (
         dfc.learned.reachable_states(
@@ -108,17 +109,28 @@ def flow_map(name, before, seed, smoke):
         )
         for k, count in ((0, 50 if smoke else 1000), (10, 300))
     )
-    exact = reference(field, others, jnp.array([step]))[:, 0]
+    return states, others, reference(field, others, jnp.array([step]))[:, 0]
+
+
+def judged(system, data, make, changes, seed):
+    """Error, estimate and seconds of the network of `make`, with `changes` of the recipe."""
+    (field, *_, step), (states, others, exact) = system, data
     started = time.process_time()
-    make = dfc.learned.paper.deeponet if before else dfc.DeepONet
     network = make(states, step, key=jr.key(seed))
-    recipe = dfc.learned.second_order(network, epochs=4 if smoke else 120 if before else None)
-    recipe = dataclasses.replace(recipe, taylor=0 if before else recipe.taylor)
+    recipe = dataclasses.replace(dfc.learned.second_order(network), **changes)
     network, log = dfc.fit(network, field, sample=states, key=jr.key(seed + 100), recipe=recipe)
     seconds = time.process_time() - started
     found = jax.jit(jax.vmap(lambda y: network(y, step)))(others)
     error = jnp.max(jnp.sqrt(jnp.mean((found - exact) ** 2, axis=0))) / jnp.max(jnp.abs(exact))
     return {"error": float(error), "estimate": log.error, "seconds": round(seconds, 1)}
+
+
+def flow_map(name, before, seed, smoke):
+    make = dfc.learned.paper.deeponet if before else dfc.DeepONet
+    changes = {"taylor": 0, "epochs": 120} if before else {}
+    changes |= {"epochs": 4} if smoke else {}
+    system = FLOW_MAPS[name]
+    return judged(system, flow_map_data(system, smoke), make, changes, seed)
 
 
 def pinn(name, before, seed, smoke):
