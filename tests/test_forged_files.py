@@ -67,7 +67,9 @@ def mutated(header, rng):
     """`header` with one to three of its entries replaced, removed, added or exchanged."""
     header = copy.deepcopy(header)
     for _ in range(rng.choice([1, 1, 1, 2, 3])):
-        place = rng.choice([p for p in places(header) if p])
+        place = rng.choice([p for p in places(header) if p] or [()])
+        if not place:  # nothing is left
+            break
         parent = functools.reduce(lambda tree, key: tree[key], place[:-1], header)
         kind, value = rng.randrange(5), copy.deepcopy(rng.choice(VALUES))
         if kind == 0:

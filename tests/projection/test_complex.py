@@ -51,7 +51,7 @@ REAL_QUANTA = dfc.FirstIntegral(lambda t, y, args: quanta(t, join(y), args))
 
 @eqx.filter_jit
 def solve(projection, y0, vf, manifold):
-    # The simplest of all solvers, as what is compared is the projection, which starts out of bounds.
+    # The simplest of all solvers: what is compared is the projection. It starts out of bounds.
     solver = dfc.ManifoldProjection(
         dfx.Euler(), {"q": manifold}, projection=projection, max_correction=None
     )
