@@ -72,7 +72,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         end = jtu.tree_map(ft.partial(jnp.where, early), *self.ends)
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
-        step = target.step(self.t0, self.t1, self.ends[0], self.error, lambda: self.inner)
+        step = target.step(self.t0, self.t1, self.ends[0], self.error)
 
         def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Bool[Array, ""]]:
             y, info = target.project(t, candidate, step)

@@ -1,6 +1,5 @@
 """PyTree arithmetic: states as vectors, with real dtypes kept leaf by leaf."""
 
-import functools as ft
 import math
 from typing import Any
 
@@ -9,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree, Real, Shaped
+from jaxtyping import Array, PyTree, Shaped
 
 from ._custom_types import RealScalarLike, Y
 
@@ -38,12 +37,6 @@ def tree_scale(factor: RealScalarLike, a: Y) -> Y:
     return jtu.tree_map(lambda x: jnp.asarray(factor, x.dtype) * x, a)
 
 
-def tree_max(a: Y) -> Real[Array, ""]:
-    """The largest modulus in `a`."""
-    sizes = [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(a)]
-    return ft.reduce(jnp.maximum, [x.astype(working_dtype(a)) for x in sizes])
-
-
 def tree_all_finite(a: PyTree[Array]) -> Array:
     finite = [jnp.all(jnp.isfinite(x)) for x in jtu.tree_leaves(a)]
     return jnp.all(jnp.stack(finite)) if finite else jnp.asarray(True)
@@ -59,13 +52,6 @@ def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
         out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
         start = stop
     return jtu.tree_unflatten(treedef, out)
-
-
-def working_dtype(y: Y) -> jnp.dtype:
-    """The real dtype that represents the parts of every leaf of `y` without loss."""
-    with jax.numpy_dtype_promotion("standard"):
-        dtype = jnp.result_type(*jtu.tree_leaves(y))
-    return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
 
 
 def tree_size(a: Any) -> int:

@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.lax as lax
@@ -42,12 +41,6 @@ class Step(eqx.Module):
     t1: RealScalarLike
     y0: Float[Array, " n"]
     error: Float[Array, " n"] | None
-    path: dfx.AbstractLocalInterpolation
-    direction: RealScalarLike
-
-    def evaluate(self, t: RealScalarLike) -> Float[Array, " n"]:
-        """The dense output of the wrapped solver at a time in the step, before any projection."""
-        return ravel(self.path.evaluate(t * self.direction))
 
 
 class ProjectionInfo(eqx.Module):
@@ -228,19 +221,13 @@ class Target(eqx.Module):
         return dataclasses.replace(self, gained=gained)
 
     def step(
-        self,
-        start: RealScalarLike,
-        end: RealScalarLike,
-        y0: Y,
-        error: Y | None,
-        path: Callable[[], dfx.AbstractLocalInterpolation],
+        self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None
     ) -> Step | None:
         """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
         if not self.projection.sees_step:
             return None
-        start, end = start * self.direction, end * self.direction
         error = None if error is None else ravel(error)
-        return Step(start, end, ravel(y0), error, path(), self.direction)
+        return Step(start * self.direction, end * self.direction, ravel(y0), error)
 
     @eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
     def project(

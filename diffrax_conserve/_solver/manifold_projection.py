@@ -16,7 +16,8 @@ from .._options import check_count, check_number
 from .._projection.base import AbstractProjection, Target, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .state import ProjectionStatistics, State, member, started, verdict
+from .diffrax_private import member
+from .state import FIRST, ProjectionStatistics, State, started, verdict
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 
 
@@ -196,7 +197,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
-        step = target.step(t0, t1, y0, error, path)
+        step = target.step(t0, t1, y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         states, limit = (y0, candidate, y1), self._limit(terms)
@@ -213,7 +214,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         shown = jnp.where(hopeless, 0, jnp.inf)
         error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
         result = dfx.RESULTS.where(
-            (failed == 0) | (result != dfx.RESULTS.successful), result, member(failed)
+            (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
         return y1, error, dense_info, state.next(inner, target.gained, info, due), result
 

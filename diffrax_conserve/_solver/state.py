@@ -19,7 +19,6 @@ from .._projection.base import ProjectionInfo
 from .._projection.equations import equations_of
 from .._projection.roundoff import hidden_scale
 from .._tree import ravel, tree_size, tree_stop_gradient
-from .diffrax_private import member as _member
 from .diffrax_private import register
 
 _SMALLER = (
@@ -29,7 +28,7 @@ _SMALLER = (
 _ENTRY = (
     "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
 )
-_FIRST = register(
+FIRST = register(
     "the solve cannot start: the initial state violates a `Constraint`, or a function of the "
     "manifold is not finite there. Start on the manifold: "
     "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`. " + _ENTRY,
@@ -45,6 +44,7 @@ _FIRST = register(
     "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
     "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
 )
+# The causes of a failure, in the order of their messages.
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
 
 
@@ -207,11 +207,6 @@ def started(
         limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (equations.magnitude + hidden + terms)
         numbers = jnp.where(must_hold & ~(jnp.abs(g) <= limit), jnp.nan, numbers)
     return numbers, hidden
-
-
-def member(cause: Int[Array, ""]) -> dfx.RESULTS:
-    """The result for a cause other than 0."""
-    return _member(_FIRST - 1 + cause)
 
 
 def verdict(

@@ -10,10 +10,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import unflatten, working_dtype
+from ..._tree import unflatten
 from .cores import AbstractCore, Activation, Concatenated, Sizes, check_sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
-from .flat import as_states, flatten, stacked_vectors
+from .flat import as_states, flatten, stacked_vectors, working_dtype
 from .flow_map import AbstractFlowMap, checked_args, checked_box
 from .layer import ConservativeLayer
 from .taylor import Taylor

@@ -1,12 +1,26 @@
 """Conversion of states to vectors, the inputs and outputs of a network."""
 
+import functools as ft
+
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
+from jaxtyping import Array, ArrayLike, Float, PyTree, Real, Shaped
 
 from ..._custom_types import Y
-from ..._tree import working_dtype
+
+
+def working_dtype(y: Y) -> jnp.dtype:
+    """The real dtype that represents the parts of every leaf of `y` without loss."""
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(*jtu.tree_leaves(y))
+    return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
+
+
+def tree_max(a: Y) -> Real[Array, ""]:
+    """The largest modulus in `a`."""
+    sizes = [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(a)]
+    return ft.reduce(jnp.maximum, [x.astype(working_dtype(a)) for x in sizes])
 
 
 def flatten(y: Y) -> Float[Array, " n"]:

@@ -12,9 +12,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._tree import tree_shapes, tree_sub, working_dtype
+from ..._tree import tree_shapes, tree_sub
 from .domain import Box
-from .flat import stacked_vectors
+from .flat import stacked_vectors, working_dtype
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 
 

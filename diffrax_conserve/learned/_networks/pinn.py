@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._options import check_number
-from ..._tree import unflatten, working_dtype
+from ..._tree import unflatten
 from .cores import MLP, Activation, check_sizes
-from .flat import as_state, flatten, stacked_vectors
+from .flat import as_state, flatten, stacked_vectors, working_dtype
 from .layer import ConservativeLayer
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
 

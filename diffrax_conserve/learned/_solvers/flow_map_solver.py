@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._projection.options import option
-from ..._tree import tree_max
+from .._networks.flat import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import Refused, check_learned_terms, check_output, judged, refused_from_start

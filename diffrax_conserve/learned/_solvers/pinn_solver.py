@@ -12,7 +12,8 @@ from jaxtyping import Array
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
-from ..._tree import tree_max, tree_sub, working_dtype
+from ..._tree import tree_sub
+from .._networks.flat import tree_max, working_dtype
 from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
 from .checks import Refused, check_learned_terms, check_output
