@@ -165,3 +165,10 @@ def test_what_is_right():
     value = FirstIntegral(rotational_energy, value=jnp.array(0.15))
     found = dfc.drift(run(RIGID_BODY), value)
     assert float(found[0]) == pytest.approx(0.15 / (0.15 + 0.6), rel=1e-3)
+
+
+def test_drift_without_the_args_of_the_solve_says_so():
+    scaled = FirstIntegral(lambda t, y, args: args["scale"] * jnp.sum(y**2))
+    with pytest.raises(TypeError) as caught:
+        dfc.drift(run(RIGID_BODY), scaled)
+    assert any("`args`" in note for note in caught.value.__notes__)

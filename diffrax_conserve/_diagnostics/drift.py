@@ -66,8 +66,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
         saveat = diffrax.SaveAt(t0=True, steps=True)
-        y0 = jnp.array([1.0, 0.0])
-        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, y0, saveat=saveat)
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, jnp.array([1.0, 0.0]), saveat=saveat)
         print(f"{jnp.max(jnp.abs(dfc.drift(sol, square))):.0e}")
         ```
 
@@ -106,7 +105,12 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
                 f"`sol` has saved {tree_shapes(y0)} at each time, but the states are {states}. "
                 "Save the states themselves, without `SaveAt(fn=...)`."
             )
-    values = conserved_values(manifold, t0, y0, args)
+    try:
+        values = conserved_values(manifold, t0, y0, args)
+    except Exception as error:
+        if args is None:
+            error.add_note("`drift` was given no `args`, which a solution does not keep.")
+        raise
     _, scale = measure(manifold, values, t0, y0, args)
     gained = _gained(sol, manifold, args, values)
 

@@ -128,8 +128,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
-        y0 = jnp.array([1.0, 0.0])
-        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.5, y0, saveat=saveat)
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.5, jnp.array([1.0, 0.0]), saveat=saveat)
         print(dfc.statistics(sol))
         ```
 

@@ -194,7 +194,7 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `core`: one network of the state and the step, [`diffrax_conserve.learned.Concatenated`][]; or
     [`diffrax_conserve.learned.Gated`][], which feeds the input into each layer; or as in the
     literature, and less accurate at the same size, [`diffrax_conserve.learned.Product`][].
-- `latent`: the number $L$ of products in each component of a `Product`.
+- `latent`: only of a `Product`, the number $L$ of products in each component.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].
