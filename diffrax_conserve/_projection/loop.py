@@ -130,13 +130,7 @@ def _solve(
         return jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
 
     def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:
-        moves = left > 0
-        if equations.may_vanish:
-            # A component that is zero on the manifold stays so: what other constraints would move
-            # it by is roundoff, which may be all that its own constraint has.
-            on = equations.verdict(*seen, y) > 0
-            moves = moves & (jnp.abs(y) > jnp.where(on, jnp.zeros((), y.dtype), -1))
-        return jnp.where(moves, _corrected(equations, kept, *seen, y), y)
+        return jnp.where(left > 0, _corrected(equations, kept, *seen, y), y)
 
     def test(kept: _Kept, y: Any, left: Array) -> tuple[Any, Array]:
         seen = equations.linearise(y)
@@ -199,9 +193,12 @@ def _corrected(
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: a true zero is never small relative to itself.
-    rest = y - change
-    least = 2 * float(jnp.finfo(y.dtype).eps) if equations.clip is None else _VANISHES
-    return jnp.where(jnp.abs(rest) <= least * jnp.abs(y), 0, rest)
+    rest, size, least = y - change, jnp.abs(y), 2 * float(jnp.finfo(y.dtype).eps)
+    if equations.clip is not None:
+        least = _VANISHES
+    elif equations.may_vanish:  # the terms of several constraints cancel in it
+        size, least = size + combined(jnp.abs(multiplier), jnp.abs(rows)), 4 * least
+    return jnp.where(jnp.abs(rest) <= least * size, 0, rest)
 
 
 def _length(
