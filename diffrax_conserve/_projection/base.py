@@ -188,8 +188,9 @@ class AbstractProjection(eqx.Module):
 
 def check_projection(projection: Any) -> None:
     if not isinstance(projection, AbstractProjection):
+        name = getattr(projection, "__name__", "SimplifiedNewton")
         raise TypeError(
-            f"`projection` is {projection!r}, which is not a projection. Pass `SimplifiedNewton()`."
+            f"`projection` is {projection!r}, which is not a projection. Pass `{name}()`."
         )
 
 
