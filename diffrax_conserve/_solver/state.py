@@ -135,12 +135,12 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         ```text
         projections of the accepted steps
           num_projections  18
-          num_iterations   3
+          num_iterations   5
           max_iterations   1
-          residual_before  4.6e-07
-          residual_after   1.9e-07
-          correction       1.0e-06
-          roundoff         3.2e-01
+          residual_before  6.0e-07
+          residual_after   2.4e-07
+          correction       8.9e-07
+          roundoff         0.0e+00
         ```
     """
     check_solution(sol, "statistics")
