@@ -173,6 +173,15 @@ def table(records):
     return "\n".join(lines)
 
 
+def kept(records, case, found, out):
+    """The records with what was found for a case, in the place of what was, also written to `out`."""
+    print(json.dumps(case | found), flush=True)
+    records = [*(r for r in records if not case.items() <= r.items()), case | found]
+    if out is not None:
+        out.write_text(json.dumps(records, indent=1) + "\n")
+    return records
+
+
 def main(argv=None):
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -196,12 +205,8 @@ def main(argv=None):
                     continue
                 for seed in range(options.seeds):
                     case = {"kind": kind, "system": name, "before": before, "seed": seed}
-                    found = case | measure(name, before, seed, options.smoke)
-                    print(json.dumps(found), flush=True)
-                    others = [r for r in records if not case.items() <= r.items()]
-                    records = [*others, found]
-                    if not options.smoke:
-                        OUT.write_text(json.dumps(records, indent=1) + "\n")
+                    found = measure(name, before, seed, options.smoke)
+                    records = kept(records, case, found, None if options.smoke else OUT)
     print(table(records))
     return records
 

@@ -107,11 +107,8 @@ def main(argv=None):
         changes = SETTINGS[setting][1] | ({"epochs": 4} if options.smoke else {})
         for name in list(SYSTEMS)[: 1 if options.smoke else None]:
             case = {"system": name, "setting": setting, "seed": options.seed}
-            found = case | defaults.judged(SYSTEMS[name], data(name), make, changes, options.seed)
-            print(json.dumps(found), flush=True)
-            records = [*(r for r in records if not case.items() <= r.items()), found]
-            if not options.smoke:
-                OUT.write_text(json.dumps(records, indent=1) + "\n")
+            found = defaults.judged(SYSTEMS[name], data(name), make, changes, options.seed)
+            records = defaults.kept(records, case, found, None if options.smoke else OUT)
     print(table(records))
     return records
 
