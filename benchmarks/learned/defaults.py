@@ -174,7 +174,7 @@ def table(records):
 
 
 def kept(records, case, found, out):
-    """The records with what was found for a case, in the place of what was, also written to `out`."""
+    """The records with what was found for a case in the place of what was, written to `out` too."""
     print(json.dumps(case | found), flush=True)
     records = [*(r for r in records if not case.items() <= r.items()), case | found]
     if out is not None:
