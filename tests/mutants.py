@@ -238,7 +238,10 @@ def never_give_up(package):
 
 @noticed_by("tests/laws/test_refused.py", "-k", "near_rest")
 def forget_the_roundoff_that_is_not_in_the_gradient(package):
-    package.function("hidden_terms", lambda _: lambda fn, y: 0 * fn(y))
+    def mutate(measure):
+        return lambda fn, y: (*measure(fn, y)[:2], 0 * fn(y))
+
+    package.function("hidden_terms", mutate)
 
 
 class _Passing(eqx.Module):

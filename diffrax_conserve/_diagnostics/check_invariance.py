@@ -218,7 +218,7 @@ def _relative_sizes(
     slope = ravel(slope_like(y, vector_field(t, y, args)))
     terms = jnp.sum(jnp.abs(jacobian * slope), axis=1) + jnp.abs(partial) + jnp.abs(rate)
     # Forces may cancel inside the field.
-    hidden = hidden_terms(excess, vector)
+    _, _, hidden = hidden_terms(excess, vector)
     terms = jnp.where(hidden > 4 * terms, hidden, terms)
     # An integral that is not finite counts as not conserved, though its derivative may vanish.
     defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)

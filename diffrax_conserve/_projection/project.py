@@ -7,7 +7,6 @@ from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
 from .._tree import ravel
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
-from .equations import equations_of
 from .newton import Newton
 from .options import check_state
 from .roundoff import hidden_scale
@@ -60,9 +59,8 @@ def project(
     check_projection(projection)
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
-    vector = ravel(y)
-    values = ravel(given_values(manifold, value, t, y, args)).astype(vector.dtype)
-    hidden = hidden_scale(equations_of(manifold, values, t, y, args), vector)
+    values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
+    _, _, hidden = hidden_scale(manifold, t, y, args)
     return Target(projection, manifold, values, hidden, args, jnp.asarray(1)).project(t, y)
 
 

@@ -17,19 +17,21 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._tree import tree_stop_gradient
-from .equations import Equations
+from .._custom_types import Args, Manifold, RealScalarLike, Y
+from .._manifold import evaluate
+from .._tree import ravel, tree_stop_gradient, unravel
+from .equations import row_sizes
 from .scalars import walk
 
+# Sums, and sums of products, each of which has an error of its own.
+_SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
+_SUMS_OF_PRODUCTS = frozenset({"dot_general", "conv_general_dilated"})
 # An operation with other operations inside is taken as one function, unless it is looked into.
 _NAMES = """
-add add_any sub reduce_sum cumsum fft
-acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 lgamma log log1p
+acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 fft lgamma log log1p
 logistic pow sin sinh tan tanh
 """
-_COUNTED = frozenset(_NAMES.split())
-# Sums of products, each with an error of its own.
-_PRODUCTS = {"dot_general", "conv_general_dilated"}
+_FUNCTIONS = frozenset(_NAMES.split())
 # What these take from the state is still the state.
 _PART_NAMES = """
 broadcast_in_dim concatenate convert_element_type gather reshape rev slice split squeeze stack
@@ -40,41 +42,45 @@ _PARTS = frozenset(_PART_NAMES.split())
 _CONSTANT, _STATE, _COMPUTED = range(3)
 
 
-def hidden_scale(equations: Equations, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The part of the scales at `y` that the gradients do not show; nothing where they show more,
-    because the terms that they show may be smaller at other states."""
-    equations, y = tree_stop_gradient((equations, y))
-    value, jacobian = equations.linearise(y)
-    hidden = hidden_terms(equations.residual, y)
-    return jnp.where(hidden > jnp.abs(value) + equations.scale(jacobian, y), hidden, 0)
+def hidden_scale(
+    manifold: Manifold, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
+    """The values and the Jacobian of the functions of a manifold at a state, and the part of their
+    scales that the gradients do not show; nothing where they show more, because the terms that they
+    show may be smaller at other states."""
+    manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
+    vector, like = ravel(y), jax.eval_shape(lambda: y)
+
+    def fn(vector: Array) -> Array:
+        return ravel(evaluate(manifold, t, unravel(vector, like), args)).astype(vector.dtype)
+
+    value, jacobian, hidden = hidden_terms(fn, vector)
+    shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * vector[None]), axis=1)
+    return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 
 
 def hidden_terms(
     fn: Callable[[Array], Float[Array, " m"]], y: Float[Array, " n"]
-) -> Float[Array, " m"]:
-    """The roundoff of `fn(y)` in units of roundoff."""
+) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
+    """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff."""
     closed = jax.make_jaxpr(fn)(y)
     like: list[Array] = []
-    out = jax.eval_shape(lambda y: _evaluated(closed, y, lambda x, _: like.append(x) or x), y)
-    if not like:
-        return jnp.zeros(out.shape, out.dtype)
+    jax.eval_shape(lambda y: _evaluated(closed, y, lambda x, _: like.append(x) or x), y)
 
-    def shifted(shifts: list[Array]) -> tuple[Array, list[Array]]:
+    def shifted(y: Array, shifts: list[Array]) -> tuple[Array, list[Array]]:
         given, sizes = iter(shifts), []
         return _evaluated(closed, y, lambda x, s: sizes.append(s) or x + next(given)), sizes
 
     zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
-    value, vjp, sizes = jax.vjp(shifted, zeros, has_aux=True)
-    (adjoints,) = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
+    value, vjp, sizes = jax.vjp(shifted, y, zeros, has_aux=True)
+    jacobian, adjoints = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
     pairs = zip(adjoints, sizes, strict=True)
     terms = [jnp.abs(v * s[None]).reshape(value.size, -1) for v, s in pairs]
-    terms = jnp.concatenate(terms, axis=1)
-    terms = jnp.where(jnp.isfinite(terms), terms, 0).astype(value.dtype)
+    terms = [jnp.where(jnp.isfinite(x), x, 0).astype(value.dtype) for x in terms]
     # Squares of small energies underflow in float32.
-    largest = jnp.max(terms, axis=1, keepdims=True)
-    unit = terms / jnp.where(largest > 0, largest, 1)
-    total = largest[:, 0] * jnp.sqrt(jnp.sum(unit**2, axis=1))
-    return jnp.where(jnp.isfinite(total), total, 0)
+    unit = row_sizes(jnp.concatenate([jnp.zeros_like(jacobian), *terms], axis=1))
+    squares = sum(jnp.sum((x / unit[:, None]) ** 2, axis=1) for x in terms)
+    return value, jacobian, unit * jnp.sqrt(squares)
 
 
 # A value, and how it depends on the state.
@@ -110,9 +116,13 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if name == "scan":
         return [(x, kind) for x in _scanned(changed, params, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
-    if name in _PRODUCTS and kind and _is_inexact(*inputs):
-        return [(changed(evaluate(*inputs), evaluate(*map(jnp.abs, inputs))), _COMPUTED)]
-    if name in _COUNTED or list(jex.jaxprs_in_params(params)):
+    products = name in _SUMS_OF_PRODUCTS
+    computed = any(of == _COMPUTED for _, of in given)
+    if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
+        sizes = [jnp.abs(x) * (products or of == _COMPUTED) for x, of in given]
+        size = sum(sizes) if name == "sub" else evaluate(*sizes)
+        return [(changed(evaluate(*inputs), size), _COMPUTED)]
+    if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):
         inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
     outs = evaluate(*inputs)
     return [(x, kind) for x in (outs if eqn.primitive.multiple_results else [outs])]

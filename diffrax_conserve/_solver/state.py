@@ -16,9 +16,8 @@ from .._manifold import Constraint, is_entry
 from .._options import check_solution
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
-from .._projection.equations import equations_of
 from .._projection.roundoff import hidden_scale
-from .._tree import ravel, tree_size, tree_stop_gradient
+from .._tree import ravel, tree_size
 from .diffrax_private import register
 
 _SMALLER = (
@@ -191,19 +190,15 @@ def started(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """The conserved values, NaN for a `Constraint` that the initial state violates, and the part of
     their scales that the gradients do not show."""
-    vector = ravel(y)
-    numbers = ravel(values).astype(vector.dtype)
-    equations = equations_of(manifold, numbers, t, y, args)
-    equations, vector = tree_stop_gradient((equations, vector))
-    hidden = hidden_scale(equations, vector)
+    g, jacobian, hidden = hidden_scale(manifold, t, y, args)
+    numbers = ravel(values).astype(g.dtype)
     entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
     sizes = [tree_size(part) for part in treedef.flatten_up_to(values)]
     must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], sizes)
     if must_hold.any():
-        g, jacobian = equations.linearise(vector)
         # A constraint on a component that is zero up to roundoff has a scale too.
-        terms = jnp.sum(jnp.abs(jacobian), axis=1) * jnp.max(jnp.abs(vector), initial=0)
-        limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (equations.magnitude + hidden + terms)
+        terms = jnp.sum(jnp.abs(jacobian), axis=1) * jnp.max(jnp.abs(ravel(y)), initial=0)
+        limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (hidden + terms)
         numbers = jnp.where(must_hold & ~(jnp.abs(g) <= limit), jnp.nan, numbers)
     return numbers, hidden
 
