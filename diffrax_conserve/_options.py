@@ -1,6 +1,8 @@
 """Checks of the numbers and functions that a user passes."""
 
+import contextlib
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax as dfx
@@ -73,6 +75,20 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
         signature.bind(*call.split(", "))
     except TypeError as error:
         raise TypeError(f"{name} has the parameters `{signature}`. {remedy}") from error
+
+
+@contextlib.contextmanager
+def one_of(states: Any) -> Iterator[None]:
+    """Tells with an error of a function what it was called with: one of `states`."""
+    try:
+        yield
+    except Exception as error:
+        one = jtu.tree_map(lambda x: jnp.asarray(x)[0], states)
+        error.add_note(f"Here a state is {eqx.tree_pformat(one)}. {ONE_STATE}")
+        raise
+
+
+ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
 
 
 def check_solution(sol: Any, user: str) -> None:

@@ -27,6 +27,7 @@ from .._manifold import (
     rate_of,
     slope_like,
 )
+from .._options import ONE_STATE, one_of
 from .._printing import printed
 from .._projection.equations import equations_of, relative
 from .._projection.roundoff import hidden_terms
@@ -142,23 +143,13 @@ def check_invariance(
     ts, ys = _batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
-    try:
+    with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
-    except (IndexError, TypeError) as error:
-        if any(x.ndim > 1 for x in jtu.tree_leaves(ys)):
-            raise
-        raise ValueError(
-            "`vector_field` or a function of `manifold` cannot be called with one of the `states`, "
-            "which are numbers. " + _ONE_STATE
-        ) from error
     entries = [
         _verdict(name, entry, rtol, *map(np.asarray, measured))
         for (name, entry), measured in zip(_entries(manifold), found, strict=True)
     ]
     return InvarianceReport(tuple(entries), ts.size, rtol)
-
-
-_ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
 
 
 def _batch(
@@ -172,7 +163,7 @@ def _batch(
     if len(sizes) != 1 or sizes & {(), (0,)} or not all(map(eqx.is_inexact_array, leaves)):
         raise ValueError(
             "`states` must be a sampler `key -> y`, or floating-point arrays with the same leading "
-            f"axis over the states, but it is {eqx.tree_pformat(states)}. " + _ONE_STATE
+            f"axis over the states, but it is {eqx.tree_pformat(states)}. " + ONE_STATE
         )
     (shape,) = sizes
     t = jnp.asarray(t, jnp.finfo(jnp.result_type(*leaves)).dtype)

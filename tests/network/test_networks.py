@@ -79,6 +79,7 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: flow_map(core="gated"), TypeError, "`core` is 'gated', but it must be"),
         (lambda: flow_map()(jnp.ones(4), 0.1), ValueError, "of 3 numbers, not 4"),
         (lambda: dfc.DeepONet((EAST, LORENZ.y0), 1.0, key=KEY), ValueError, "leading axis"),
+        (lambda: dfc.DeepONet(LORENZ.sample, 1.0, key=KEY), TypeError, "Draw states from it"),
         (lambda: dfc.PINN(jnp.array([1j]), 0.0, 1.0, key=KEY), TypeError, "complex"),
         (lambda: dfc.learned.Taylor(LORENZ.vector_field, 0), ValueError, "`order` must be a posit"),
     ],

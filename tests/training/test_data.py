@@ -75,6 +75,8 @@ def test_trajectories_are_solutions():
     np.testing.assert_allclose(ys, [1 / (1 / 0.5 - np.array([0.0, 0.5, 1.0]))], rtol=1e-6)
     with pytest.raises(ValueError, match="every solve failed"):
         solve([2.0, 3.0])
+    with pytest.raises(IndexError, match=r"Here a state is f64\[\]. For one state"):
+        dfc.learned.reachable_states(lambda t, y, args: y[::-1], EAST, 1.0, key=KEY)
 
 
 @pytest.mark.parametrize(

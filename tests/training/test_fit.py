@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -128,6 +129,7 @@ def test_the_losses():
 
 
 RECIPE, WITHOUT_WEIGHTS, SINGLE = dfc.learned.Recipe, Still(), in_single(flow_map())
+TERM, ONE_STATE = dfx.ODETerm(LORENZ.vector_field), dfc.DeepONet(LORENZ.y0, 0.1, key=jr.key(0))
 NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_field)
 
 
@@ -136,6 +138,8 @@ NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_fi
     [
         (lambda: refuse(sample=LORENZ.sample), ValueError, "leave `sample` and"),
         (lambda: refuse(NO_DOMAIN, **TAYLOR), ValueError, "pass `sample`"),
+        (lambda: refuse(vector_field=TERM), TypeError, "pass its `vector_field`"),
+        (lambda: refuse(ONE_STATE, **TAYLOR), TypeError, r"Here a state is f64\[\]. For one state"),
         (lambda: refuse(LAYER), TypeError, "max_step"),
         (lambda: refuse(WITHOUT_WEIGHTS, sample=LORENZ.sample), ValueError, "no weights of its"),
         (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),

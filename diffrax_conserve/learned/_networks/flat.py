@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Float, PyTree, Real, Shaped
 
 from ..._custom_types import Y
+from ..._options import ONE_STATE
 
 
 def working_dtype(y: Y) -> jnp.dtype:
@@ -50,13 +51,18 @@ def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]
 
 def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`as_state` of states that are stacked along a leading axis; raises unless they are."""
+    if callable(states):
+        raise TypeError(
+            "`states` is a function. Draw states from it: "
+            "`jax.vmap(states)(jax.random.split(key, 1000))`."
+        )
     states = as_state(states)
     shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
     lengths = {shape[:1] for shape in shapes}
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(
             "`states` must be one state or more, stacked along a leading axis, but the leaves have "
-            f"shapes {shapes}. For a single one write `jax.tree.map(lambda x: x[None], y0)`."
+            f"shapes {shapes}. " + ONE_STATE
         )
     return states
 

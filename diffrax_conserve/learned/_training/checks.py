@@ -12,8 +12,8 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
-from ..._manifold import check_manifold
-from ..._options import check_number, is_real
+from ..._manifold import check_manifold, check_vector_field
+from ..._options import check_number, is_real, one_of
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
@@ -53,6 +53,8 @@ def checked(
     """The flow map, or the first window of a PINN, and the problem; raises unless they fit."""
     if vector_field is None and data is None:
         raise TypeError("`fit` needs a `vector_field`, or for a flow map `data`.")
+    if vector_field is not None:
+        check_vector_field(vector_field)
     if manifold is not None:
         check_manifold(manifold)
         refuse_rates(manifold, "a training")
@@ -147,7 +149,8 @@ def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
     """Raises unless the field fits the states, is finite, and for a flow map is autonomous."""
     starts = network.starts(problem.draw(network, key))
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
-    check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
+    with one_of(starts.y0s):
+        check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
     now = np.asarray(_rates(problem, starts.ts, starts.y0s))
     wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
     if wrong.size:

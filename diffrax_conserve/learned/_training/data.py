@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import Args, RealScalarLike, Y
+from ..._manifold import check_vector_field
+from ..._options import one_of
 from ..._tree import tree_all_finite
 from .._networks.flat import as_states
 from .._networks.flow_map import AbstractFlowMap
@@ -63,7 +65,7 @@ def reachable_states(
         states = dfc.learned.reachable_states(system.vector_field, y0s, 5.0, key=key)
         ```
     """
-    count = jtu.tree_leaves(y0s)[0].shape[0]
+    count = jtu.tree_leaves(as_states(y0s))[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
     _, ys = trajectories(
         vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6, atol=1e-6
@@ -112,7 +114,8 @@ def trajectories(
         data = dfc.learned.trajectories(system.vector_field, y0s, jnp.linspace(0.0, 2.0, 21))
         ```
     """
-    count = jtu.tree_leaves(y0s)[0].shape[0]
+    check_vector_field(vector_field)
+    count = jtu.tree_leaves(as_states(y0s))[0].shape[0]
     times = jnp.asarray(ts, float)
     times = jnp.broadcast_to(times, (count, times.shape[-1]))
     if atol is None:
@@ -129,7 +132,8 @@ def trajectories(
         )  # fmt: skip
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)
+    with one_of(y0s):
+        ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)
     return _the_good((times, ys), good)
 
 
