@@ -68,13 +68,11 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
     if not callable(fn):
         raise TypeError(f"{name} is {fn!r}, which is not callable. {remedy}")
     try:
-        signature = inspect.signature(fn)
-    except ValueError:  # as for some builtins
-        return
-    try:
-        signature.bind(*call.split(", "))
+        inspect.signature(fn).bind(*call.split(", "))
     except TypeError as error:
-        raise TypeError(f"{name} has the parameters `{signature}`. {remedy}") from error
+        raise TypeError(f"{name} has the parameters {inspect.signature(fn)}. {remedy}") from error
+    except ValueError:  # some builtins have no signature
+        pass
 
 
 @contextlib.contextmanager

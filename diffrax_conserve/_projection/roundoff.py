@@ -1,11 +1,11 @@
 """The roundoff of a function, which its gradient does not show.
 
 In `1 - cos(q)` near zero the terms are about one and the gradient is about zero; in a network the
-terms of the hidden layers cancel. Each operand `v` of an operation has an error of about half a
-unit in the last place. With the adjoint `v̄` it changes the value by `v̄ v` units of roundoff, and
-as errors are independent, all together by the root of the sum of squares. A product passes relative
-errors on, so operands of sums and functions count. What does not depend on the state has the same
-error at each evaluation, which is none here; the error of the state itself is in the gradient.
+terms of the hidden layers cancel. The error of a sum is about one unit of roundoff of the sizes of
+its terms, that of the operand of a function one of its own size. Times their adjoints, and as they
+are independent, they add up to the root of the sum of squares. A product passes relative errors on.
+What does not depend on the state has the same error at each evaluation, which is none here; the
+error of the state itself is in the gradient.
 """
 
 import functools as ft
@@ -40,14 +40,12 @@ transpose unstack
 _PARTS = frozenset(_PART_NAMES.split())
 # How a value depends on the state: not at all, as a part of it, or as computed from it.
 _CONSTANT, _STATE, _COMPUTED = range(3)
+_Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
 
 
-def hidden_scale(
-    manifold: Manifold, t: RealScalarLike, y: Y, args: Args
-) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
-    """The values and the Jacobian of the functions of a manifold at a state, and the part of their
-    scales that the gradients do not show; nothing where they show more, because the terms that they
-    show may be smaller at other states."""
+def hidden_scale(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> _Measured:
+    """Values and Jacobian of the functions of a manifold, and the part of their scales that the
+    gradients do not show: nothing where they show more, because elsewhere they may show less."""
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector, like = ravel(y), jax.eval_shape(lambda: y)
 
@@ -59,17 +57,16 @@ def hidden_scale(
     return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 
 
-def hidden_terms(
-    fn: Callable[[Array], Float[Array, " m"]], y: Float[Array, " n"]
-) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
+def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
     """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff."""
     closed = jax.make_jaxpr(fn)(y)
     like: list[Array] = []
-    jax.eval_shape(lambda y: _evaluated(closed, y, lambda x, _: like.append(x) or x), y)
+    evaluate = lambda y, changed: _inside(closed, [(y, _STATE)], changed)[0][0]  # noqa: E731
+    jax.eval_shape(lambda y: evaluate(y, lambda x, _: like.append(x) or x), y)
 
     def shifted(y: Array, shifts: list[Array]) -> tuple[Array, list[Array]]:
         given, sizes = iter(shifts), []
-        return _evaluated(closed, y, lambda x, s: sizes.append(s) or x + next(given)), sizes
+        return evaluate(y, lambda x, size: sizes.append(size) or x + next(given)), sizes
 
     zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
     value, vjp, sizes = jax.vjp(shifted, y, zeros, has_aux=True)
@@ -87,27 +84,22 @@ def hidden_terms(
 _Pair = tuple[Any, int]
 
 
-def _constant(x: Any) -> _Pair:
-    return x, _CONSTANT
-
-
-def _evaluated(closed: Any, y: Array, changed: Callable[[Any, Any], Any]) -> Array:
-    """The value of a jaxpr whose operands are `changed(x, size)` where they depend on `y`."""
-    return walk(closed, [(y, _STATE)], _constant, ft.partial(_equation, changed))[0][0]
+def _inside(closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]) -> list[_Pair]:
+    """The values of a jaxpr in which `changed(x, size)` takes the place of an `x` with an error."""
+    return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, changed))
 
 
 def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
     name, params = eqn.primitive.name, eqn.params
     inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
     kind = _COMPUTED if kind == _STATE and name not in _PARTS else kind
-    inside = ft.partial(walk, constant=_constant, equation=ft.partial(_equation, changed))
     inner = params.get("call_jaxpr")
     if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
-        return inside(inner, given)
+        return _inside(inner, given, changed)
     if name in ("checkpoint", "remat2"):
-        return inside(jex.ClosedJaxpr(params["jaxpr"], ()), given)
+        return _inside(jex.ClosedJaxpr(params["jaxpr"], ()), given, changed)
     if name == "cond":
-        branches = [inside(branch, given[1:]) for branch in params["branches"]]
+        branches = [_inside(branch, given[1:], changed) for branch in params["branches"]]
         which = jnp.clip(inputs[0].astype(int), 0, len(branches) - 1)
         return [
             (jnp.stack([x for x, _ in outs])[which], max(kind for _, kind in outs))
@@ -146,8 +138,7 @@ def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any])
                 return x if given is None else x + next(given)
 
             values = [(x, _COMPUTED) for x in (*consts, *carry, *x[0])]
-            outs = walk(params["jaxpr"], values, _constant, ft.partial(_equation, shifted))
-            outs = [x for x, _ in outs]
+            outs = [x for x, _ in _inside(params["jaxpr"], values, shifted)]
             return outs[: last - first], (outs[last - first :], sizes)
 
         return jax.lax.scan(body, init, (xs, shifts), params["length"], params["reverse"])
