@@ -77,9 +77,9 @@ class Equations(eqx.Module):
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> Int[Array, ""]:
-        """0 if `y` is off the manifold; 1 if it is on it; 2 if all residuals are so small, within
-        an eighth of the tolerance, that only chance could reduce them. A residual within a
-        tolerance that underflows says nothing."""
+        """-1 if a residual is not finite; 0 if `y` is off the manifold; 1 if it is on it; 2 if all
+        residuals are so small, within an eighth of the tolerance, that only chance could reduce
+        them. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
@@ -87,8 +87,9 @@ class Equations(eqx.Module):
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         reached = jnp.where(jnp.abs(g) <= 0.125 * limit, jnp.int8(2), jnp.int8(1))
+        missed = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(0), jnp.int8(-1))
         # Not by a maximum of residuals, which can lose NaN on a CPU.
-        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, jnp.int8(0)))
+        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, missed))
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""

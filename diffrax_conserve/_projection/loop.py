@@ -127,6 +127,8 @@ def _solve(
         # Within the tolerance at most two more.
         now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
         now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
+        # NaN stays NaN, in the state after one more.
+        now = jnp.where((level < 0) & ~second, jnp.minimum(now, 1), now)
         return jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
 
     def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:

@@ -111,7 +111,8 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     products = name in _SUMS_OF_PRODUCTS
     computed = any(of == _COMPUTED for _, of in given)
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
-        sizes = [jnp.abs(x) * (products or of == _COMPUTED) for x, of in given]
+        counted = (x if products or of == _COMPUTED else jnp.zeros_like(x) for x, of in given)
+        sizes = [jnp.abs(x) for x in counted]
         size = sum(sizes) if name == "sub" else evaluate(*sizes)
         return [(changed(evaluate(*inputs), size), _COMPUTED)]
     if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):

@@ -202,6 +202,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         y1, info = target.project_if(due, t1, candidate, step)
         states, limit = (y0, candidate, y1), self._limit(terms)
         failed, hopeless = verdict(info.ok, state, (t0, t1), states, limit)
+        # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
+        y1 = jtu.tree_map(lambda y: jnp.where(info.ok, y, jnp.nan), y1)
         dense_info = dict(
             inner=dense_info,
             ends=(y0, y1),

@@ -47,6 +47,24 @@ def test_a_pendulum_near_rest_is_solved(dtype, fixed):
     assert np.all(done), (np.mean(done), amplitude[~np.asarray(done)][:5])
 
 
+@pytest.mark.parametrize("centre", [0.0, 1.0, -30.0])
+def test_a_small_vibration_far_from_the_origin_is_solved(centre):
+    """Its steps, which at first are much too long, are short beside the state."""
+    rng = np.random.default_rng(5)
+    amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-4.5, 0, 200)
+    y0 = np.stack([centre + amplitude, 0 * amplitude], axis=1)
+    done = okay(
+        lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)]),
+        lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2,
+        dfx.Tsit5(),
+        dfx.PIDController(rtol=1e-3, atol=1e-6),
+        y0,
+        jnp.zeros(200),
+        jnp.asarray([10.0, 0.01]),
+    )
+    assert np.all(done), amplitude[~np.asarray(done)][:5]
+
+
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
 # mass in electron masses.
 MOLECULES = {

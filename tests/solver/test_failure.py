@@ -104,6 +104,19 @@ def test_an_adaptive_solve_without_hope_ends(after):
     assert sol.stats["num_steps"] <= plain.stats["num_steps"] + 40
 
 
+def test_what_failed_is_nan_and_takes_no_iterations():
+    """In a batch a lane that ended is evaluated until the last one ends."""
+    sol = run(OUT_OF_REACH, throw=False)
+    assert NOT_REACHED in dfx.RESULTS[sol.result]
+    assert np.all(np.isnan(sol.ys[-1]))
+    for projection in (dfc.SimplifiedNewton(), dfc.Newton()):
+        unit = dfc.FirstIntegral(square, value=1.0)
+        y, info = dfc.project(unit, jnp.array([jnp.nan, 1.0]), projection=projection)
+        assert not info.ok
+        assert np.isnan(y[0])
+        assert info.num_steps <= 3, info
+
+
 @pytest.mark.parametrize(("late", "dtype"), [(1e13, jnp.float64), (2e4, jnp.float32)])
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
