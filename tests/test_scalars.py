@@ -72,6 +72,16 @@ def test_a_batch_keeps_the_function(name):
     np.testing.assert_allclose(found[2], alone, rtol=1e-12)
 
 
+def test_zero_times_nan_is_nan_in_a_batch_too():
+    """So that no lane conserves a function that has no value."""
+    integral = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2) + 0 * jnp.sqrt(y[0]), value=1.0)
+    project = lambda y: dfc.project(integral, y, projection=dfc.SimplifiedNewton())[1].ok  # noqa: E731
+    np.testing.assert_array_equal(
+        jax.jit(jax.vmap(project))(jnp.array([[0.6, 0.8], [-0.6, 0.8], [-0.6, 0.79]])),
+        [True, False, False],
+    )
+
+
 # ---- What `print` shows of the records of the package ----
 
 

@@ -120,7 +120,9 @@ def contestants(network, smoke):
 
 def untrained(states):
     boxcox = dfc.learned.BoxCox(0.125)
-    inner = dfc.DeepONet(boxcox(states), STEP, width=8, depth=1, key=jr.key(0))
+    inner = dfc.DeepONet(
+        boxcox(states), STEP, width=8, depth=1, core=dfc.learned.Concatenated, key=jr.key(0)
+    )
     return dfc.learned.Transformed(inner, boxcox)
 
 

@@ -163,27 +163,9 @@ def _once(fn: Callable[[Array], Array], x: Array) -> Array:
     return fn(x) / (lax.stop_gradient(x) * 0 + 1)
 
 
-def _product(x: Any, y: Any) -> Any:
-    """Without the products by 0 and 1 that the gradients of several functions consist of."""
-    for a, b in ((x, y), (y, x)):
-        if isinstance(a, np.generic) and a in (0, 1):
-            return a if a == 0 else b
-    return lax.mul(x, y)
-
-
-def _sum(x: Any, y: Any) -> Any:
-    for a, b in ((x, y), (y, x)):
-        if isinstance(a, np.generic) and a == 0:
-            return b
-    return lax.add(x, y)
-
-
 _INSTEAD: dict[str, Callable[..., Any]] = {
     "sin": ft.partial(_once, lax.sin),
     "cos": ft.partial(_once, lax.cos),
-    "mul": _product,
-    "add": _sum,
-    "add_any": _sum,
 }
 
 
@@ -245,7 +227,6 @@ class _WriteOut:
     def _reduce(
         self, fn: Callable[[Array, Array], Array], places: _Places, axes: tuple[int, ...]
     ) -> _Places:
-        fn = _sum if fn is lax.add else fn
         self._count(places.size)
         places = np.moveaxis(places, axes, range(-len(axes), 0))
         shape = places.shape[: places.ndim - len(axes)]
@@ -265,7 +246,7 @@ class _WriteOut:
         middle = first + free[0]
         a = a.reshape(*a.shape[:middle], *[1] * free[1], *a.shape[middle:])
         b = b.reshape(*b.shape[:first], *[1] * free[0], *b.shape[first:])
-        product = self._elementwise(_product, [a, b])
+        product = self._elementwise(lax.mul, [a, b])
         return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
 
     def _pad(self, places: _Places, value: _Places, config: Any) -> _Places:

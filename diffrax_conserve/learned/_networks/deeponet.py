@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import unflatten
-from .cores import AbstractCore, Activation, Concatenated, Sizes, check_sizes, find_activation
+from .cores import AbstractCore, Activation, Gated, Sizes, check_sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import as_states, flatten, stacked_vectors, working_dtype
 from .flow_map import AbstractFlowMap, checked_args, checked_box
@@ -66,10 +66,10 @@ class DeepONet(AbstractFlowMap):
         max_step: RealScalarLike,
         *,
         key: PRNGKeyArray,
-        width: int = 32,
-        depth: int = 2,
+        width: int = 20,
+        depth: int = 3,
         latent: int = 20,
-        core: type[AbstractCore] = Concatenated,
+        core: type[AbstractCore] = Gated,
         activation: str | Activation = "tanh",
         taylor: Taylor | None = None,
         frame: MakeFrame | None = None,
@@ -89,7 +89,7 @@ class DeepONet(AbstractFlowMap):
             )
         if not (isinstance(core, type) and issubclass(core, AbstractCore)):
             raise TypeError(
-                f"`core` is {core!r}, but it must be `learned.Concatenated`, `Gated` or `Product`."
+                f"`core` is {core!r}, but it must be `learned.Gated`, `Concatenated` or `Product`."
             )
         if not max_step > 0:
             raise ValueError(f"`max_step` must be positive, but is {max_step}.")
@@ -191,9 +191,10 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `core`: one network of the state and the step, [`diffrax_conserve.learned.Concatenated`][]; or
-    [`diffrax_conserve.learned.Gated`][], which feeds the input into each layer; or as in the
-    literature, and less accurate at the same size, [`diffrax_conserve.learned.Product`][].
+- `core`: one network of the state and the step that feeds both into each layer,
+    [`diffrax_conserve.learned.Gated`][]; or only into the first, less accurate and faster,
+    [`diffrax_conserve.learned.Concatenated`][]; or as in the literature, and least accurate at the
+    same size, [`diffrax_conserve.learned.Product`][].
 - `latent`: only of a `Product`, the number $L$ of products in each component.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
