@@ -113,7 +113,7 @@ def trained(field=LORENZ.vector_field, **options):
 
 def test_a_flow_map_gets_the_slope_of_the_field():
     network = trained()
-    assert isinstance(network.core, dfc.learned.Concatenated)
+    assert isinstance(network.core, dfc.learned.Gated)
     y = states(1)[0]
     slope = LORENZ.vector_field(0.0, y, None)
     np.testing.assert_allclose(network.slope(y), slope, rtol=1e-12)
