@@ -70,7 +70,8 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
     try:
         inspect.signature(fn).bind(*call.split(", "))
     except TypeError as error:
-        raise TypeError(f"{name} has the parameters {inspect.signature(fn)}. {remedy}") from error
+        given = inspect.signature(fn)
+        raise TypeError(f"{name} has the parameters `{given}`. {remedy}") from error
     except ValueError:  # some builtins have no signature
         pass
 
