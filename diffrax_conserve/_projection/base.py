@@ -58,8 +58,8 @@ class ProjectionInfo(eqx.Module):
     - `correction`: the Euclidean norm of the projected state minus the candidate.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
-    - `worst`: after a failure the position of the entry with the largest relative residual (before
-        or after, the smaller), as [`diffrax_conserve.entry_name`][] takes it; otherwise 0.
+    - `worst`: the position of the entry with the largest relative residual (before or after, the
+        smaller), as [`diffrax_conserve.entry_name`][] takes it; it tells the cause of a failure.
     """
 
     ok: Bool[Array, ""]
@@ -160,7 +160,7 @@ class Problem(eqx.Module):
             residual_after=after,
             correction=jnp.linalg.norm(y - candidate),
             roundoff=jnp.max(relative(equations.hidden, scale)),
-            worst=jnp.where(success, 0, entry[jnp.argmax(least)]),
+            worst=entry[jnp.argmax(least)],
         )
 
 

@@ -1,7 +1,13 @@
 """`project`, and the checks of what is projected."""
 
+import dataclasses
+
+import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
@@ -60,8 +66,36 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    _, _, hidden = hidden_scale(manifold, t, y, args)
-    return Target(projection, manifold, values, hidden, args, jnp.asarray(1)).project(t, y)
+    return _projected(projection, manifold, values, t, y, args)
+
+
+@eqx.filter_jit
+def _projected(
+    projection: AbstractProjection,
+    manifold: Manifold,
+    values: Float[Array, " m"],
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+) -> tuple[Y, ProjectionInfo]:
+    """Projects twice, because the roundoff that counts is that at the result: at first with that at
+    the candidate, then with that at the first result. Where it has shrunk again, success by the
+    larger one is none."""
+
+    def projected(hidden: Array, _: None) -> tuple[Array, tuple[Y, ProjectionInfo]]:
+        target = Target(projection, manifold, values, hidden, args, jnp.asarray(1))
+        y, info = target.project(t, candidate)
+        value, jacobian, found = hidden_scale(manifold, t, y, args)
+        shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * ravel(y)[None]), axis=1)
+        ok = info.ok & jnp.all(hidden <= 2 * (shown + found))
+        missed = optx.RESULTS.nonlinear_max_steps_reached
+        result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)
+        return found, (y, dataclasses.replace(info, ok=ok, result=result))
+
+    # A loop, so that the projection is compiled once.
+    _, _, hidden = hidden_scale(manifold, t, candidate, args)
+    _, results = lax.scan(projected, hidden, length=2)
+    return jtu.tree_map(lambda x: x[-1], results)
 
 
 def given_values(
