@@ -256,15 +256,7 @@ def conserved_values(
         raise ValueError(
             f"`manifold` has {count} scalar constraints for {unknowns} unknowns. Remove some."
         )
-    if count > _CONSTRAINTS_MAX:
-        raise ValueError(
-            f"`manifold` has {count} scalar constraints, but a projection can solve for at most "
-            f"{_CONSTRAINTS_MAX}. Project parts of the state by solves of their own."
-        )
     return treedef.unflatten(found)
-
-
-_CONSTRAINTS_MAX = 2048
 
 
 def _check_output(

@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
@@ -66,25 +66,19 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    return _projected(projection, manifold, values, t, y, args)
+    target = Target(projection, manifold, values, jnp.zeros_like(values), args, jnp.asarray(1))
+    return _projected(target, t, y)
 
 
 @eqx.filter_jit
-def _projected(
-    projection: AbstractProjection,
-    manifold: Manifold,
-    values: Float[Array, " m"],
-    t: RealScalarLike,
-    candidate: Y,
-    args: Args,
-) -> tuple[Y, ProjectionInfo]:
+def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
     """Projects twice, because the roundoff that counts is that at the result: at first with that at
     the candidate, then with that at the first result. Where it has shrunk again, success by the
     larger one is none."""
+    manifold, args = target.manifold, target.args
 
     def projected(hidden: Array, _: None) -> tuple[Array, tuple[Y, ProjectionInfo]]:
-        target = Target(projection, manifold, values, hidden, args, jnp.asarray(1))
-        y, info = target.project(t, candidate)
+        y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
         value, jacobian, found = hidden_scale(manifold, t, y, args)
         shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * ravel(y)[None]), axis=1)
         ok = info.ok & jnp.all(hidden <= 2 * (shown + found))

@@ -21,6 +21,10 @@ from .state import FIRST, ProjectionStatistics, State, started, verdict
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 
 
+def _of_innermost(name: str) -> Any:
+    return property(lambda self: getattr(innermost(self.solver), name))
+
+
 @final
 class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     r"""Projects every step of another solver to a manifold.
@@ -48,8 +52,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve tries a smaller step, until the candidate is very close to the last state;
-    then it ends. A solve with fixed steps ends at once. The `diffrax.RESULTS` tells the cause, and
-    [`diffrax_conserve.statistics`][] the entry of the manifold.
+    then it ends. A solve with fixed steps ends at once. The last state is NaN; the
+    `diffrax.RESULTS` tells the cause, [`diffrax_conserve.statistics`][] the entry of the manifold.
 
     !!! example
 
@@ -99,27 +103,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             )
 
     # diffrax forwards `isinstance` to the innermost solver, then reads these attributes of the
-    # wrapper. They are `Any` because `equinox.tree_at` replaces values by placeholders.
-
-    @property
-    def term_structure(self) -> Any:  # pyright: ignore
-        return self.solver.term_structure
-
-    @property
-    def term_compatible_contr_kwargs(self) -> Any:  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def root_finder(self) -> Any:
-        return innermost(self.solver).root_finder  # pyright: ignore
-
-    @property
-    def root_find_max_steps(self) -> Any:
-        return innermost(self.solver).root_find_max_steps  # pyright: ignore
-
-    @property
-    def scan_kind(self) -> Any:
-        return innermost(self.solver).scan_kind  # pyright: ignore
+    # wrapper.
+    term_structure = _of_innermost("term_structure")
+    term_compatible_contr_kwargs = _of_innermost("term_compatible_contr_kwargs")
+    root_finder = _of_innermost("root_finder")
+    root_find_max_steps = _of_innermost("root_find_max_steps")
+    scan_kind = _of_innermost("scan_kind")
 
     @property
     def interpolation_cls(self) -> MakeManifoldInterpolation:  # pyright: ignore

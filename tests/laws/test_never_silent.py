@@ -79,6 +79,39 @@ def test_success_means_on_the_manifold_at_the_state_that_is_returned(
     assert np.all(np.abs(values - value) <= 64 * numbers.eps * size + numbers.tiny)
 
 
+def powers(t, y, args):
+    """Its roundoff is that of the exponent, thousands of times as large far away."""
+    return jnp.exp(args[0] * jnp.log(y[0] ** 2)) + args[1] * y[1] ** 2
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, 0, 0, 0))
+def to_powers(projection, y, value, args):
+    y, info = dfc.project(
+        dfc.FirstIntegral(powers), y, value=value, args=args, projection=projection
+    )
+    return y, info.ok
+
+
+@pytest.mark.parametrize("name", ["simplified", "newton"])
+def test_the_roundoff_that_counts_is_that_at_the_result(name):
+    rng = np.random.default_rng(5)
+    start = np.exp(rng.uniform(-1.6, 1.4, (2, 2000)))
+    args = np.exp(rng.uniform([[-1.6], [-7.0]], [[2.0], [7.0]], (2, 2000)))
+    value = np.exp(args[0] * np.log(start[0] ** 2)) + args[1] * start[1] ** 2
+    candidate = start + 10 ** rng.uniform(-6, 5, 2000) * rng.normal(size=start.shape)
+    given = (x.astype(np.float32) for x in (candidate.T, value, args.T))
+    y, ok = map(np.asarray, to_powers(PROJECTIONS[name], *given))
+    x, v, (a, b), size = (np.asarray(z, np.longdouble) for z in (y.T, value, args, np.abs(y.T)))
+    with np.errstate(all="ignore"):
+        first, second = np.exp(a * np.log(x[0] ** 2)), b * x[1] ** 2
+        exponent = np.abs(a * np.log(size[0] ** 2))
+        scale = np.abs(v) + (2 * a + exponent) * first + 2 * second
+        off = np.abs(first + second - v) / scale / np.finfo(np.float32).eps
+    assert ok.sum() > 1000
+    assert np.all(off[ok] <= 64), (np.max(off[ok]), np.sum(off[ok] > 64))
+
+
 @pytest.mark.parametrize("factor", [5.97e24, 1e-27])
 @given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0.5, 2))
 def test_units_do_not_matter_in_single_precision(factor, displacement, size):
