@@ -114,7 +114,7 @@ def do_not_project_the_interpolant(package):
     package.method("ManifoldInterpolation.evaluate", lambda _: evaluate)
 
 
-@noticed_by("tests/projection/test_laws.py", "-k", "nan")
+@noticed_by("tests/solver/test_failure.py", "-k", "without_hope")
 def call_nan_a_success(package):
     def mutate(verdict):
         return lambda self, *values: verdict(
