@@ -237,13 +237,14 @@ def solve_factored(factors: Factors, b: Float[Array, " m"]) -> Float[Array, " m"
     return x.astype(b.dtype) * right
 
 
-def row_sizes(rows: Float[Array, "m n"]) -> Float[Array, " m"]:
-    """The largest element of each row, or one if all are zero. In float64 one, because products of
-    elements neither overflow nor underflow in usual units."""
+def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    """The largest element of each row, or one if all are zero, and the rows divided by it. In
+    float64 one: products of elements neither overflow nor underflow in usual units."""
     if rows.dtype == jnp.float64:
-        return jnp.ones(len(rows))
+        return jnp.ones(len(rows)), rows
     sizes = jnp.max(jnp.abs(rows), axis=1)
-    return jnp.where(sizes > 0, sizes, 1)
+    sizes = jnp.where(sizes > 0, sizes, 1)
+    return sizes, rows / sizes[:, None]
 
 
 def _scaled(gram: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Array, Array]:

@@ -28,7 +28,7 @@ from .equations import (
     gram_matrix,
     gram_solve,
     relative,
-    row_sizes,
+    scaled_rows,
     solve_factored,
 )
 from .scalars import components, in_scalars, joined
@@ -103,15 +103,14 @@ def _solve(
 ) -> Solved:
     def start(y: Any) -> tuple[_Kept, _Seen | None]:
         if directions is not None:
-            return _Kept(directions / row_sizes(directions)[:, None]), None
+            return _Kept(scaled_rows(directions)[1]), None
         if fresh and not damped:
             return _Kept(), None
         g, jacobian = equations.linearise(y)
         if fresh:
             far = jnp.full_like(y, jnp.max(jnp.abs(y)))
             return _Kept(scale=equations.scale(jacobian, far)), None
-        sizes = row_sizes(jacobian)
-        unit = jacobian / sizes[:, None]
+        sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit)
         if len(rows) <= WRITTEN_OUT_MAX:
             return _Kept(rows), None
@@ -136,6 +135,8 @@ def _solve(
 
     def test(kept: _Kept, y: Any, left: Array) -> tuple[Any, Array]:
         seen = equations.linearise(y)
+        if not small:  # otherwise XLA evaluates residuals for each use
+            seen = lax.optimization_barrier(seen)
         left = judge(seen, y, left)
         return move(kept, seen, y, left), left
 
@@ -185,8 +186,7 @@ def _corrected(
     if kept.factors is not None:
         rows, multiplier = kept.rows, solve_factored(kept.factors, g)
     else:
-        sizes = row_sizes(jacobian)
-        unit = jacobian / sizes[:, None]
+        sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
         far = 0.0 if kept.scale is None else jnp.sum(relative(g, kept.scale) ** 2)
         damping = jnp.minimum(1e-2, far)
@@ -250,8 +250,8 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
         rows = equations.weighted(dual)
     else:
         dual = rows = directions
-    sizes = row_sizes(dual)
-    dual, rows = dual / sizes[:, None], rows / sizes[:, None]
+    sizes, dual = scaled_rows(dual)
+    rows = rows / sizes[:, None]
     along = dual @ (y - candidate)
     multiplier = gram_solve(gram_matrix(dual, rows), along) / sizes
 
@@ -266,9 +266,8 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     tangent = eqx.filter_jvp(displaced, primals, tangents)[1]
     t_y, t_g = tree_tangents((y, multiplier), tangent)
     _, jacobian = equations.linearise(y)
-    heights = row_sizes(jacobian)
-    gram = gram_matrix(jacobian / heights[:, None], rows)
-    t_y = t_y - combined(gram_solve(gram, t_g / heights), rows)
+    heights, unit = scaled_rows(jacobian)
+    t_y = t_y - combined(gram_solve(gram_matrix(unit, rows), t_g / heights), rows)
     # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
     factor = jnp.where(ok, certain(equations, candidate, y, jacobian, directions), 1)
     return (y, ok, count), (lax.stop_gradient(factor) * t_y, None, None)
@@ -303,7 +302,7 @@ def certain(
 
 def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, " m"]:
     """The sine of the angle between each gradient and the span of those before, in the metric."""
-    unit = jacobian / row_sizes(jacobian)[:, None]
+    _, unit = scaled_rows(jacobian)
     if equations.weights is not None:
         unit = unit * jnp.sqrt(equations.weights)[None]
     columns = unit.astype(jnp.float32 if jnp.finfo(unit.dtype).bits < 32 else unit.dtype).T

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .bounded import Box, box_of, check_bounds, project_within
-from .equations import Equations, gram_matrix, gram_solve
+from .equations import Equations, gram_matrix, gram_solve, scaled_rows
 from .loop import certain, solve
 from .options import NEWTON_OPTIONS, check_options, option, positive_weights
 
@@ -75,7 +75,7 @@ class Newton(AbstractProjection):
             )
         equations = problem.tolerating(self.rtol, self.atol)
         box = box_of(self.lower, self.upper, problem.like)
-        unknowns, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
+        unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
         y = unknowns[: candidate.size]
         return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol)
 
@@ -84,75 +84,79 @@ Newton.__init__.__doc__ = NEWTON_OPTIONS
 
 
 class _Optimality(eqx.Module):
-    """`y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and `λ` in one vector."""
+    """`y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and `sizes * λ` in one vector."""
 
     equations: Equations
     candidate: Float[Array, " n"]
     box: Box | None
+    sizes: Float[Array, " m"]
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         y, multiplier = jnp.split(unknowns, [self.candidate.size])
         g, vjp = jax.vjp(self.equations.residual, y)  # by one reverse pass, not row by row
-        z = self.candidate + self.equations.weighted(vjp(multiplier)[0][None])[0]
+        z = self.candidate + self.equations.weighted(vjp(multiplier / self.sizes)[0][None])[0]
         return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
 
 
 @eqx.filter_custom_jvp
 def _nearest(
     equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
-) -> tuple[Float[Array, " N"], Bool[Array, ""], Int[Array, ""]]:
-    """State and multipliers, whether they are of the nearest point, and a count of iterations."""
+) -> tuple[Float[Array, " N"], Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]:
+    """State and scaled multipliers, the sizes by which they are scaled, whether they are of the
+    nearest point, and a count of iterations."""
     if box is None:
         y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
     else:
         y, _, count = project_within(box, equations, candidate, max_steps=max_steps)
-    n = y.size
+    n, (sizes, unit, gram, units) = y.size, _scaled(equations, y)
     if n + equations.magnitude.size > _NEAREST_MAX:
-        return jnp.concatenate([y, 0 * equations.magnitude]), jnp.asarray(False), count
-    _, jacobian = equations.linearise(y)
-    gram = gram_matrix(jacobian, equations.weighted(jacobian))
-    start = jnp.concatenate([y, gram_solve(gram, jacobian @ (y - candidate))])
+        return jnp.concatenate([y, 0 * equations.magnitude]), sizes, jnp.asarray(False), count
+    start = jnp.concatenate([y, gram_solve(gram, unit @ (y - candidate))])
     optimality = dataclasses.replace(
         equations,
-        parts=(_Optimality(equations, candidate, box),),
+        parts=(_Optimality(equations, candidate, box, sizes),),
         magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-        weights=_units(equations, gram, n),
+        weights=units,
     )
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
         found = found & equations.judged(end[:n])
-    return jnp.where(found, end, start), found, count + more
+    return jnp.where(found, end, start), sizes, found, count + more
 
 
-def _units(equations: Equations, gram: Float[Array, "m m"], n: int) -> Float[Array, " N"]:
-    """Squared units of `y` and `λ` in which the condition number does not depend on the user's."""
-    weights = jnp.ones(n, gram.dtype) if equations.weights is None else equations.weights
+def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, Array, Array]:
+    """The sizes of the rows of the Jacobian, the rows divided by them, their Gram matrix, and the
+    squared units of `y` and the multipliers in which no condition number depends on the user's."""
+    sizes, unit = scaled_rows(equations.linearise(y)[1])
+    gram = gram_matrix(unit, equations.weighted(unit))
+    weights = jnp.ones_like(y) if equations.weights is None else equations.weights
     lengths = jnp.diagonal(gram)
-    return jnp.concatenate([weights, 1 / jnp.where(lengths > 0, lengths, 1)])
+    units = jnp.concatenate([weights, 1 / jnp.where(lengths > 0, lengths, 1)])
+    return sizes, unit, gram, units
 
 
 @_nearest.def_jvp
 def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     """The tangent of the optimality system at constant `y` and `λ` is cancelled by theirs."""
     equations, candidate, _ = primals
-    unknowns, found, count = _nearest(*primals, max_steps=max_steps)
+    solved = _nearest(*primals, max_steps=max_steps)
+    unknowns, sizes, found, _ = solved
     if unknowns.size > _NEAREST_MAX:
-        return (unknowns, found, count), (jnp.full_like(unknowns, jnp.nan), None, None)
+        return solved, (jnp.full_like(unknowns, jnp.nan), None, None, None)
     y = unknowns[: candidate.size]
-    _, right = eqx.filter_jvp(lambda *p: _Optimality(*p)(unknowns), primals, tangents)
+    _, unit, _, units = _scaled(equations, y)
+    _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right
-    _, jacobian = equations.linearise(y)
-    units = _units(equations, gram_matrix(jacobian, equations.weighted(jacobian)), y.size)
     columns = jnp.sqrt(jnp.where(units > 0, units, 1))
-    rows = jnp.concatenate([columns[: y.size], 1 / columns[y.size :]])
-    matrix = jax.jacfwd(_Optimality(*primals))(unknowns) / rows[:, None] * columns
+    rows = jnp.concatenate([columns[: y.size], sizes / columns[y.size :]])
+    matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns) / rows[:, None] * columns
     tangent = -columns * _shortest(matrix, right / rows)
     # Only the nearest point has a derivative; that of a failed projection is not used.
-    doubt = jnp.where(found, certain(equations, candidate, y, jacobian), jnp.nan)
+    doubt = jnp.where(found, certain(equations, candidate, y, unit), jnp.nan)
     doubt = lax.stop_gradient(jnp.where(equations.judged(y), doubt, 1))
-    return (unknowns, found, count), (doubt * tangent, None, None)
+    return solved, (doubt * tangent, None, None, None)
 
 
 def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:

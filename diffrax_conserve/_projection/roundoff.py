@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._manifold import evaluate
 from .._tree import ravel, tree_stop_gradient, unravel
-from .equations import row_sizes
+from .equations import scaled_rows
 from .scalars import walk
 
 # Sums, and sums of products, each of which has an error of its own.
@@ -75,7 +75,7 @@ def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measur
     terms = [jnp.abs(v * s[None]).reshape(value.size, -1) for v, s in pairs]
     terms = [jnp.where(jnp.isfinite(x), x, 0).astype(value.dtype) for x in terms]
     # Squares of small energies underflow in float32.
-    unit = row_sizes(jnp.concatenate([jnp.zeros_like(jacobian), *terms], axis=1))
+    unit, _ = scaled_rows(jnp.concatenate([jnp.zeros_like(jacobian), *terms], axis=1))
     squares = sum(jnp.sum((x / unit[:, None]) ** 2, axis=1) for x in terms)
     return value, jacobian, unit * jnp.sqrt(squares)
 

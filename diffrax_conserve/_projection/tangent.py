@@ -25,7 +25,7 @@ from .._manifold import (
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
-from .equations import combined, equations_of, gram_matrix, gram_solve
+from .equations import combined, equations_of, gram_matrix, gram_solve, scaled_rows
 from .options import check_state, inverse_metric, positive_weights
 from .scalars import written_out
 
@@ -152,10 +152,7 @@ class TangentField(eqx.Module):
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             vector, wrong = given
             _, jacobian = equations.linearise(vector)
-            # The result is not checked, so no product may overflow or underflow.
-            sizes = jnp.max(jnp.abs(jacobian), axis=1)
-            sizes = jnp.where(sizes > 0, sizes, 1)
-            unit = jacobian / sizes[:, None]
+            sizes, unit = scaled_rows(jacobian)
             rows = equations.weighted(unit)
             multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
             return combined(multiplier, rows), multiplier / sizes

@@ -116,21 +116,28 @@ def test_the_roundoff_that_counts_is_that_at_the_result(name):
 @given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0.5, 2))
 def test_units_do_not_matter_in_single_precision(factor, displacement, size):
     """The energy of a planet in joules, or of an atom: squares of its gradient overflow, or vanish,
-    in float32."""
+    in float32. On a circle both projections move to the nearest point."""
     y = np.float32(size) * np.array([0.6, 0.8], np.float32)
     candidate = y + 1e-3 * np.asarray(displacement, np.float32)
     value = jnp.float32(factor * size**2)
+    radius, t_candidate = np.linalg.norm(candidate), np.array([1.0, -2.0], np.float32)
+    across = t_candidate - candidate * (candidate @ t_candidate) / radius**2
     for projection in (PROJECTIONS["simplified"], PROJECTIONS["newton"]):
-        found, ok = in_units(projection, candidate, value, jnp.float32(factor))
+        found, t_found, ok = in_units(projection, candidate, t_candidate, value, factor)
         assert ok
-        np.testing.assert_allclose(np.linalg.norm(found), size, rtol=2e-6)
+        np.testing.assert_allclose(found, size / radius * candidate, rtol=4e-6)
+        np.testing.assert_allclose(t_found, size / radius * across, rtol=2e-4, atol=1e-5)
 
 
 @eqx.filter_jit
-def in_units(projection, y, value, factor):
+def in_units(projection, y, t_y, value, factor):
     square = dfc.FirstIntegral(lambda t, y, args: args * jnp.sum(y**2))
-    found, info = dfc.project(square, y, value=value, args=factor, projection=projection)
-    return found, info.ok
+
+    def projected(y):
+        y, info = dfc.project(square, y, value=value, args=factor, projection=projection)
+        return y, info.ok
+
+    return *jax.jvp(lambda y: projected(y)[0], (y,), (t_y,)), projected(y)[1]
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -141,7 +148,8 @@ def test_what_underflows_is_no_success(dtype, share, angle, off):
     size = float(numbers.tiny) ** share
     value = dtype(size**2)
     candidate = (size * (1 + off) * np.array([np.cos(angle), np.sin(angle)])).astype(dtype)
-    found, ok = in_units(PROJECTIONS["simplified"], candidate, value, jnp.asarray(1, dtype))
+    given = candidate, 0 * candidate, value, jnp.asarray(1, dtype)
+    found, _, ok = in_units(PROJECTIONS["simplified"], *given)
     error = np.sum(np.asarray(found, np.longdouble) ** 2) - value
     assert not ok or abs(error) <= 64 * numbers.eps * value
     assert ok or value <= numbers.tiny / numbers.eps
