@@ -35,7 +35,7 @@ NEWTON_OPTIONS = r"""**Arguments:**
 - `rtol`: the largest accepted residual, relative to the scale of its constraint at the projected
     state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype.
 - `atol`: an absolute tolerance, added to the relative one. Default: 0.
-- `max_steps`: the largest number of iterations, with bounds twice as many.
+- `max_steps`: the largest number of iterations; twice as many with bounds, or in all by `Newton`.
 - `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
     arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
     freezes its component. Default: Euclidean.

@@ -3,11 +3,9 @@
 import dataclasses
 
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
@@ -72,24 +70,16 @@ def project(
 
 @eqx.filter_jit
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
-    """Projects twice, because the roundoff that counts is that at the result: at first with that at
-    the candidate, then with that at the first result. Where it has shrunk again, success by the
-    larger one is none."""
-    manifold, args = target.manifold, target.args
-
-    def projected(hidden: Array, _: None) -> tuple[Array, tuple[Y, ProjectionInfo]]:
-        y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
-        value, jacobian, found = hidden_scale(manifold, t, y, args)
-        shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * ravel(y)[None]), axis=1)
-        ok = info.ok & jnp.all(hidden <= 2 * (shown + found))
-        missed = optx.RESULTS.nonlinear_max_steps_reached
-        result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)
-        return found, (y, dataclasses.replace(info, ok=ok, result=result))
-
-    # A loop, so that the projection is compiled once.
-    _, _, hidden = hidden_scale(manifold, t, candidate, args)
-    _, results = lax.scan(projected, hidden, length=2)
-    return jtu.tree_map(lambda x: x[-1], results)
+    """The roundoff is measured at the candidate. Far away it may be much larger than at the result,
+    where success by it is none."""
+    _, _, hidden = hidden_scale(target.manifold, t, candidate, target.args)
+    y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
+    value, jacobian, found = hidden_scale(target.manifold, t, y, target.args)
+    shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * ravel(y)[None]), axis=1)
+    ok = info.ok & jnp.all(hidden <= 2 * (shown + found))
+    missed = optx.RESULTS.nonlinear_max_steps_reached
+    result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)
+    return y, dataclasses.replace(info, ok=ok, result=result)
 
 
 def given_values(

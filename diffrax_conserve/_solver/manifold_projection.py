@@ -192,7 +192,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         states, limit = (y0, candidate, y1), self._limit(terms)
         failed, hopeless = verdict(info.ok, state, (t0, t1), states, limit)
         # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
-        y1 = jtu.tree_map(lambda y: jnp.where(info.ok, y, jnp.nan), y1)
+        y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
             inner=dense_info,
             ends=(y0, y1),

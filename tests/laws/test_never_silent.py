@@ -183,9 +183,12 @@ def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
     direction = rng.normal(size=(400, 4))
     (y, t), (exact, t_exact) = tangents(PROJECTIONS[name], e, direction)
     found, expected = (np.concatenate(x, axis=-1) for x in (t, t_exact))
-    assert np.max(np.abs(np.concatenate(y, -1) - np.concatenate(exact, -1))) < 1e-5
+    off = np.abs(np.concatenate(y, -1) - np.concatenate(exact, -1)).max(axis=-1)
+    solved = ~np.isnan(off)
+    assert np.all(off[solved] < 1e-5)
+    assert np.mean(solved) >= (1 if name == "newton" else 0.9)
     error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
-    assert not np.any(error > 1e-3)  # NaN is right
+    assert not np.any(error[solved] > 1e-3)  # NaN is right
     assert np.all(error[e > 1e-2] <= 1e-3)
 
 
