@@ -85,9 +85,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
     def __check_init__(self):
         if not isinstance(self.solver, dfx.AbstractSolver):
+            name = getattr(self.solver, "__name__", type(self.solver).__name__)
             raise TypeError(
-                f"`solver` is {self.solver!r}, which is not a diffrax solver. Pass an instance, "
-                "such as `diffrax.Tsit5()`."
+                f"`solver` is `{name}`, which is not a diffrax solver. Pass an instance, such as "
+                "`diffrax.Tsit5()`, or of a network its solver, such as `DeepONetSolver(network)`."
             )
         check_nested(self.solver)
         check_manifold(self.manifold)
