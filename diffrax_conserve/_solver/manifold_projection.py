@@ -227,7 +227,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
-    this times the distance covered by the step (plus $8 \sqrt\varepsilon$ of the state), each the
+    this times the distance covered by the step (plus $\varepsilon^{3/4}$ of the state), each the
     sum over the components. Corrections are of the size of the local error of the wrapped solver:
     one as long as half a step tells that the quantity is not conserved, or that the state jumped to
     another part of the manifold. `every` multiplies the limit. It does not apply with a

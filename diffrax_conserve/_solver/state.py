@@ -219,7 +219,7 @@ def verdict(
     # One sum, hence one kernel. A correction within the second term is allowed in any step.
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    excess = jnp.sum(correction - share * moved - 8 * float(info.eps) ** 0.5 * size)
+    excess = jnp.sum(correction - share * moved - float(info.eps) ** 0.75 * size)
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
@@ -230,6 +230,5 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved very short steps tell nothing.
-    least = jnp.where(cause == _TOO_FAR, 5e-4, max(1e-5, 16 * float(info.eps))).astype(info.dtype)
-    near = jnp.sum(moved - least * size) <= 0
+    near = jnp.sum(moved - max(1e-5, float(info.eps) ** 0.5) * size) <= 0
     return cause, near | instant | lost

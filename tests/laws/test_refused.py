@@ -57,10 +57,10 @@ def test_a_small_vibration_far_from_the_origin_is_solved(centre):
         lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)]),
         lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2,
         dfx.Tsit5(),
-        dfx.PIDController(rtol=1e-3, atol=1e-6),
+        dfx.PIDController(rtol=1e-2, atol=1e-2),
         y0,
         jnp.zeros(200),
-        jnp.asarray([10.0, 0.01]),
+        jnp.asarray([60.0, 0.01]),
     )
     assert np.all(done), amplitude[~np.asarray(done)][:5]
 
