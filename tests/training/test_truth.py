@@ -120,6 +120,7 @@ def nan_somewhere(t, y, args):
         (pinn(), lambda t, y, args: jnp.nan * y, "not finite at 1 of 1 initial states"),
         (flow_map(), nan_somewhere, r"not finite at \d+ of 30 initial states, for example at"),
         (flow_map(), lambda t, y, args: jnp.cos(t) * y, "depends on time.*autonomous"),
+        (flow_map(), lambda t, y, args: jnp.where(t > 5, 2.0, 1.0) * y, "depends on time"),
         (pinn(), lambda t, y, args: jnp.ones(3), r"returns the structure \(3,\).*has \(2,\)"),
         (flow_map(), lambda t, y, args: (y, y), "returns the structure"),
     ],

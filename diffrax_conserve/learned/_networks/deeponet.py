@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
+from ..._options import check_number
 from ..._tree import unflatten
 from .cores import AbstractCore, Activation, Gated, Sizes, check_sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
@@ -91,8 +92,12 @@ class DeepONet(AbstractFlowMap):
             raise TypeError(
                 f"`core` is {core!r}, but it must be `learned.Gated`, `Concatenated` or `Product`."
             )
-        if not max_step > 0:
-            raise ValueError(f"`max_step` must be positive, but is {max_step}.")
+        check_number("max_step", max_step, above=0.0, optional=False)
+        if max_step == jnp.inf:
+            raise ValueError("`max_step` is infinite: give the longest step that is learned.")
+        for name, part, kind in (("layer", layer, ConservativeLayer), ("taylor", taylor, Taylor)):
+            if not isinstance(part, kind | None):
+                raise TypeError(f"`{name}` is {part!r}, but it must be a `{kind.__name__}`.")
         states = as_states(states)
         dtype = working_dtype(states)
         # What the network sees of all states, and the number of functions to be learned.

@@ -5,10 +5,12 @@ import functools as ft
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree, Real, Shaped
 
 from ..._custom_types import Y
 from ..._options import ONE_STATE
+from ..._printing import is_traced
 
 
 def working_dtype(y: Y) -> jnp.dtype:
@@ -64,6 +66,8 @@ def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "
             "`states` must be one state or more, stacked along a leading axis, but the leaves have "
             f"shapes {shapes}. " + ONE_STATE
         )
+    if not is_traced(states) and not all(np.all(np.isfinite(x)) for x in jtu.tree_leaves(states)):
+        raise ValueError("`states` holds a state that is not finite. Leave it out.")
     return states
 
 

@@ -125,7 +125,7 @@ class PINN(eqx.Module):
     ):
         check_sizes(width=width, depth=depth, windows=windows)
         check_number("slope", slope, above=0.0)
-        if not t0 < t1:
+        if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)
         self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
