@@ -72,7 +72,7 @@ class Equations(eqx.Module):
 
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
         y = y if self.clip is None else self.clip(y)
-        return self.magnitude + jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
+        return self.magnitude + shown_terms(jacobian, y)
 
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
@@ -99,6 +99,11 @@ class Equations(eqx.Module):
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""
         return rows if self.weights is None else rows * self.weights[None]
+
+
+def shown_terms(jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`Σ_k |y_k ∂g/∂y_k|`, the part of a scale that the gradient shows."""
+    return jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
 
 
 def relative(residual: Any, scale: Any) -> Any:

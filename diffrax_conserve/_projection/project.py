@@ -11,6 +11,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
 from .._tree import ravel
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
+from .equations import shown_terms
 from .newton import Newton
 from .options import check_state
 from .roundoff import hidden_scale
@@ -75,7 +76,7 @@ def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, Proj
     _, _, hidden = hidden_scale(target.manifold, t, candidate, target.args)
     y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
     value, jacobian, found = hidden_scale(target.manifold, t, y, target.args)
-    shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * ravel(y)[None]), axis=1)
+    shown = jnp.abs(value) + shown_terms(jacobian, ravel(y))
     ok = info.ok & jnp.all(hidden <= 2 * (shown + found))
     missed = optx.RESULTS.nonlinear_max_steps_reached
     result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._manifold import evaluate
 from .._tree import ravel, tree_stop_gradient, unravel
-from .equations import scaled_rows
+from .equations import scaled_rows, shown_terms
 from .scalars import walk
 
 # Sums, and sums of products, each of which has an error of its own.
@@ -53,7 +53,7 @@ def hidden_scale(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> _Me
         return ravel(evaluate(manifold, t, unravel(vector, like), args)).astype(vector.dtype)
 
     value, jacobian, hidden = hidden_terms(fn, vector)
-    shown = jnp.abs(value) + jnp.sum(jnp.abs(jacobian * vector[None]), axis=1)
+    shown = jnp.abs(value) + shown_terms(jacobian, vector)
     return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 
 
