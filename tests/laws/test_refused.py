@@ -47,6 +47,28 @@ def test_a_pendulum_near_rest_is_solved(dtype, fixed):
     assert np.all(done), (np.mean(done), amplitude[~np.asarray(done)][:5])
 
 
+@eqx.filter_jit
+@eqx.filter_vmap
+def to_pendulum(candidate, value):
+    y, info = dfc.project(dfc.FirstIntegral(pendulum_energy), candidate, value=value)
+    return y, info.ok
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_far_candidates_reach_a_pendulum_near_rest(dtype):
+    """The terms that cancel at the result are not those at the candidate."""
+    rng = np.random.default_rng(1)
+    angle, amplitude = rng.uniform(0, 2 * np.pi, 500), 10 ** rng.uniform(-4, -1, 500)
+    q, p = amplitude * np.cos(angle), amplitude * np.sin(angle)
+    value = p**2 / 2 + 2 * np.sin(q / 2) ** 2
+    candidate = np.stack([q, p], axis=1) + rng.normal(size=(500, 2))
+    y, okay = map(np.asarray, to_pendulum(candidate.astype(dtype), value.astype(dtype)))
+    assert np.all(okay), np.mean(okay)
+    q, p = y.astype(np.longdouble).T
+    off = np.abs(p**2 / 2 + 2 * np.sin(q / 2) ** 2 - value)
+    assert np.all(off <= 64 * np.finfo(dtype).eps), np.max(off)
+
+
 @pytest.mark.parametrize("centre", [0.0, 1.0, -30.0])
 def test_a_small_vibration_far_from_the_origin_is_solved(centre):
     """Its steps, which at first are much too long, are short beside the state."""
