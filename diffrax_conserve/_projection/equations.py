@@ -188,10 +188,11 @@ def gram_solve(
     """`gram⁻¹ b`, for a matrix not symmetric in general; `damping` is relative to its diagonal."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
-        unit, scaled, added = _scaled(gram)
-        scaled = scaled + jnp.asarray(damping, scaled.dtype) * jnp.eye(m, dtype=scaled.dtype)
+        diagonal, one = jnp.abs(jnp.diagonal(gram)), jnp.eye(m, dtype=_wide(dtype))
+        unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+        scaled = gram * unit[:, None] * unit + jnp.asarray(damping, dtype) * one
         right = (b * unit).astype(scaled.dtype)
-        lu, x = jsp.linalg.lu_factor(scaled + added), jnp.zeros_like(right)
+        lu, x = jsp.linalg.lu_factor(scaled + _added(m, dtype) * one), jnp.zeros_like(right)
         for _ in range(3):  # which removes what is added
             x = x + jsp.linalg.lu_solve(lu, right - scaled @ x)
         return x.astype(dtype) * unit
@@ -222,24 +223,19 @@ def gram_solve(
     return jnp.stack(x)
 
 
-# The inverse Cholesky factor of a scaled matrix, and the factors of equations and multipliers.
-Factors = tuple[Float[Array, "m m"], Float[Array, " m"], Float[Array, " m"]]
+def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
+    """`L⁻¹ S⁻¹` for `gram = L Lᵀ` and the diagonal matrix `S` of `sizes`. With the inverse of a
+    triangle each solve is two products."""
+    m, one = len(gram), jnp.eye(len(gram), dtype=_wide(gram.dtype))
+    added = _added(m, gram.dtype) * one * jnp.where(gram > 0, gram, 1)
+    lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
+    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
 
 
-def factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Factors:
-    """The factors of a symmetric matrix, for right-hand sides to be divided by `sizes`. With the
-    inverse of the triangle each solve is two products."""
-    unit, scaled, added = _scaled(gram)
-    lower = jnp.linalg.cholesky(scaled + added, symmetrize_input=False)
-    inverse = jsp.linalg.solve_triangular(lower, jnp.eye(len(lower), dtype=lower.dtype), lower=True)
-    return inverse, unit / sizes, unit
-
-
-def solve_factored(factors: Factors, b: Float[Array, " m"]) -> Float[Array, " m"]:
-    inverse, left, right = factors
-    x = jnp.matmul(inverse, (b * left).astype(inverse.dtype), precision=lax.Precision.HIGHEST)
-    x = jnp.matmul(x, inverse, precision=lax.Precision.HIGHEST)
-    return x.astype(b.dtype) * right
+def solve_factored(inverse: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`(S gram S)⁻¹ b`."""
+    x = jnp.matmul(inverse, b.astype(inverse.dtype), precision=lax.Precision.HIGHEST)
+    return jnp.matmul(x, inverse, precision=lax.Precision.HIGHEST).astype(b.dtype)
 
 
 def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
@@ -252,12 +248,10 @@ def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Ar
     return sizes, rows / sizes[:, None]
 
 
-def _scaled(gram: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Array, Array]:
-    """Factors by which the matrix has a unit diagonal, the scaled matrix, and roundoff to be added:
-    dependent constraints have small multipliers then."""
-    m, dtype = len(gram), gram.dtype
-    diagonal = jnp.abs(jnp.diagonal(gram))
-    unit = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
-    scaled = (gram * unit[:, None] * unit).astype(jnp.promote_types(dtype, jnp.float32))
-    added = jnp.eye(m, dtype=scaled.dtype) * (16 * m**0.5 * float(jnp.finfo(dtype).eps))
-    return unit, scaled, added
+def _added(m: int, dtype: Any) -> float:
+    """Roundoff that is added to a diagonal: dependent constraints have small multipliers then."""
+    return 16 * m**0.5 * float(jnp.finfo(dtype).eps)
+
+
+def _wide(dtype: Any) -> Any:
+    return jnp.promote_types(dtype, jnp.float32)

@@ -21,12 +21,11 @@ from .._tree import tree_tangents
 from .equations import (
     WRITTEN_OUT_MAX,
     Equations,
-    Factors,
     any_lane,
     combined,
-    factor,
     gram_matrix,
     gram_solve,
+    inverse_factor,
     relative,
     scaled_rows,
     solve_factored,
@@ -45,10 +44,10 @@ _VANISHES = 1e-8
 
 class _Kept(NamedTuple):
     """What an iteration keeps from the candidate: the directions of the correction, and with many
-    constraints the factors of the Gram matrix; or only the scale there, for the damping."""
+    constraints the factor of the Gram matrix; or only the scale there, for the damping."""
 
     rows: Any = None
-    factors: Factors | None = None
+    inverse: Float[Array, "m m"] | None = None
     scale: Float[Array, " m"] | None = None
 
 
@@ -115,7 +114,8 @@ def _solve(
         if len(rows) <= WRITTEN_OUT_MAX:
             return _Kept(rows), None
         # A large Jacobian is carried, so that none is computed twice.
-        return _Kept(rows, factor(gram_matrix(unit, rows), sizes)), (g, jacobian)
+        inverse = inverse_factor(gram_matrix(unit, rows), sizes)
+        return _Kept(equations.weighted(jacobian), inverse), (g, jacobian)
 
     def judge(seen: _Seen, y: Any, left: Array) -> Array:
         """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1. A
@@ -183,8 +183,8 @@ def _corrected(
 ) -> Float[Array, " n"]:
     """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
     candidate: near a state where all terms vanish it never becomes small relative to theirs."""
-    if kept.factors is not None:
-        rows, multiplier = kept.rows, solve_factored(kept.factors, g)
+    if kept.inverse is not None:
+        rows, multiplier = kept.rows, solve_factored(kept.inverse, g)
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
