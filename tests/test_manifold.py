@@ -169,6 +169,5 @@ def test_what_is_right():
 
 def test_drift_without_the_args_of_the_solve_says_so():
     scaled = FirstIntegral(lambda t, y, args: args["scale"] * jnp.sum(y**2))
-    with pytest.raises(TypeError) as caught:
+    with pytest.raises(ValueError, match="`args` of the solve"):
         dfc.drift(solve(rigid_body, wrap(ENERGY), OMEGA0, saveat=dfx.SaveAt(steps=True)), scaled)
-    assert any("`args`" in note for note in caught.value.__notes__)

@@ -108,9 +108,10 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     try:
         values = conserved_values(manifold, t0, y0, args)
     except Exception as error:
-        if args is None:
-            error.add_note("`drift` was given no `args`, which a solution does not keep.")
-        raise
+        raise ValueError(
+            "`manifold` cannot be evaluated at the saved states. Pass the `args` of the solve, "
+            "which a solution does not keep. Save the states themselves, without `SaveAt(fn=...)`."
+        ) from error
     _, scale = measure(manifold, values, t0, y0, args)
     gained = _gained(sol, manifold, args, values)
 

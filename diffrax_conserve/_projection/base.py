@@ -141,6 +141,8 @@ class Problem(eqx.Module):
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
+        # A maximum can lose NaN on a CPU.
+        sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
         success = equations.verdict(after, jacobian, y) > 0 if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
@@ -148,8 +150,6 @@ class Problem(eqx.Module):
             jnp.isfinite(after), kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
         )
         failed = kinds.where(jnp.isfinite(before), reached, kinds.nonfinite)
-        # The smaller of both, so that none is blamed for an iteration that diverged.
-        least = jnp.minimum(*(jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes))
         parts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
         entry = jnp.asarray(np.repeat(np.arange(len(parts)), parts))
         return ProjectionInfo(
@@ -160,7 +160,8 @@ class Problem(eqx.Module):
             residual_after=after,
             correction=jnp.linalg.norm(y - candidate),
             roundoff=jnp.max(relative(equations.hidden, scale)),
-            worst=entry[jnp.argmax(least)],
+            # The smaller of both, so that none is blamed for an iteration that diverged.
+            worst=entry[jnp.argmax(jnp.minimum(*sizes))],
         )
 
 

@@ -182,24 +182,21 @@ def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float
     return jnp.sum(multiplier[:, None] * rows, axis=0)
 
 
-def gram_solve(
-    gram: Float[Array, "m m"], b: Float[Array, " m"], damping: Array | float = 0.0
-) -> Float[Array, " m"]:
-    """`gram⁻¹ b`, for a matrix not symmetric in general; `damping` is relative to its diagonal."""
+def gram_solve(gram: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`gram⁻¹ b`, for a matrix not symmetric in general."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
-        diagonal, one = jnp.abs(jnp.diagonal(gram)), jnp.eye(m, dtype=_wide(dtype))
+        one, diagonal = _one(gram), jnp.abs(jnp.diagonal(gram))
         unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-        scaled = gram * unit[:, None] * unit + jnp.asarray(damping, dtype) * one
-        right = (b * unit).astype(scaled.dtype)
-        lu, x = jsp.linalg.lu_factor(scaled + _added(m, dtype) * one), jnp.zeros_like(right)
+        scaled = gram * unit[:, None] * unit
+        right = (b * unit).astype(one.dtype)
+        lu, x = jsp.linalg.lu_factor(scaled + _added(gram) * one), jnp.zeros_like(right)
         for _ in range(3):  # which removes what is added
             x = x + jsp.linalg.lu_solve(lu, right - scaled @ x)
         return x.astype(dtype) * unit
     least = 4 * m * float(jnp.finfo(dtype).eps)
     if m == 2:  # with one division, because XLA compiles each into a kernel of its own
         (a, b01), (b10, d) = gram[0], gram[1]
-        a, d = a * (1 + damping), d * (1 + damping)
         det = a * d - b01 * b10
         regular, first = jnp.abs(det) > least * jnp.abs(a * d), a != 0
         divisor = jnp.where(regular, det, jnp.where(first, a, d))
@@ -209,8 +206,8 @@ def gram_solve(
     rows = [[gram[i, j] for j in range(m)] for i in range(m)]
     x, pivots = [b[i] for i in range(m)], []
     for k in range(m):
-        pivot = rows[k][k] + damping * gram[k, k]
-        pivots.append(jnp.where(jnp.abs(pivot) > least * jnp.abs(gram[k, k]), pivot, jnp.inf))
+        regular = jnp.abs(rows[k][k]) > least * jnp.abs(gram[k, k])
+        pivots.append(jnp.where(regular, rows[k][k], jnp.inf))
         for i in range(k + 1, m):
             share = rows[i][k] / pivots[k]
             x[i] = x[i] - share * x[k]
@@ -226,10 +223,9 @@ def gram_solve(
 def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
     """`L⁻¹ S⁻¹` for `gram = L Lᵀ` and the diagonal matrix `S` of `sizes`. With the inverse of a
     triangle each solve is two products."""
-    m, one = len(gram), jnp.eye(len(gram), dtype=_wide(gram.dtype))
-    added = _added(m, gram.dtype) * one * jnp.where(gram > 0, gram, 1)
+    added = _added(gram) * _one(gram) * jnp.where(gram > 0, gram, 1)
     lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
-    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
+    return jsp.linalg.solve_triangular(lower, _one(gram), lower=True) / sizes
 
 
 def solve_factored(inverse: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -248,10 +244,10 @@ def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Ar
     return sizes, rows / sizes[:, None]
 
 
-def _added(m: int, dtype: Any) -> float:
-    """Roundoff that is added to a diagonal: dependent constraints have small multipliers then."""
-    return 16 * m**0.5 * float(jnp.finfo(dtype).eps)
+def _one(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    return jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))
 
 
-def _wide(dtype: Any) -> Any:
-    return jnp.promote_types(dtype, jnp.float32)
+def _added(gram: Float[Array, "m m"]) -> float:
+    """Roundoff that is added to a unit diagonal: dependent constraints have small multipliers."""
+    return 16 * len(gram) ** 0.5 * float(jnp.finfo(gram.dtype).eps)

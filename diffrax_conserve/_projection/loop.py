@@ -44,15 +44,16 @@ _VANISHES = 1e-8
 
 class _Kept(NamedTuple):
     """What an iteration keeps from the candidate: the directions of the correction, and with many
-    constraints the factor of the Gram matrix; or only the scale there, for the damping."""
+    constraints the factor of the Gram matrix."""
 
     rows: Any = None
     inverse: Float[Array, "m m"] | None = None
-    scale: Float[Array, " m"] | None = None
 
 
 # The residuals and the Jacobian at a state.
 _Seen = tuple[Float[Array, " m"], Float[Array, "m n"]]
+# The best state so far, its largest residual, and the scales of residuals at the first one.
+_Best = tuple[Float[Array, " n"], Float[Array, ""], Float[Array, " m"]]
 # The state, whether it is on the manifold, and the number of iterations.
 Solved = tuple[Float[Array, " n"], Bool[Array, ""], Int[Array, ""]]
 
@@ -67,7 +68,8 @@ def solve(
     damped: bool = False,
 ) -> Solved:
     """The state `y = ŷ + Dᵀ λ` on the manifold. The directions `D` are by default `G M⁻¹` at the
-    candidate, with `fresh` at the last state."""
+    candidate, with `fresh` at the last state. With `damped` a step that increases the largest
+    residual, or leaves the domain of a function, is shortened until it does not."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
     small = equations.magnitude.size <= WRITTEN_OUT_MAX
 
@@ -103,12 +105,9 @@ def _solve(
     def start(y: Any) -> tuple[_Kept, _Seen | None]:
         if directions is not None:
             return _Kept(scaled_rows(directions)[1]), None
-        if fresh and not damped:
+        if fresh:
             return _Kept(), None
         g, jacobian = equations.linearise(y)
-        if fresh:
-            far = jnp.full_like(y, jnp.max(jnp.abs(y)))
-            return _Kept(scale=equations.scale(jacobian, far)), None
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit)
         if len(rows) <= WRITTEN_OUT_MAX:
@@ -126,8 +125,8 @@ def _solve(
         # Within the tolerance at most two more.
         now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
         now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
-        # NaN stays NaN, in the state after one more.
-        now = jnp.where((level < 0) & ~second, jnp.minimum(now, 1), now)
+        # NaN stays NaN, in the state after one more, unless the step is shortened.
+        now = jnp.where((level < 0) & (first if damped else ~second), jnp.minimum(now, 1), now)
         return jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
 
     def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:
@@ -161,36 +160,46 @@ def _solve(
         y, left = test(kept, y, left)
         count = count + (left > 0).astype(int)
 
+    last: Any = (y, jnp.asarray(jnp.inf, candidate.dtype), equations.magnitude) if damped else seen
+
     def body(carry: tuple[Any, Any, Array, Array]) -> tuple[Any, Any, Array, Array]:
-        y, seen, left, count = carry
-        if seen is None:
+        y, last, left, count = carry
+        if damped:
+            seen = lax.optimization_barrier(equations.linearise(y))
+            left = judge(seen, y, left)
+            better, last = _better(equations, seen, y, last)
+            shorter = last[0] + (y - last[0]) / 4
+            y = jnp.where(better | (left <= 0), move(kept, seen, y, left), shorter)
+        elif last is None:
             y, left = test(kept, y, left)
         else:
-            y = move(kept, seen, y, left)
-            seen = equations.linearise(y)
-            left = judge(seen, y, left)
-        return y, seen, left, count + (left > 0).astype(int)
+            y = move(kept, last, y, left)
+            last = equations.linearise(y)
+            left = judge(last, y, left)
+        return y, last, left, count + (left > 0).astype(int)
 
-    def unfinished(carry: tuple[Any, Any, Array, Array]) -> Array:
-        return any_lane(carry[2] > 0)
-
-    y, _, left, count = lax.while_loop(unfinished, body, (y, seen, left, count))
+    first = (y, last, left, count)
+    y, _, left, count = lax.while_loop(lambda carry: any_lane(carry[2] > 0), body, first)
     return jnp.where(left == -2, candidate, joined(candidate, y)), left != -1, count
 
 
-def _corrected(
-    equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: Array
-) -> Float[Array, " n"]:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`. The damping is the squared residual, relative to the scale at the
-    candidate: near a state where all terms vanish it never becomes small relative to theirs."""
+def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[Array, _Best]:
+    """Whether no residual at `y` is above the largest one of the best state, and the better one."""
+    state, least, scale = best
+    scale = jnp.where(least < jnp.inf, scale, equations.scale(seen[1], y))
+    sizes = jnp.abs(relative(seen[0], scale))
+    better = jnp.all(sizes <= least)  # NaN is not
+    return better, (jnp.where(better, y, state), jnp.where(better, jnp.max(sizes), least), scale)
+
+
+def _corrected(equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: Array) -> Array:
+    """`y - Dᵀ (G Dᵀ)⁻¹ g`."""
     if kept.inverse is not None:
         rows, multiplier = kept.rows, solve_factored(kept.inverse, g)
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
-        far = 0.0 if kept.scale is None else jnp.sum(relative(g, kept.scale) ** 2)
-        damping = jnp.minimum(1e-2, far)
-        multiplier = gram_solve(gram_matrix(unit, rows), g / sizes, damping)
+        multiplier = gram_solve(gram_matrix(unit, rows), g / sizes)
     change = combined(multiplier, rows)
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change

@@ -27,13 +27,12 @@ class Newton(AbstractProjection):
 
     $$y = \hat y + M^{-1} G(y)^\top \lambda, \qquad g(y) = 0,$$
 
-    in two phases. First a Gauss-Newton iteration converges to a point of the manifold. The damping
-    $\min(10^{-2}, |g|^2)$ of its row-scaled Gram matrix vanishes with the (relative) residual: it
-    can pass near points where gradients are parallel, and converges quadratically elsewhere. Then
-    the same iteration on both equations moves along the manifold to the nearest point. If that
-    fails, or with more than 512 unknowns and constraints, the result is that of the first phase, on
-    the manifold but not nearest, and its derivative is NaN. For the close candidates of an
-    integrator use [`diffrax_conserve.SimplifiedNewton`][].
+    in two phases. First a damped Gauss-Newton iteration converges to a point of the manifold: a
+    step that increases the largest residual, or leaves the domain of a function, is shortened. Then
+    Newton's method for both equations moves along the manifold to the nearest point. If that fails,
+    or with more than 512 unknowns and constraints, the result is that of the first phase, on the
+    manifold but not nearest, and its derivative is NaN. For the close candidates of an integrator
+    use [`diffrax_conserve.SimplifiedNewton`][].
 
     The derivative follows from the implicit function theorem for both equations. It is NaN where
     the gradients of the constraints are nearly parallel at the projected state but not everywhere.
@@ -55,7 +54,7 @@ class Newton(AbstractProjection):
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    max_steps: int = option(50, static=True)
+    max_steps: int = option(100, static=True)
     metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)

@@ -127,18 +127,18 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
-        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.5, jnp.array([1.0, 0.0]), saveat=saveat)
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 1.0, jnp.array([1.0, 0.0]), saveat=saveat)
         print(dfc.statistics(sol))
         ```
 
         ```text
         projections of the accepted steps
-          num_projections  18
-          num_iterations   5
+          num_projections  9
+          num_iterations   9
           max_iterations   1
-          residual_before  6.0e-07
-          residual_after   2.4e-07
-          correction       8.9e-07
+          residual_before  8.6e-05
+          residual_after   4.0e-08
+          correction       1.3e-04
           roundoff         0.0e+00
         ```
     """

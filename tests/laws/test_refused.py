@@ -48,9 +48,9 @@ def test_a_pendulum_near_rest_is_solved(dtype, fixed):
 
 
 @eqx.filter_jit
-@eqx.filter_vmap
-def to_pendulum(candidate, value):
-    y, info = dfc.project(dfc.FirstIntegral(pendulum_energy), candidate, value=value)
+@eqx.filter_vmap(in_axes=(None, 0, 0))
+def to_values(fn, candidate, value):
+    y, info = dfc.project(dfc.FirstIntegral(fn), candidate, value=value)
     return y, info.ok
 
 
@@ -62,11 +62,39 @@ def test_far_candidates_reach_a_pendulum_near_rest(dtype):
     q, p = amplitude * np.cos(angle), amplitude * np.sin(angle)
     value = p**2 / 2 + 2 * np.sin(q / 2) ** 2
     candidate = np.stack([q, p], axis=1) + rng.normal(size=(500, 2))
-    y, okay = map(np.asarray, to_pendulum(candidate.astype(dtype), value.astype(dtype)))
+    found = to_values(pendulum_energy, candidate.astype(dtype), value.astype(dtype))
+    y, okay = map(np.asarray, found)
     assert np.all(okay), np.mean(okay)
     q, p = y.astype(np.longdouble).T
     off = np.abs(p**2 / 2 + 2 * np.sin(q / 2) ** 2 - value)
     assert np.all(off <= 64 * np.finfo(dtype).eps), np.max(off)
+
+
+def three_bodies(t, y, args):
+    apart = y.reshape(3, 2) - jnp.roll(y.reshape(3, 2), 1, axis=0)
+    return jnp.sum(1 / jnp.linalg.norm(apart, axis=1))
+
+
+DOMAINS = {
+    "logarithms": (2, lambda t, y, args: jnp.sum(y - jnp.log(y)), np.exp),
+    "a root": (2, lambda t, y, args: jnp.sqrt(y[0]) + 0.1 * y[1], np.exp),
+    "collisions": (6, three_bodies, np.asarray),
+}
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_newton_does_not_leave_the_domain_of_a_function(name):
+    """Full steps lead to negative numbers, or so far away that nothing changes there."""
+    n, fn, state = DOMAINS[name]
+    rng = np.random.default_rng(3)
+    start = state(0.5 * rng.normal(size=(300, n)))
+    candidate = start + rng.normal(size=start.shape)
+    value = jax.vmap(lambda y: fn(0.0, y, None))
+    inside = np.isfinite(value(candidate)) & np.isfinite(value(start))
+    y, okay = to_values(fn, candidate[inside], value(start)[inside])
+    assert np.all(okay), np.mean(okay)
+    off = np.abs(value(y) - value(start)[inside])
+    assert np.all(off <= 1e-13 * (1 + np.abs(value(y)))), np.max(off)
 
 
 @pytest.mark.parametrize("centre", [0.0, 1.0, -30.0])

@@ -126,7 +126,8 @@ def _conserve(
         g, jacobian = _linearise(residual, y)
         ratio = relative(g, magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
-        change = gram_solve(gram_matrix(jacobian, rows), g, damping)
+        gram = gram_matrix(jacobian, rows)
+        change = gram_solve(gram + damping * jnp.diag(jnp.diagonal(gram)), g)
         step = combined(change, rows)
         shortening = lax.rsqrt(1 + jnp.sum(step * step) / jnp.square(radius))
         return multipliers - shortening * change
