@@ -80,6 +80,8 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: flow_map(max_step=jnp.inf), ValueError, "`max_step` is infinite"),
         (lambda: flow_map(taylor=2), TypeError, "`taylor` is 2, but it must be a `Taylor`"),
         (lambda: flow_map(layer=2), TypeError, "must be a `ConservativeLayer`"),
+        (lambda: solution(layer=2), TypeError, "must be a `ConservativeLayer`"),
+        (lambda: dfc.learned.Box(2.0, 1.0), ValueError, "must be at most `upper`"),
         (lambda: dfc.DeepONet(jnp.array([[jnp.nan]]), 1.0, key=KEY), ValueError, "not finite"),
         (lambda: flow_map(core="gated"), TypeError, "`core` is 'gated', but it must be"),
         (lambda: flow_map()(jnp.ones(4), 0.1), ValueError, "of 3 numbers, not 4"),

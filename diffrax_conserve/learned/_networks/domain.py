@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import RealScalarLike, Y
+from ..._projection.bounded import check_bounds
 from ..._tree import tree_shapes
 from .flat import as_state, as_states, flatten
 
@@ -23,11 +24,10 @@ class Box(eqx.Module):
 
         ```python
         import diffrax_conserve as dfc
-        import jax
+        import jax.numpy as jnp
 
-        system = dfc.systems.get("conservative-lorenz")
-        states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
-        assert not dfc.learned.Box.around(states).contains(100 * states[0])
+        box = dfc.learned.Box(jnp.array([-1.0, 0.0]), jnp.array([1.0, 2.0]))
+        assert not box.contains(jnp.array([0.0, 3.0]))
         ```
     """
 
@@ -38,6 +38,7 @@ class Box(eqx.Module):
         lower, upper = tree_shapes(self.lower), tree_shapes(self.upper)
         if lower != upper:
             raise ValueError(f"`lower` has the structure {lower}, but `upper` has {upper}.")
+        check_bounds(self.lower, self.upper)
 
     @classmethod
     def around(cls, states: Y) -> "Box":
@@ -70,7 +71,7 @@ class Box(eqx.Module):
 Box.__init__.__doc__ = """**Arguments:**
 
 - `lower`, `upper`: the corners, two real PyTrees of the structure and shapes of a state; others
-    raise a `ValueError` or `TypeError`.
+    raise a `ValueError` or `TypeError`, as does a lower corner above the upper one.
 """
 
 

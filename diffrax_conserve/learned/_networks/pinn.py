@@ -125,6 +125,8 @@ class PINN(eqx.Module):
     ):
         check_sizes(width=width, depth=depth, windows=windows)
         check_number("slope", slope, above=0.0)
+        if not isinstance(layer, ConservativeLayer | None):
+            raise TypeError(f"`layer` is {layer!r}, but it must be a `ConservativeLayer`.")
         if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)
