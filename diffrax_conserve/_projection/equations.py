@@ -123,6 +123,15 @@ def measure(
     return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
 
 
+def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -> list[Part]:
+    """The function of each entry, from the numbers of a state to a vector."""
+
+    def flat(entry: Any) -> Part:
+        return lambda y: ravel(entry.fn(t, unravel(y, like), args)).astype(y.dtype)
+
+    return [flat(entry) for entry in jtu.tree_leaves(manifold, is_leaf=is_entry)]
+
+
 def equations_of(
     manifold: Manifold,
     values: Float[Array, " m"],
@@ -135,10 +144,10 @@ def equations_of(
     hidden = jnp.zeros_like(values) if hidden is None else hidden
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
-    for entry in jtu.tree_leaves(manifold, is_leaf=is_entry):
+    for fn in functions_of(manifold, t, like, args):
 
-        def part(y: Array, entry=entry, start=start) -> Array:
-            out = ravel(entry.fn(t, unravel(y, like), args)).astype(y.dtype)
+        def part(y: Array, fn=fn, start=start) -> Array:
+            out = fn(y)
             return out - values[start : start + out.size]
 
         # Arrays over which `fn` closes become leaves, and can be differentiated.
@@ -226,12 +235,6 @@ def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Floa
     added = _added(gram) * _one(gram) * jnp.where(gram > 0, gram, 1)
     lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
     return jsp.linalg.solve_triangular(lower, _one(gram), lower=True) / sizes
-
-
-def solve_factored(inverse: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`(S gram S)⁻¹ b`."""
-    x = jnp.matmul(inverse, b.astype(inverse.dtype), precision=lax.Precision.HIGHEST)
-    return jnp.matmul(x, inverse, precision=lax.Precision.HIGHEST).astype(b.dtype)
 
 
 def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:

@@ -28,7 +28,6 @@ from .equations import (
     inverse_factor,
     relative,
     scaled_rows,
-    solve_factored,
 )
 from .scalars import components, in_scalars, joined
 
@@ -195,7 +194,8 @@ def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[A
 def _corrected(equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: Array) -> Array:
     """`y - Dᵀ (G Dᵀ)⁻¹ g`."""
     if kept.inverse is not None:
-        rows, multiplier = kept.rows, solve_factored(kept.inverse, g)
+        x = combined(g.astype(kept.inverse.dtype), kept.inverse.T)
+        rows, multiplier = kept.rows, combined(x, kept.inverse).astype(g.dtype)
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows

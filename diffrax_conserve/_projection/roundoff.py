@@ -18,9 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
-from .._manifold import evaluate
-from .._tree import ravel, tree_stop_gradient, unravel
-from .equations import scaled_rows, shown_terms
+from .._tree import ravel, tree_stop_gradient
+from .equations import functions_of, scaled_rows, shown_terms
 from .scalars import walk
 
 # Sums, and sums of products, each of which has an error of its own.
@@ -47,12 +46,9 @@ def hidden_scale(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> _Me
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
     gradients do not show: nothing where they show more, because elsewhere they may show less."""
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
-    vector, like = ravel(y), jax.eval_shape(lambda: y)
-
-    def fn(vector: Array) -> Array:
-        return ravel(evaluate(manifold, t, unravel(vector, like), args)).astype(vector.dtype)
-
-    value, jacobian, hidden = hidden_terms(fn, vector)
+    vector = ravel(y)
+    measured = [hidden_terms(fn, vector) for fn in functions_of(manifold, t, y, args)]
+    value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
     shown = jnp.abs(value) + shown_terms(jacobian, vector)
     return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 
