@@ -147,8 +147,7 @@ def equations_of(
     for fn in functions_of(manifold, t, like, args):
 
         def part(y: Array, fn=fn, start=start) -> Array:
-            out = fn(y)
-            return out - values[start : start + out.size]
+            return (out := fn(y)) - values[start : start + out.size]
 
         # Arrays over which `fn` closes become leaves, and can be differentiated.
         parts.append(eqx.filter_closure_convert(part, vector))

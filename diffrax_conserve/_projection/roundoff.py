@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._tree import ravel, tree_stop_gradient
-from .equations import functions_of, scaled_rows, shown_terms
+from .equations import functions_of, shown_terms
 from .scalars import walk
 
 # Sums, and sums of products, each of which has an error of its own.
@@ -56,24 +56,36 @@ def hidden_scale(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> _Me
 def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
     """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff."""
     closed = jax.make_jaxpr(fn)(y)
-    like: list[Array] = []
-    evaluate = lambda y, changed: _inside(closed, [(y, _STATE)], changed)[0][0]  # noqa: E731
-    jax.eval_shape(lambda y: evaluate(y, lambda x, _: like.append(x) or x), y)
 
-    def shifted(y: Array, shifts: list[Array]) -> tuple[Array, list[Array]]:
-        given, sizes = iter(shifts), []
-        return evaluate(y, lambda x, size: sizes.append(size) or x + next(given)), sizes
+    def evaluate(y: Array, *sums: Array) -> Array:
+        return _inside(closed, [(y, _STATE)], lambda x, size: _rounded(x, size, *sums))[0][0]
 
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
-    value, vjp, sizes = jax.vjp(shifted, y, zeros, has_aux=True)
-    jacobian, adjoints = jax.vmap(vjp)(jnp.eye(value.size, dtype=value.dtype))
-    pairs = zip(adjoints, sizes, strict=True)
-    terms = [jnp.abs(v * s[None]).reshape(value.size, -1) for v, s in pairs]
-    terms = [jnp.where(jnp.isfinite(x), x, 0).astype(value.dtype) for x in terms]
-    # Squares of small energies underflow in float32.
-    unit, _ = scaled_rows(jnp.concatenate([jnp.zeros_like(jacobian), *terms], axis=1))
-    squares = sum(jnp.sum((x / unit[:, None]) ** 2, axis=1) for x in terms)
+    value, vjp = jax.vjp(evaluate, y, *jnp.zeros(2, y.dtype))
+    one = jnp.eye(value.size, dtype=value.dtype)
+    jacobian, total, squares = jax.vmap(vjp)(one)
+    unit = jnp.ones_like(total)
+    if y.dtype != jnp.float64:  # squares of small energies underflow
+        unit = jnp.where(total > 0, total, 1)
+        _, _, squares = jax.vmap(vjp)(one / unit[:, None].astype(value.dtype))
     return value, jacobian, unit * jnp.sqrt(squares)
+
+
+@jax.custom_vjp
+def _rounded(x: Array, size: Array, total: Array, squares: Array) -> Array:
+    """`x`, which is rounded. The cotangents of the last two are sums over all that is rounded, of
+    the sizes times their adjoints, and of the squares."""
+    del size, total, squares
+    return x
+
+
+def _adjoint(given: tuple[Array, Array], adjoint: Array) -> tuple[Array, ...]:
+    size, total = given
+    terms = jnp.abs(adjoint * size).astype(total.dtype)
+    terms = jnp.where(jnp.isfinite(terms), terms, 0)
+    return adjoint, jnp.zeros_like(size), jnp.sum(terms), jnp.sum(terms**2)
+
+
+_rounded.defvjp(lambda x, size, total, squares: (x, (size, total)), _adjoint)
 
 
 # A value, and how it depends on the state.
@@ -122,26 +134,16 @@ def _is_inexact(*xs: Any) -> bool:
 
 
 def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:
-    """A scan whose operands are changed. A first run finds their sizes."""
     first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
-    consts, init, xs = inputs[:first], inputs[first:last], inputs[last:]
 
-    def run(shifts: list[Array] | None) -> Any:
-        def body(carry: list[Any], x: Any) -> tuple[list[Any], Any]:
-            given, sizes = None if shifts is None else iter(x[1]), []
+    @jax.checkpoint  # so that no step of a long scan is kept
+    def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
+        given = [(value, _COMPUTED) for value in (*inputs[:first], *carry, *x)]
+        outs = [value for value, _ in _inside(params["jaxpr"], given, changed)]
+        return outs[: last - first], outs[last - first :]
 
-            def shifted(x: Any, size: Any) -> Any:
-                sizes.append(size)
-                return x if given is None else x + next(given)
-
-            values = [(x, _COMPUTED) for x in (*consts, *carry, *x[0])]
-            outs = [x for x, _ in _inside(params["jaxpr"], values, shifted)]
-            return outs[: last - first], (outs[last - first :], sizes)
-
-        return jax.lax.scan(body, init, (xs, shifts), params["length"], params["reverse"])
-
-    _, (_, sizes) = run(None)
-    carry, (ys, _) = run([changed(jnp.zeros_like(size), size) for size in sizes])
+    init, xs = inputs[first:last], inputs[last:]
+    carry, ys = jax.lax.scan(body, init, xs, params["length"], params["reverse"])
     return [*carry, *ys]
 
 

@@ -209,3 +209,20 @@ def test_terms_that_no_gradient_shows_are_found(name):
     times = jnp.asarray([50.0, 0.1])
     done = okay(field, energy, dfx.Tsit5(), dfx.ConstantStepSize(), y0, jnp.zeros(100), times)
     assert np.all(done), np.mean(done)
+
+
+def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
+    """Its sums go row by row; what is measured at the start must not keep the rows."""
+
+    def energy(t, q, args):
+        def of_row(row):
+            return jnp.sum(1 / jnp.sqrt(jnp.sum((row - q) ** 2, axis=1) + 1e-4))
+
+        return -jnp.sum(lax.map(jax.checkpoint(of_row), q))
+
+    def start(q, value):
+        return dfc.project(dfc.FirstIntegral(energy), q, value=value)
+
+    q = jax.random.normal(jax.random.key(0), (1000, 3))
+    needed = jax.jit(start).lower(q, energy(0.0, q, None)).compile().memory_analysis()
+    assert needed.temp_size_in_bytes < 100 * q.nbytes, needed  # one array for all pairs is 333
