@@ -127,7 +127,7 @@ def _conserve(
         ratio = relative(g, magnitude + jnp.sum(jnp.abs(jacobian * y), axis=1))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         gram = gram_matrix(jacobian, rows)
-        change = gram_solve(gram + damping * jnp.diag(jnp.diagonal(gram)), g)
+        change = gram_solve(gram * (1 + damping * jnp.eye(g.size, dtype=g.dtype)), g)
         step = combined(change, rows)
         shortening = lax.rsqrt(1 + jnp.sum(step * step) / jnp.square(radius))
         return multipliers - shortening * change
