@@ -15,10 +15,10 @@ from ..._tree import unflatten
 from .cores import AbstractCore, Activation, Gated, Sizes, check_sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import as_states, flatten, stacked_vectors, working_dtype
-from .flow_map import AbstractFlowMap, checked_args, checked_box
+from .flow_map import AbstractFlowMap, checked_args
 from .layer import ConservativeLayer
 from .taylor import Taylor
-from .trainable import LayerSchedule
+from .trainable import LayerSchedule, checked_part
 
 
 @final
@@ -78,12 +78,15 @@ class DeepONet(AbstractFlowMap):
         args_domain: Box | None = None,
     ):
         check_sizes(width=width, depth=depth, latent=latent)
-        if layer is not None and (frame is not None or checked_box(args_domain) is not None):
+        checked_part("layer", layer, ConservativeLayer)
+        checked_part("taylor", taylor, Taylor)
+        checked_part("args_domain", args_domain, Box)
+        if layer is not None and (frame is not None or args_domain is not None):
             raise ValueError(
                 "A flow map with a `frame` or an `args_domain` cannot have a `layer`. Wrap its "
                 "solver in `diffrax_conserve.ManifoldProjection` instead."
             )
-        if checked_box(args_domain) is not None and taylor is not None and taylor.args is not None:
+        if args_domain is not None and taylor is not None and taylor.args is not None:
             raise ValueError(
                 "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
                 "`Taylor(vector_field, order)`."
@@ -95,9 +98,6 @@ class DeepONet(AbstractFlowMap):
         check_number("max_step", max_step, above=0.0, optional=False)
         if max_step == jnp.inf:
             raise ValueError("`max_step` is infinite: give the longest step that is learned.")
-        for name, part, kind in (("layer", layer, ConservativeLayer), ("taylor", taylor, Taylor)):
-            if not isinstance(part, kind | None):
-                raise TypeError(f"`{name}` is {part!r}, but it must be a `{kind.__name__}`.")
         states = as_states(states)
         dtype = working_dtype(states)
         # What the network sees of all states, and the number of functions to be learned.

@@ -15,7 +15,7 @@ from ..._custom_types import Args, RealScalarLike, Y
 from ..._tree import tree_shapes, tree_sub
 from .domain import Box
 from .flat import stacked_vectors, working_dtype
-from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
+from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times, checked_part
 
 
 class AbstractFlowMap(AbstractTrainable):
@@ -98,7 +98,7 @@ class FlowMap(AbstractFlowMap):
     def __init__(self, function: Any):
         self.function, self.max_step = function, function.max_step
         self.order, self.domain = getattr(function, "order", 0), getattr(function, "domain", None)
-        self.args_domain = checked_box(args_domain_of(function))
+        self.args_domain = checked_part("args_domain", args_domain_of(function), Box)
         if self.domain is not None and not callable(getattr(self.domain, "contains", None)):
             raise TypeError(
                 f"The `domain` of the flow map is {self.domain!r}, which has no method "
@@ -132,13 +132,6 @@ def as_flow_map(model: AbstractFlowMap | Callable[..., Any]) -> AbstractFlowMap:
 def args_domain_of(model: Any) -> Box | None:
     """The `args` that a flow map takes as inputs, or `None`."""
     return getattr(model, "args_domain", None)
-
-
-def checked_box(args_domain: Any) -> Box | None:
-    """`args_domain`; raises unless it is `None` or a box, from which `fit` can draw."""
-    if not isinstance(args_domain, Box | None):
-        raise TypeError(f"`args_domain` is {args_domain!r}, but it must be a `learned.Box`.")
-    return args_domain
 
 
 def known_args(flow_map: AbstractFlowMap, args: Args) -> tuple[Args, ...]:

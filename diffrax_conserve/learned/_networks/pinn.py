@@ -16,7 +16,7 @@ from ..._tree import unflatten
 from .cores import MLP, Activation, check_sizes
 from .flat import as_state, flatten, stacked_vectors, working_dtype
 from .layer import ConservativeLayer
-from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times
+from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times, checked_part
 
 
 @final
@@ -125,8 +125,6 @@ class PINN(eqx.Module):
     ):
         check_sizes(width=width, depth=depth, windows=windows)
         check_number("slope", slope, above=0.0)
-        if not isinstance(layer, ConservativeLayer | None):
-            raise TypeError(f"`layer` is {layer!r}, but it must be a `ConservativeLayer`.")
         if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)
@@ -138,7 +136,8 @@ class PINN(eqx.Module):
 
         self.nets = eqx.filter_vmap(net)(key[None] if count == 1 else jr.split(key, count))
         self.y0s = jtu.tree_map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), y0)
-        self.layer, self.scale = layer, flatten(jtu.tree_map(_magnitude, y0))
+        self.layer = checked_part("layer", layer, ConservativeLayer)
+        self.scale = flatten(jtu.tree_map(_magnitude, y0))
 
     def __call__(self, t: RealScalarLike) -> Y:
         """The state at time `t`."""

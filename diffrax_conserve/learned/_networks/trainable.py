@@ -25,6 +25,13 @@ class Points(NamedTuple):
     pairs: Any = None  # pairs of states from data, one for each point
 
 
+def checked_part(name: str, part: Any, kind: type) -> Any:
+    """`part`; raises unless it is `None` or a `kind`."""
+    if not isinstance(part, kind | None):
+        raise TypeError(f"`{name}` is {part!r}, but it must be a `{kind.__name__}`.")
+    return part
+
+
 class AbstractTrainable(eqx.Module):
     """A network whose states are functions of time, which `fit` trains to be solutions."""
 
