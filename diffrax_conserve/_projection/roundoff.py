@@ -2,10 +2,10 @@
 
 In `1 - cos(q)` near zero the terms are about one and the gradient is about zero; in a network the
 terms of the hidden layers cancel. The error of a sum is about one unit of roundoff of the sizes of
-its terms, that of the operand of a function one of its own size. Times their adjoints, and as they
-are independent, they add up to the root of the sum of squares. A product passes relative errors on.
-What does not depend on the state has the same error at each evaluation, which is none here; the
-error of the state itself is in the gradient.
+its terms, that of a cast or of the operand of a function one of its own size. Times their adjoints,
+and as they are independent, they add up to the root of the sum of squares. A product passes
+relative errors on. What does not depend on the state has the same error each time, which is none
+here; the error of the state is in the gradient.
 """
 
 import functools as ft
@@ -26,17 +26,12 @@ from .scalars import walk
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
 _SUMS_OF_PRODUCTS = frozenset({"dot_general", "conv_general_dilated"})
 # An operation with other operations inside is taken as one function, unless it is looked into.
-_NAMES = """
-acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1 fft lgamma log log1p
-logistic pow sin sinh tan tanh
-"""
-_FUNCTIONS = frozenset(_NAMES.split())
+_FUNCTION_NAMES = """acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1
+fft lgamma log log1p logistic pow sin sinh tan tanh"""
 # What these take from the state is still the state.
-_PART_NAMES = """
-broadcast_in_dim concatenate convert_element_type gather reshape rev slice split squeeze stack
-transpose unstack
-"""
-_PARTS = frozenset(_PART_NAMES.split())
+_PART_NAMES = """broadcast_in_dim concatenate gather reshape rev slice split squeeze stack transpose
+unstack"""
+_FUNCTIONS, _PARTS = frozenset(_FUNCTION_NAMES.split()), frozenset(_PART_NAMES.split())
 # How a value depends on the state: not at all, as a part of it, or as computed from it.
 _CONSTANT, _STATE, _COMPUTED = range(3)
 _Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
@@ -80,16 +75,15 @@ def _rounded(x: Array, size: Array, total: Array, squares: Array) -> Array:
 
 def _adjoint(given: tuple[Array, Array], adjoint: Array) -> tuple[Array, ...]:
     size, total = given
-    terms = jnp.abs(adjoint * size).astype(total.dtype)
-    terms = jnp.where(jnp.isfinite(terms), terms, 0)
+    unit = float(jnp.finfo(adjoint.dtype).eps) / float(jnp.finfo(total.dtype).eps)
+    terms = jnp.nan_to_num(unit * jnp.abs(adjoint * size).astype(total.dtype), posinf=0)
     return adjoint, jnp.zeros_like(size), jnp.sum(terms), jnp.sum(terms**2)
 
 
 _rounded.defvjp(lambda x, size, total, squares: (x, (size, total)), _adjoint)
 
 
-# A value, and how it depends on the state.
-_Pair = tuple[Any, int]
+_Pair = tuple[Any, int]  # a value, and how it depends on the state
 
 
 def _inside(closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]) -> list[_Pair]:
@@ -102,17 +96,13 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
     kind = _COMPUTED if kind == _STATE and name not in _PARTS else kind
     inner = params.get("call_jaxpr")
-    if inner is not None and not _has_loop(inner.jaxpr):  # a function with a rule of its own
+    if inner is not None and not _is_opaque(inner.jaxpr):  # a function with a rule of its own
         return _inside(inner, given, changed)
     if name in ("checkpoint", "remat2"):
         return _inside(jex.ClosedJaxpr(params["jaxpr"], ()), given, changed)
     if name == "cond":
-        branches = [_inside(branch, given[1:], changed) for branch in params["branches"]]
-        which = jnp.clip(inputs[0].astype(int), 0, len(branches) - 1)
-        return [
-            (jnp.stack([x for x, _ in outs])[which], max(kind for _, kind in outs))
-            for outs in zip(*branches, strict=True)
-        ]
+        branches = [ft.partial(_values, changed, branch) for branch in params["branches"]]
+        return [(x, kind) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
     if name == "scan":
         return [(x, kind) for x in _scanned(changed, params, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
@@ -123,6 +113,8 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
         sizes = [jnp.abs(x) for x in counted]
         size = sum(sizes) if name == "sub" else evaluate(*sizes)
         return [(changed(evaluate(*inputs), size), _COMPUTED)]
+    if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
+        return [(changed(x := evaluate(*inputs), x), _COMPUTED)]
     if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):
         inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
     outs = evaluate(*inputs)
@@ -133,23 +125,28 @@ def _is_inexact(*xs: Any) -> bool:
     return all(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in xs)
 
 
+def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> list[Any]:
+    """As `_inside`, where all inputs may be computed from the state."""
+    return [x for x, _ in _inside(closed, [(x, _COMPUTED) for x in inputs], changed)]
+
+
 def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:
     first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
 
     @jax.checkpoint  # so that no step of a long scan is kept
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
-        given = [(value, _COMPUTED) for value in (*inputs[:first], *carry, *x)]
-        outs = [value for value, _ in _inside(params["jaxpr"], given, changed)]
+        outs = _values(changed, params["jaxpr"], *inputs[:first], *carry, *x)
         return outs[: last - first], outs[last - first :]
 
-    init, xs = inputs[first:last], inputs[last:]
-    carry, ys = jax.lax.scan(body, init, xs, params["length"], params["reverse"])
+    given = inputs[first:last], inputs[last:]
+    carry, ys = jax.lax.scan(body, *given, params["length"], params["reverse"])
     return [*carry, *ys]
 
 
-def _has_loop(jaxpr: Any) -> bool:
-    """Whether a jaxpr has a loop, through which there is no reverse mode."""
+def _is_opaque(jaxpr: Any) -> bool:
+    """Whether a jaxpr has a loop or callback, through which reverse mode needs a rule."""
     return any(
-        eqn.primitive.name == "while" or any(map(_has_loop, jex.jaxprs_in_params(eqn.params)))
+        eqn.primitive.name in ("while", "pure_callback", "io_callback")
+        or any(map(_is_opaque, jex.jaxprs_in_params(eqn.params)))
         for eqn in jaxpr.eqns
     )

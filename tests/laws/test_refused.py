@@ -180,6 +180,7 @@ HEIGHTS = {
     "checkpoint": jax.checkpoint(height),
     "cond": lambda q: lax.cond(q > 0, height, height, q),
     "scan": lambda q: lax.scan(lambda sum, q: (sum + height(q), None), 0 * q, q[None])[0],
+    "single": lambda q: height(q.astype(jnp.float32)).astype(q.dtype),
 }
 SPRINGS = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
 
@@ -209,6 +210,16 @@ def test_terms_that_no_gradient_shows_are_found(name):
     times = jnp.asarray([50.0, 0.1])
     done = okay(field, energy, dfx.Tsit5(), dfx.ConstantStepSize(), y0, jnp.zeros(100), times)
     assert np.all(done), np.mean(done)
+
+
+@pytest.mark.usefixtures("errors_raise")
+def test_a_branch_that_is_not_taken_does_not_run():
+
+    def energy(t, y, args):
+        return jnp.sum(eqx.error_if(y, jnp.abs(y) > 1e3, "too large") ** 2)
+
+    _, info = dfc.project(dfc.FirstIntegral(energy, value=1.0), jnp.array([0.3, 1.2]))
+    assert info.ok
 
 
 def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
