@@ -42,9 +42,10 @@ _MAGIC, _VERSION = b"diffrax-conserve network ", 4
 _NETWORKS = (PINN, DeepONet, Repeated, Transformed, BoxCox, Product, Concatenated, Gated, MLP)
 _PARTS = (Box, FramedBox, ConservativeLayer, Taylor, FirstIntegral, Constraint)
 _CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (*_NETWORKS, *_PARTS, *CLASSES)}
+_DTYPES = ("float64", "float32", "float16", "bfloat16", "int64", "int32", "bool")
 # No network needs more. It limits what a small file can make this package compute.
 _INTEGER_MAX = 100_000
-# Fields that must be of a class, because a network is built without its `__init__`.
+# Fields that must be of a certain class, because a network is built without its `__init__`.
 _KINDS = {"layer": ConservativeLayer | None, "taylor": Taylor | None, "transformation": BoxCox}
 # The fields with functions, of which `load` can be given the whole part: for each, the attribute
 # that must agree, and the argument of `load`.
@@ -228,7 +229,7 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
         return {kind.__name__: [_describe(item, arrays) for item in x]}
     if kind is dict and all(isinstance(key, str) for key in x):
         return {"dict": {key: _describe(x[key], arrays) for key in x}}
-    if isinstance(x, jax.Array):
+    if isinstance(x, jax.Array) and x.dtype.name in _DTYPES:
         arrays.append(np.asarray(x))
         return {"array": [x.dtype.name, *x.shape]}
     if names := [name for name, function in ACTIVATIONS.items() if function is x]:
@@ -237,22 +238,24 @@ def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
     if owner is not None and _method(owner, name) == x:
         return {"method": [name, _describe(owner, arrays)]}
     if _CLASSES.get(kind.__name__) is kind:
-        described = {}
-        for field in (field.name for field in dataclasses.fields(x)):
-            count, part = len(arrays), getattr(x, field)
-            try:
-                described[field] = _describe(part, arrays)
-            except TypeError:
-                if field not in _GIVEN:
-                    raise
-                del arrays[count:]
-                described[field] = {"given": [field, getattr(part, _GIVEN[field][0], None)]}
-        return {kind.__name__: described}
+        names = [field.name for field in dataclasses.fields(_CLASSES[kind.__name__])]
+        return {kind.__name__: {f: _describe_field(f, getattr(x, f), arrays) for f in names}}
     raise TypeError(
         f"The network holds {x!r:.200}, which a file cannot describe: neither a number, array, "
         "string, tuple, list, dictionary or named activation function, nor a part of a `PINN` or "
         "`DeepONet` of this package. Use `equinox.tree_serialise_leaves`."
     )
+
+
+def _describe_field(field: str, value: Any, arrays: list[np.ndarray]) -> Any:
+    count = len(arrays)
+    try:
+        return _describe(value, arrays)
+    except TypeError:
+        if field not in _GIVEN:
+            raise
+        del arrays[count:]
+        return {"given": [field, getattr(value, _GIVEN[field][0], None)]}
 
 
 def _method(system: Any, name: str) -> Any:
@@ -293,12 +296,13 @@ def _build(described: Any, body: io.BytesIO, given: dict[str, Any]) -> Any:
 
 
 def _array(body: io.BytesIO, name: str, *shape: int) -> jax.Array:
-    dtype = jnp.dtype(name)
-    # An empty array could have any number of columns.
-    if dtype.itemsize * math.prod(max(n, 1) for n in shape) > 8 + len(body.getbuffer()):
+    dtype = np.dtype(jnp.dtype(_DTYPES[_DTYPES.index(name)]))
+    # The factors of an empty array could be of any size.
+    size = dtype.itemsize * math.prod(max(n, 1) for n in shape)
+    if min(shape, default=0) < 0 or size > 8 + len(body.getbuffer()):
         raise ValueError("its arrays are larger than the file")
-    numbers = np.frombuffer(body.read(dtype.itemsize * math.prod(shape)), dtype)
-    return jnp.asarray(numbers.reshape(shape))
+    data = body.read(dtype.itemsize * math.prod(shape))
+    return jnp.asarray(np.frombuffer(data, dtype).reshape(shape))
 
 
 def _module(kind: Any, fields: dict[str, Any]) -> Any:
