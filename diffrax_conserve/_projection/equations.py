@@ -192,6 +192,15 @@ def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float
 
 def gram_solve(gram: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """`gram⁻¹ b`, for a matrix not symmetric in general."""
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype)))
+
+
+def eliminated(
+    gram: Float[Array, "m m"], b: Float[Array, " m"], rows: Float[Array, "m n"]
+) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
+    `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
+    in the sum, which is wrong if XLA evaluates `b` once for each."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         one, diagonal = _one(gram), jnp.abs(jnp.diagonal(gram))
@@ -201,31 +210,19 @@ def gram_solve(gram: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array,
         lu, x = jsp.linalg.lu_factor(scaled + _added(gram) * one), jnp.zeros_like(right)
         for _ in range(3):  # which removes what is added
             x = x + jsp.linalg.lu_solve(lu, right - scaled @ x)
-        return x.astype(dtype) * unit
+        return x.astype(dtype) * unit, rows
     least = 4 * m * float(jnp.finfo(dtype).eps)
-    if m == 2:  # with one division, because XLA compiles each into a kernel of its own
-        (a, b01), (b10, d) = gram[0], gram[1]
-        det = a * d - b01 * b10
-        regular, first = jnp.abs(det) > least * jnp.abs(a * d), a != 0
-        divisor = jnp.where(regular, det, jnp.where(first, a, d))
-        upper = jnp.where(regular, d * b[0] - b01 * b[1], jnp.where(first, b[0], 0))
-        lower = jnp.where(regular, a * b[1] - b10 * b[0], jnp.where(first, 0, b[1]))
-        return jnp.stack([upper, lower]) / jnp.where(divisor == 0, jnp.inf, divisor)
-    rows = [[gram[i, j] for j in range(m)] for i in range(m)]
-    x, pivots = [b[i] for i in range(m)], []
+    u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
     for k in range(m):
-        regular = jnp.abs(rows[k][k]) > least * jnp.abs(gram[k, k])
-        pivots.append(jnp.where(regular, rows[k][k], jnp.inf))
+        regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
+        pivot = jnp.where(regular, u[k][k], jnp.inf)
         for i in range(k + 1, m):
-            share = rows[i][k] / pivots[k]
-            x[i] = x[i] - share * x[k]
+            below, right = u[i][k] / pivot, u[k][i] / pivot
+            x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
             for j in range(k + 1, m):
-                rows[i][j] = rows[i][j] - share * rows[k][j]
-    for k in reversed(range(m)):
-        for j in range(k + 1, m):
-            x[k] = x[k] - rows[k][j] * x[j]
-        x[k] = x[k] / pivots[k]
-    return jnp.stack(x)
+                u[i][j] = u[i][j] - below * u[k][j]
+        x[k] = x[k] / pivot
+    return jnp.stack(x), jnp.stack(d)
 
 
 def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:

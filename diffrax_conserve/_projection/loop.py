@@ -23,6 +23,7 @@ from .equations import (
     Equations,
     any_lane,
     combined,
+    eliminated,
     gram_matrix,
     gram_solve,
     inverse_factor,
@@ -199,7 +200,11 @@ def _corrected(equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: 
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
-        multiplier = gram_solve(gram_matrix(unit, rows), g / sizes)
+        gram, right = gram_matrix(unit, rows), g / sizes
+        if equations.clip is None:
+            multiplier, rows = eliminated(gram, right, rows)
+        else:
+            multiplier = gram_solve(gram, right)
     change = combined(multiplier, rows)
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
@@ -276,7 +281,7 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     t_y, t_g = tree_tangents((y, multiplier), tangent)
     _, jacobian = equations.linearise(y)
     heights, unit = scaled_rows(jacobian)
-    t_y = t_y - combined(gram_solve(gram_matrix(unit, rows), t_g / heights), rows)
+    t_y = t_y - combined(*eliminated(gram_matrix(unit, rows), t_g / heights, rows))
     # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
     factor = jnp.where(ok, certain(equations, candidate, y, jacobian, directions), 1)
     return (y, ok, count), (lax.stop_gradient(factor) * t_y, None, None)

@@ -27,7 +27,7 @@ _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
 _SUMS_OF_PRODUCTS = frozenset({"dot_general", "conv_general_dilated"})
 # An operation with other operations inside is taken as one function, unless it is looked into.
 _FUNCTION_NAMES = """acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1
-fft lgamma log log1p logistic pow sin sinh tan tanh"""
+fft lgamma log log1p logistic lu pow sin sinh tan tanh"""
 # What these take from the state is still the state.
 _PART_NAMES = """broadcast_in_dim concatenate gather reshape rev slice split squeeze stack transpose
 unstack"""
@@ -111,8 +111,8 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
         counted = (x if products or of == _COMPUTED else jnp.zeros_like(x) for x, of in given)
         sizes = [jnp.abs(x) for x in counted]
-        size = sum(sizes) if name == "sub" else evaluate(*sizes)
-        return [(changed(evaluate(*inputs), size), _COMPUTED)]
+        size, x = sum(sizes) if name == "sub" else evaluate(*sizes), evaluate(*inputs)
+        return [(changed(x, jnp.maximum(size, jnp.abs(x))), _COMPUTED)]
     if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
         return [(changed(x := evaluate(*inputs), x), _COMPUTED)]
     if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):

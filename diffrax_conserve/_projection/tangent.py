@@ -25,7 +25,7 @@ from .._manifold import (
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
-from .equations import combined, equations_of, gram_matrix, gram_solve, scaled_rows
+from .equations import combined, eliminated, equations_of, gram_matrix, gram_solve, scaled_rows
 from .options import check_state, inverse_metric, positive_weights
 from .scalars import written_out
 
@@ -154,8 +154,8 @@ class TangentField(eqx.Module):
             _, jacobian = equations.linearise(vector)
             sizes, unit = scaled_rows(jacobian)
             rows = equations.weighted(unit)
-            multiplier = gram_solve(gram_matrix(unit, rows), wrong / sizes)
-            return combined(multiplier, rows), multiplier / sizes
+            gram, right = gram_matrix(unit, rows), wrong / sizes
+            return combined(*eliminated(gram, right, rows)), gram_solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)

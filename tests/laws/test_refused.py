@@ -19,7 +19,7 @@ ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-7)
 @eqx.filter_vmap(in_axes=(None, None, None, None, 0, 0, None))
 def okay(field, fn, solver, controller, y0, args, times):
     t1, dt0 = times
-    solver = dfc.ManifoldProjection(solver, dfc.FirstIntegral(fn))
+    solver = dfc.ManifoldProjection(solver, jax.tree.map(dfc.FirstIntegral, fn))
     options = dict(stepsize_controller=controller, max_steps=4096, throw=False)
     sol = solve(field, solver, y0, t1=t1, dt0=dt0, args=args, **options)
     return dfx.is_okay(sol.result)
@@ -115,6 +115,30 @@ def test_a_small_vibration_far_from_the_origin_is_solved(centre):
     assert np.all(done), amplitude[~np.asarray(done)][:5]
 
 
+def kepler(t, y, args):
+    return jnp.concatenate([y[2:], -y[:2] / jnp.sum(y[:2] ** 2) ** 1.5])
+
+
+KEPLER = (
+    lambda t, y, args: jnp.sum(y[2:] ** 2) / 2 - 1 / jnp.sqrt(jnp.sum(y[:2] ** 2)),
+    lambda t, y, args: y[0] * y[3] - y[1] * y[2],
+)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_almost_circular_orbits_in_a_batch_are_solved(dtype):
+    """Gradients are nearly parallel, so multipliers are large, and cancel in the correction."""
+    rng = np.random.default_rng(6)
+    e, angle = 10 ** rng.uniform(-9, -1, 500), rng.uniform(0, 2 * np.pi, 500)
+    radius, cos, sin = (1 - e**2) / (1 + e * np.cos(angle)), np.cos(angle), np.sin(angle)
+    speed = 1 / np.sqrt(1 - e**2)
+    y0 = np.stack([radius * cos, radius * sin, -speed * sin, speed * (e + cos)], axis=1)
+    times = jnp.asarray([2 * np.pi, 2 * np.pi / 80], dtype)
+    given = kepler, KEPLER, dfx.Tsit5(), dfx.ConstantStepSize()
+    done = okay(*given, y0.astype(dtype), jnp.zeros(500, dtype), times)
+    assert np.all(done), e[~np.asarray(done)][:5]
+
+
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
 # mass in electron masses.
 MOLECULES = {
@@ -189,9 +213,24 @@ def pendulum_of(height):
     return pendulum, lambda t, y, args: y[1] ** 2 / 2 + height(y[0]), 1e-3, 2
 
 
-# Pendulums whose height is inside other operations, and a chain of springs far from the origin,
-# where the products of the stiffness matrix cancel.
+NUMBERS = np.arange(1.0, 9.0)
+
+
+def determinant_energy(t, y, args):
+    matrix = jnp.diag(NUMBERS * (1 + y[0] ** 2)) + 1e5
+    return jnp.sum(y**2) / 2 + jnp.linalg.slogdet(matrix)[1] / 2
+
+
+def in_determinant(t, y, args):
+    a = 1 + y[0] ** 2
+    return jnp.stack([y[1], -y[0] * (1 + 7 / a + 1 / (a + 1e5 * np.sum(1 / NUMBERS)))])
+
+
+# Pendulums whose height is inside other operations, a determinant in whose elimination large
+# numbers cancel, and a chain of springs far from the origin, where the products of the stiffness
+# matrix cancel.
 HIDDEN = {name: pendulum_of(height) for name, height in HEIGHTS.items()} | {
+    "determinant": (in_determinant, determinant_energy, 1.0, 2),
     "matrix": (
         lambda t, y, args: jnp.concatenate([y[3:], -SPRINGS @ y[:3]]),
         lambda t, y, args: (y[3:] @ y[3:] + y[:3] @ SPRINGS @ y[:3]) / 2,
