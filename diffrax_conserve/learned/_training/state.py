@@ -30,6 +30,7 @@ class FitState(eqx.Module):
     finished: int = 0
     passes: int = 0  # number of earlier passes over the windows, each with a smaller limit
     tightening: float = 1.0  # by which the limit of a window's error is divided
+    first: Any = None  # the first window of a PINN as it was given
     # The records of all networks without the present one.
     losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
     criteria: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))

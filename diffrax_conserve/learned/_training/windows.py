@@ -41,6 +41,7 @@ def train_windows(
     """Trains the windows one after the other, and estimates the error of the whole solution."""
     windows = _Windows(loop, pinn, manifold)
     state = loop.begin(tuple(map(pinn.window, range(pinn.windows))), given)
+    state = state if given else dataclasses.replace(state, first=pinn.window(0))
     # Compiled here, so that it takes no time of the training.
     windows.errors_along(windows.halved(state))
     shown, carry, ended = state, state.carry, "epochs"
@@ -109,8 +110,8 @@ class _Windows:
         """The largest error of the solution in each window, with what earlier windows add to it."""
         error, end, paths = jnp.zeros_like(self.pinn.scale), self.pinn.y0, []
         for window in state.networks:
-            # The window may start at another state, but the exact solution is continuous.
-            error = error + flatten(end) - flatten(window.y0)
+            # A window may start at another state. The solution is continuous, but for roundoff.
+            error = error + flatten(end) - flatten(window.y0) + jnp.spacing(flatten(end)) / 2
             paths.append(window_errors(window, self.loop.problem, error))
             error, (_, end) = paths[-1].end[0], _end(window)
         size = np.max([np.asarray(path.size[0]) for path in paths], axis=0)
@@ -144,9 +145,9 @@ class _Windows:
         failed = ~(np.array(state.errors) <= self.limits(state))
         # After a window that has finally failed the others start at a wrong state.
         lost = bool(np.any(failed[:k]))
-        shortest = (self.pinn.t1 - self.pinn.t0) / self.pinn.windows / 2**self.retries
+        shortest = 1.5 * state.first.length / 2**self.retries
         following: FitState | None = None
-        if failed[k] and not lost and self.retries and state.networks[k].length > 1.5 * shortest:
+        if failed[k] and not lost and self.retries and state.networks[k].length > shortest:
             following = self.halved(state)
         elif k + 1 < failed.size:
             following = dataclasses.replace(state, present=k + 1)
@@ -160,8 +161,7 @@ class _Windows:
         window, (first, last) = state.networks[k], self.edges(state)[k : k + 2]
         middle = (first + last) / 2
         # In a shorter window the state changes less, and so do the outputs.
-        size = jnp.asarray((middle - first) * pinn.windows / (pinn.t1 - pinn.t0), pinn.scale.dtype)
-        slope = initial_slope(pinn.window(0).net)
+        size, slope = (middle - first) / state.first.length, initial_slope(state.first.net)
 
         def half(key: PRNGKeyArray, first: float, last: float) -> Window:
             return pinn.window_of(fresh(window.net, slope, size, key), window.y0, first, last)
