@@ -13,13 +13,15 @@ CODE = """
 import json, sys
 import diffrax, diffrax_conserve
 modules, messages = list(sys.modules), len(diffrax.RESULTS._index_to_message)
-print(json.dumps({"modules": modules, "messages": messages}))
+from tests.laws.test_refused import almost_circular_failures
+failures = {dtype: almost_circular_failures(dtype) for dtype in ("float64", "float32")}
+print(json.dumps({"modules": modules, "messages": messages, "failures": failures}))
 """
 
 
 @functools.cache
 def interpreter() -> dict:
-    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    environment = {**os.environ, "XLA_FLAGS": "", "JAX_ENABLE_X64": "1"}
     done = subprocess.run(
         [sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=False
     )

@@ -10,6 +10,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
+from .. import fresh
 from ..problems import solve
 
 ADAPTIVE = dfx.PIDController(rtol=1e-4, atol=1e-7)
@@ -125,9 +126,7 @@ KEPLER = (
 )
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_almost_circular_orbits_in_a_batch_are_solved(dtype):
-    """Gradients are nearly parallel, so multipliers are large, and cancel in the correction."""
+def almost_circular_failures(dtype):
     rng = np.random.default_rng(6)
     e, angle = 10 ** rng.uniform(-9, -1, 500), rng.uniform(0, 2 * np.pi, 500)
     radius, cos, sin = (1 - e**2) / (1 + e * np.cos(angle)), np.cos(angle), np.sin(angle)
@@ -136,7 +135,13 @@ def test_almost_circular_orbits_in_a_batch_are_solved(dtype):
     times = jnp.asarray([2 * np.pi, 2 * np.pi / 80], dtype)
     given = kepler, KEPLER, dfx.Tsit5(), dfx.ConstantStepSize()
     done = okay(*given, y0.astype(dtype), jnp.zeros(500, dtype), times)
-    assert np.all(done), e[~np.asarray(done)][:5]
+    return e[~np.asarray(done)].tolist()
+
+
+def test_almost_circular_orbits_in_a_batch_are_solved():
+    """Multipliers of nearly parallel gradients are large, and cancel in the correction. By default
+    flags, but not by those of the tests, XLA evaluates the residuals once for each multiplier."""
+    assert fresh.interpreter()["failures"] == {"float64": [], "float32": []}
 
 
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
