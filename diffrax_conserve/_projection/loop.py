@@ -197,15 +197,14 @@ def _corrected(equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: 
     if kept.inverse is not None:
         x = combined(g.astype(kept.inverse.dtype), kept.inverse.T)
         rows, multiplier = kept.rows, combined(x, kept.inverse).astype(g.dtype)
+        change = combined(multiplier, rows)
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
         gram, right = gram_matrix(unit, rows), g / sizes
-        if equations.clip is None:
-            multiplier, rows = eliminated(gram, right, rows)
-        else:
-            multiplier = gram_solve(gram, right)
-    change = combined(multiplier, rows)
+        change = combined(*eliminated(gram, right, rows))
+        used = equations.clip is not None or equations.may_vanish
+        multiplier = gram_solve(gram, right) if used else right
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: a true zero is never small relative to itself.
