@@ -216,10 +216,11 @@ def verdict(
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
     size = jnp.abs(candidate)
-    # One sum, hence one kernel. A correction within the second term is allowed in any step.
+    # One sum, hence one kernel. A correction within the last term is allowed in any step: where
+    # gradients are nearly parallel, roundoff alone moves the state by its root.
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    excess = jnp.sum(correction - share * moved - float(info.eps) ** 0.75 * size)
+    excess = jnp.sum(correction - share * moved - max(2e-8, float(info.eps) ** 0.75) * size)
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
