@@ -4,8 +4,8 @@ In `1 - cos(q)` near zero the terms are about one and the gradient is about zero
 terms of the hidden layers cancel. The error of a sum is about one unit of roundoff of the sizes of
 its terms, that of a cast or of the operand of a function one of its own size. Times their adjoints,
 and as they are independent, they add up to the root of the sum of squares. A product passes
-relative errors on. What does not depend on the state has the same error each time, which is none
-here; the error of the state is in the gradient.
+relative errors on. A function of what does not depend on the state has the same error each time,
+which is none here; the error of the state is in the gradient.
 """
 
 import functools as ft
@@ -109,10 +109,10 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     products = name in _SUMS_OF_PRODUCTS
     computed = any(of == _COMPUTED for _, of in given)
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
-        counted = (x if products or of == _COMPUTED else jnp.zeros_like(x) for x, of in given)
+        counted = (x if products or of != _STATE else jnp.zeros_like(x) for x, of in given)
         sizes = [jnp.abs(x) for x in counted]
-        size, x = sum(sizes) if name == "sub" else evaluate(*sizes), evaluate(*inputs)
-        return [(changed(x, jnp.maximum(size, jnp.abs(x))), _COMPUTED)]
+        size = sum(sizes) if name == "sub" else evaluate(*sizes)
+        return [(changed(evaluate(*inputs), size), _COMPUTED)]
     if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
         return [(changed(x := evaluate(*inputs), x), _COMPUTED)]
     if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):

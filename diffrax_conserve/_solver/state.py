@@ -215,12 +215,12 @@ def verdict(
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    size = jnp.abs(candidate)
-    # One sum, hence one kernel. A correction within the last term is allowed in any step: where
-    # gradients are nearly parallel, roundoff alone moves the state by its root.
+    size, root = jnp.abs(candidate), float(info.eps) ** 0.5
+    # One sum, hence one kernel. In any step a component may change by the root of roundoff, as
+    # roundoff alone moves the state where gradients are nearly parallel.
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    excess = jnp.sum(correction - share * moved - max(2e-8, float(info.eps) ** 0.75) * size)
+    excess = jnp.sum(correction - jnp.maximum(share * moved, root * size))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
@@ -231,5 +231,5 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved very short steps tell nothing.
-    near = jnp.sum(moved - max(1e-5, float(info.eps) ** 0.5) * size) <= 0
+    near = jnp.sum(moved - max(1e-5, 4 * root) * size) <= 0
     return cause, near | instant | lost
