@@ -55,11 +55,10 @@ def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
         check_number(name + jtu.keystr(path), leaf, least=least)
 
 
-def check_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
-    if value < 1:
-        raise ValueError(f"`{name}` is {value}, but it must be at least 1.")
+def check_counts(**counts: Any) -> None:
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"`{name}` is {value!r}, but it must be a positive integer.")
 
 
 def check_function(name: str, fn: Any, call: str, returns: str) -> None:
@@ -96,3 +95,16 @@ def check_solution(sol: Any, user: str) -> None:
             f"`sol` is of type `{type(sol).__name__}`, but `{user}` takes the `diffrax.Solution` "
             "that `diffrax.diffeqsolve` returned."
         )
+
+
+def found_in(sol: Any, kind: type, user: str, solver: str) -> Any:
+    """What of a `kind` is in the state of the solver; raises if there is nothing."""
+    check_solution(sol, user)
+    is_one = lambda x: isinstance(x, kind)  # noqa: E731
+    found = [*filter(is_one, jtu.tree_leaves(sol.solver_state, is_leaf=is_one))]
+    if not found:
+        raise ValueError(
+            f"`sol` holds no `{kind.__name__}`. Solve with {solver}, and with "
+            "`saveat=SaveAt(..., solver_state=True)`."
+        )
+    return found[0]

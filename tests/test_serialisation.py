@@ -194,18 +194,11 @@ def test_bad_files(path, change, match):
         dfc.load(path)
 
 
-@pytest.mark.parametrize(
-    ("path", "error", "match"),
-    [
-        (3, TypeError, "os.PathLike"),  # an open file
-        (b"a.network", TypeError, "os.PathLike"),
-        ("/dev/zero", ValueError, "is a folder or a device"),
-        ("/", ValueError, "is a folder or a device"),
-    ],
-)
-def test_what_is_no_file(path, error, match):
+# 3 could be an open file.
+@pytest.mark.parametrize("path", [3, None, b"a.network", "/dev/zero", "/"])
+def test_what_is_no_file(path):
     for function in (dfc.load, dfc.learned.read_info, lambda p: dfc.save(p, NETWORKS["pinn"])):
-        with pytest.raises(error, match=match):
+        with pytest.raises(ValueError, match="`path` is "):
             function(path)
 
 

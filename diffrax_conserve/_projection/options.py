@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Y
-from .._options import check_count, check_number, check_numbers, dtype_of
+from .._options import check_counts, check_number, check_numbers, dtype_of
 from .._tree import ravel, real_view
 
 
@@ -24,7 +24,7 @@ def check_options(projection: Any) -> None:
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):
-        check_count("max_steps", projection.max_steps)
+        check_counts(max_steps=projection.max_steps)
     for name in ("lower", "upper"):
         check_numbers(name, getattr(projection, name, None), least=-math.inf)
 

@@ -12,7 +12,7 @@ from .._balance import has_rates
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import FirstIntegral, check_manifold, conserved_values, named_entries
-from .._options import check_count, check_number
+from .._options import check_counts, check_number
 from .._projection.base import AbstractProjection, Target, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
@@ -95,7 +95,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_projection(self.projection)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
-        check_count("every", self.every)
+        check_counts(every=self.every)
         bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
         if bounds != [None, None] and self.every > 1:
             raise ValueError(

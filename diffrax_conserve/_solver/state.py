@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry
-from .._options import check_solution
+from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
 from .._projection.roundoff import hidden_scale
@@ -142,18 +142,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
           roundoff         0.0e+00
         ```
     """
-    check_solution(sol, "statistics")
-
-    def is_one(x: Any) -> bool:
-        return isinstance(x, ProjectionStatistics)
-
-    found = [*filter(is_one, jtu.tree_leaves(sol.solver_state, is_leaf=is_one))]
-    if not found:
-        raise ValueError(
-            "`sol` holds no state of a `ManifoldProjection`. Solve with one, and with "
-            "`saveat=SaveAt(..., solver_state=True)`."
-        )
-    return found[0]
+    return found_in(sol, ProjectionStatistics, "statistics", "a `ManifoldProjection`")
 
 
 class State(eqx.Module):

@@ -150,7 +150,7 @@ def pretrained_path(name: str) -> Path:
     [`diffrax_conserve.load_pretrained`][]. Raises a `ValueError` for another name."""
     folder = Path(__file__).parents[1] / "pretrained"
     known = {file.stem: file for file in sorted(folder.glob("*.network"))}
-    if name not in known:
+    if str(name) not in known:
         raise ValueError(f"There is no pretrained network {name!r}. Known: {', '.join(known)}.")
     return known[name]
 
@@ -207,10 +207,10 @@ def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
 
 
 def _file(path: Any) -> Path:
-    path = Path(path)
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is a folder or a device, but it must be a file.")
-    return path
+    known = isinstance(path, str | os.PathLike)
+    if not known or (Path(path).exists() and not Path(path).is_file()):
+        raise ValueError(f"`path` is {path!r}, but it must be the path of a file.")
+    return Path(path)
 
 
 # ---- The description ----

@@ -72,7 +72,7 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: solution(width=0), ValueError, "`width`"),
         (lambda: solution(depth=-1), ValueError, "`depth`"),
         (lambda: solution(activation="tan"), ValueError, "`activation`"),
-        (lambda: solution(windows=0), ValueError, "`windows` must be"),
+        (lambda: solution(windows=0), ValueError, "`windows` is 0, but it must be"),
         (lambda: solution(slope=-1.0), ValueError, "`slope` is -1.0, but it must be positive"),
         (lambda: solution(t1=0.0), ValueError, "`t0` must be less than `t1`"),
         (lambda: solution(t1=jnp.inf), ValueError, "they are 0.0 and inf"),
@@ -88,7 +88,7 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: dfc.DeepONet((EAST, LORENZ.y0), 1.0, key=KEY), ValueError, "leading axis"),
         (lambda: dfc.DeepONet(LORENZ.sample, 1.0, key=KEY), TypeError, "Draw states from it"),
         (lambda: dfc.PINN(jnp.array([1j]), 0.0, 1.0, key=KEY), TypeError, "complex"),
-        (lambda: dfc.learned.Taylor(LORENZ.vector_field, 0), ValueError, "`order` must be a posit"),
+        (lambda: dfc.learned.Taylor(LORENZ.vector_field, 0), ValueError, "`order` is 0, but it must be a posit"),
     ],
 )
 def test_mistakes_are_named(make, error, match):

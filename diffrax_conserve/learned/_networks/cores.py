@@ -99,12 +99,6 @@ def fresh(net: MLP, slope: float | None, size: Float[Array, ""], key: PRNGKeyArr
     return eqx.tree_at(lambda net: net.weights[-1], new, size * new.weights[-1])
 
 
-def check_sizes(**sizes: int) -> None:
-    for name, size in sizes.items():
-        if not isinstance(size, int) or size < 1:
-            raise ValueError(f"`{name}` must be a positive integer, but is {size!r}.")
-
-
 # ---- Architectures ----
 
 

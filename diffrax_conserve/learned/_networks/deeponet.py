@@ -10,11 +10,11 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._options import check_number
+from ..._options import check_counts
 from ..._tree import unflatten
-from .cores import AbstractCore, Activation, Gated, Sizes, check_sizes, find_activation
+from .cores import AbstractCore, Activation, Gated, Sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
-from .flat import as_states, flatten, stacked_vectors, working_dtype
+from .flat import as_states, check_key, check_scalars, flatten, stacked_vectors, working_dtype
 from .flow_map import AbstractFlowMap, checked_args
 from .layer import ConservativeLayer
 from .taylor import Taylor
@@ -77,7 +77,8 @@ class DeepONet(AbstractFlowMap):
         layer: ConservativeLayer | None = None,
         args_domain: Box | None = None,
     ):
-        check_sizes(width=width, depth=depth, latent=latent)
+        check_counts(width=width, depth=depth, latent=latent)
+        check_key(key)
         checked_part("layer", layer, ConservativeLayer)
         checked_part("taylor", taylor, Taylor)
         checked_part("args_domain", args_domain, Box)
@@ -95,7 +96,7 @@ class DeepONet(AbstractFlowMap):
             raise TypeError(
                 f"`core` is {core!r}, but it must be `learned.Gated`, `Concatenated` or `Product`."
             )
-        check_number("max_step", max_step, above=0.0, optional=False)
+        check_scalars(max_step=max_step, above=0.0, optional=False)
         if max_step == jnp.inf:
             raise ValueError("`max_step` is infinite: give the longest step that is learned.")
         states = as_states(states)

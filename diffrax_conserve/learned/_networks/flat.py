@@ -1,7 +1,9 @@
-"""Conversion of states to vectors, the inputs and outputs of a network."""
+"""What a network is given: states, which it takes and returns as vectors, and checks."""
 
 import functools as ft
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -9,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree, Real, Shaped
 
 from ..._custom_types import Y
-from ..._options import ONE_STATE
+from ..._options import ONE_STATE, check_number, is_real
 from ..._printing import is_traced
 
 
@@ -33,16 +35,30 @@ def flatten(y: Y) -> Float[Array, " n"]:
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
 
 
+def check_key(key: Any) -> None:
+    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
+        raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
+
+
+def check_scalars(
+    *, least: Any = None, above: Any = None, optional: bool = True, **values: Any
+) -> None:
+    for name, value in values.items():
+        if np.ndim(value):
+            raise TypeError(f"`{name}` is {value!r}, but it must be one number.")
+        check_number(name, value, least=least, above=above, optional=optional)
+
+
 def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`y` with arrays as leaves; raises unless they are real and floating-point."""
     leaves = jtu.tree_leaves(y)
-    if not leaves:
-        raise ValueError("The state has no arrays: there is nothing to learn.")
-    if any(jnp.issubdtype(jnp.result_type(x), jnp.complexfloating) for x in leaves):
+    if wrong := [x for x in leaves if not is_real(x)]:
         raise TypeError(
-            "The state has a complex leaf, but a network needs real states. Split it into its real "
-            "and its imaginary part."
+            f"The state has the leaf {wrong[0]!r}, but a network needs real numbers. Split complex "
+            "ones into real and imaginary parts."
         )
+    if not any(jnp.size(x) for x in leaves):
+        raise ValueError("The state has no numbers: there is nothing to learn.")
 
     def floating(leaf: ArrayLike) -> Array:
         dtype = jnp.result_type(leaf)

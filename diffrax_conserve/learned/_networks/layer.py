@@ -13,10 +13,10 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
+from ..._options import check_counts
 from ..._projection.equations import combined, equations_of, gram_matrix, gram_solve, relative
 from ..._projection.scalars import written_out
 from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
-from .cores import check_sizes
 
 
 @final
@@ -60,7 +60,7 @@ class ConservativeLayer(eqx.Module):
     def __check_init__(self):
         check_manifold(self.manifold)
         refuse_rates(self.manifold, "a `ConservativeLayer`")
-        check_sizes(steps=self.steps)
+        check_counts(steps=self.steps)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
         """The conserved values of the solution through `y0`."""

@@ -11,10 +11,10 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
-from ..._options import check_number
+from ..._options import check_counts
 from ..._tree import unflatten
-from .cores import MLP, Activation, check_sizes
-from .flat import as_state, flatten, stacked_vectors, working_dtype
+from .cores import MLP, Activation
+from .flat import as_state, check_key, check_scalars, flatten, stacked_vectors, working_dtype
 from .layer import ConservativeLayer
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times, checked_part
 
@@ -123,8 +123,10 @@ class PINN(eqx.Module):
         slope: float | None = 2.0,
         layer: ConservativeLayer | None = None,
     ):
-        check_sizes(width=width, depth=depth, windows=windows)
-        check_number("slope", slope, above=0.0)
+        check_counts(width=width, depth=depth, windows=windows)
+        check_scalars(slope=slope, above=0.0)
+        check_scalars(t0=t0, t1=t1, optional=False)
+        check_key(key)
         if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)

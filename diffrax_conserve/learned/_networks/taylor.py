@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ..._custom_types import Args, RealScalarLike, Y
-from .cores import check_sizes
+from ..._options import check_counts
 
 
 @final
@@ -42,7 +42,7 @@ class Taylor(eqx.Module):
     args: Args = eqx.field(kw_only=True, default=None)
 
     def __check_init__(self):
-        check_sizes(order=self.order)
+        check_counts(order=self.order)
         if not callable(self.vector_field):
             raise TypeError(
                 f"`vector_field` is {self.vector_field!r}, not a function `(t, y, args)`."

@@ -13,8 +13,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike, Y
+from ..._options import check_counts
 from ..._tree import unflatten
-from .cores import check_sizes
 from .domain import Box
 from .flat import flatten
 from .flow_map import AbstractFlowMap, args_domain_of, as_flow_map
@@ -90,7 +90,7 @@ class Repeated(AbstractWrapper):
         self.flow_map, self.count = as_flow_map(flow_map), count
 
     def __check_init__(self):
-        check_sizes(count=self.count)
+        check_counts(count=self.count)
 
     def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
         """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""

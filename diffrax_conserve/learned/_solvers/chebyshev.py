@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
+from numpy.polynomial import chebyshev
 
 from ..._custom_types import RealScalarLike, Y
 from ..._tree import tree_sub
@@ -80,18 +81,13 @@ def chebyshev_points(count: int) -> np.ndarray:
 @ft.cache
 def to_coefficients(count: int) -> np.ndarray:
     """The matrix from values at the points to the coefficients of the series."""
-    n = count - 1
-    index = np.arange(count)
-    # T_j at -cos(pi k / n); the sums of a type-I discrete cosine transform have halved ends.
-    cosines = np.cos(np.pi * np.outer(index, n - index) / n)
-    halves = np.where((index == 0) | (index == n), 0.5, 1.0)
-    return 2 / n * halves[:, None] * cosines * halves[None, :]
+    return np.linalg.inv(chebyshev.chebvander(2 * chebyshev_points(count) - 1, count - 1))
 
 
 @ft.cache
 def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
     x = 2 * np.asarray(where) - 1
-    return np.polynomial.chebyshev.chebvander(x, count - 1) @ to_coefficients(count)
+    return chebyshev.chebvander(x, count - 1) @ to_coefficients(count)
 
 
 @ft.cache
@@ -100,8 +96,8 @@ def _integration(count: int) -> np.ndarray:
     polynomial."""
     x = 2 * chebyshev_points(count) - 1
     # The factor 1/2 is `ds/dx`.
-    antiderivative = np.polynomial.chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
-    basis = np.polynomial.chebyshev.chebvander(x, count)
+    antiderivative = chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
+    basis = chebyshev.chebvander(x, count)
     matrix = basis @ antiderivative @ to_coefficients(count)
     matrix[0] = 0.0  # exactly
     return matrix

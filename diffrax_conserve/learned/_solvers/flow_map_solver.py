@@ -143,9 +143,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
-    def _learned(
-        self, known: tuple[Args, ...], h: Array, y0: Y, increment: Increment
-    ) -> StepResult:
+    def _learned(self, known: tuple, h: Array, y0: Y, increment: Increment) -> StepResult:
         start, unravel = ravel_pytree(y0)
 
         def state(fraction: Array) -> Array:

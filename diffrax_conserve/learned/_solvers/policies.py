@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
-from ..._options import check_number, check_solution
+from ..._options import check_number, found_in
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
@@ -171,12 +171,4 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         assert dfc.learned.domain_statistics(sol).num_outside == 0
         ```
     """
-    check_solution(sol, "domain_statistics")
-    is_found = lambda x: isinstance(x, DomainStatistics)  # noqa: E731
-    found = [x for x in jtu.tree_leaves(sol.solver_state, is_leaf=is_found) if is_found(x)]
-    if not found:
-        raise ValueError(
-            "`sol` holds no statistics of a domain. Solve with a learned solver that has "
-            "`outside=`, and with `saveat=SaveAt(..., solver_state=True)`."
-        )
-    return found[0]
+    return found_in(sol, DomainStatistics, "domain_statistics", "a solver with `outside=`")

@@ -13,31 +13,31 @@ from jaxtyping import Array, PRNGKeyArray
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
 from ..._manifold import check_manifold, check_vector_field
-from ..._options import check_number, is_real, one_of
+from ..._options import one_of
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
 from .._networks.domain import Box
-from .._networks.flat import stacked_vectors
+from .._networks.flat import check_key, check_scalars, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
+from .._networks.trainable import checked_part
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
 from .objective import Problem, VectorField
 from .recipe import Recipe, second_order
+from .state import FitState
 
 
-def check_types(key: Any, recipe: Any, **limits: Any) -> None:
+def check_types(key: Any, recipe: Any, state: Any, progress: Any, **limits: Any) -> None:
     """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
-    if not (eqx.is_array(key) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim)):
-        raise TypeError(f"`key` is {key!r}, but it must be a random key: `jax.random.key(0)`.")
-    if not isinstance(recipe, Recipe | None):
-        raise TypeError(f"`recipe` is {recipe!r}, but it must be a `learned.Recipe`.")
-    for name, value in limits.items():
-        if value is not None and not (is_real(value) and np.ndim(value) == 0):
-            raise TypeError(f"`{name}` is {value!r}, but it must be one real number, or `None`.")
-        check_number(name, value, above=0.0)
+    check_key(key)
+    checked_part("recipe", recipe, Recipe)
+    checked_part("state", state, FitState)
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise TypeError(f"`progress` is {progress!r}, but it must be a boolean or a function.")
+    check_scalars(above=0.0, **limits)
 
 
 def checked(

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, PyTree, 
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._manifold import check_vector_field
-from ..._options import one_of
+from ..._options import check_numbers, one_of
 from ..._tree import tree_all_finite
 from .._networks.flat import as_states
 from .._networks.flow_map import AbstractFlowMap
@@ -205,6 +205,7 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     """The trajectories `(ts, ys)`; raises unless they are valid."""
     if not (isinstance(data, tuple) and len(data) == 2):
         raise TypeError(f"`data` is a {type(data).__name__}, but it must be a pair `(ts, ys)`.")
+    check_numbers("data", data)
     ts = np.asarray(data[0], float)
     ys = jtu.tree_map(jnp.asarray, data[1])
     shapes = [jnp.shape(y)[:2] for y in jtu.tree_leaves(ys)]

@@ -114,7 +114,7 @@ def fit(
         E. Cardoso-Bihlo and A. Bihlo, arXiv:2311.14131, Algorithm 1.
     """
     created = time.perf_counter()
-    check_types(key, recipe, target=target, seconds=seconds)
+    check_types(key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     target = None if target is None else float(target)
     seconds = math.inf if seconds is None else seconds

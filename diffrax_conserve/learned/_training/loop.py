@@ -130,7 +130,7 @@ class Loop:
         """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
         if math.isinf(self.seconds) or goal == 0:
             return goal
-        if (left := self.seconds - self.elapsed) <= self.pace / 2:
+        if (left := self.seconds - self.elapsed) <= self.pace:
             return done
         # Half of the time, because the pace may change.
         return min(goal, done + max(1, int(left / (2 * self.pace)) if self.pace else 1))

@@ -9,8 +9,9 @@ import jax.random as jr
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..._options import check_number
+from ..._options import check_counts
 from ..._tree import tree_size
+from .._networks.flat import check_scalars
 from .._networks.pinn import PINN
 from .._networks.trainable import LayerSchedule, Times
 from .second_order import SPRING, LevenbergMarquardt, Loss, SecondOrder
@@ -71,11 +72,9 @@ class Recipe(eqx.Module):
     retries: int = 0
 
     def __check_init__(self):
-        for name in ("epochs", "points", "check_every"):
-            check_number(name, getattr(self, name), least=1.0, optional=False)
-        for name in ("retries", "taylor"):
-            check_number(name, getattr(self, name), least=0.0, optional=False)
-        check_number("refresh", self.refresh, least=1.0)
+        counts = dict(epochs=self.epochs, points=self.points, check_every=self.check_every)
+        check_counts(**counts, refresh=1 if self.refresh is None else self.refresh)
+        check_scalars(least=0.0, optional=False, retries=self.retries, taylor=self.taylor)
         if not isinstance(self.optimiser, optax.GradientTransformation | SecondOrder):
             raise TypeError(
                 f"`optimiser` is {self.optimiser!r}, but it must be one of optax, or "
