@@ -29,8 +29,6 @@ from .oracle import Tally
 ROOT = Path(__file__).parents[2]
 # How much of the count is for each attack.
 SHARES = {"far": 0.5, "ordinary": 0.25, "nan": 0.249, "ending": 0.001}
-# Most of the time goes into compilation, which takes half as long with XLA's older emitters.
-OLDER_EMITTERS = "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters"
 GRACE = 60.0  # seconds for an interpreter to start
 
 
@@ -70,7 +68,7 @@ def command_of(job: Job) -> list[str]:
 
 def run_job(job: Job) -> Tally:
     timeout = module_of(job.attack).TIMEOUT + GRACE
-    defaults = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": OLDER_EMITTERS, "JAX_ENABLE_X64": "1"}
+    defaults = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_X64": "1"}
     try:
         done = subprocess.run(
             command_of(job),
