@@ -104,7 +104,7 @@ def _solve(
 ) -> Solved:
     def start(y: Any) -> tuple[_Kept, _Seen | None]:
         if directions is not None:
-            return _Kept(scaled_rows(directions)[1]), None
+            return _Kept(directions), None
         if fresh:
             return _Kept(), None
         g, jacobian = equations.linearise(y)
