@@ -38,7 +38,7 @@ ADAPTIVE = {
     "Dopri8": dfx.Dopri8(),
     "ReversibleHeun": dfx.ReversibleHeun(),
     "HalfSolver(RK4)": dfx.HalfSolver(dfc.RK4()),
-    "Kvaerno3": dfx.Kvaerno3(dfx.VeryChord(rtol=1e-3, atol=1e-6, norm=optx.max_norm)),
+    "Kvaerno3": dfx.Kvaerno3(root_finder=dfx.VeryChord(1e-3, 1e-6, norm=optx.max_norm)),
 }
 SOLVERS = FIXED | ADAPTIVE
 MODES = ["ts", "dense", "event", "steps", "t1"]
