@@ -16,16 +16,16 @@ from ..learned import EAST, LORENZ, flow_map, oscillator, states
 KEY = jr.key(5)
 
 
-def turns(t1, seed=0, **options):
+def turns(t1, seed=0, unit=1.0, **options):
     """A PINN for the rotation, of the shape that Levenberg-Marquardt is made for."""
     sizes = dict(width=30, depth=1, slope=2.0)
-    return dfc.PINN(EAST, 0.0, t1, key=jr.key(seed), **(sizes | options))
+    return dfc.PINN(unit * EAST, 0.0, t1, key=jr.key(seed), **(sizes | options))
 
 
-def error(pinn):
+def error(pinn, unit=1.0):
     ts = jnp.linspace(0, pinn.t1, 50)
     exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
-    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
+    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) / unit - exact)))
 
 
 # ---- One update, against what it is defined to be ----
@@ -44,8 +44,8 @@ class Powers(eqx.Module):
 @pytest.mark.parametrize(
     ("method", "damping"),
     [
-        (dfc.learned.LevenbergMarquardt(damping=0.3), lambda loss: 0.3),
-        (dfc.learned.SPRING(damping=0.1), lambda loss: 0.1 * loss),
+        (dfc.learned.LevenbergMarquardt(damping=0.3), lambda loss, columns: 0.3 * columns),
+        (dfc.learned.SPRING(damping=0.1), lambda loss, columns: 0.1 * loss),
     ],
     ids=["levenberg-marquardt", "spring"],
 )
@@ -62,15 +62,17 @@ def test_an_update_solves_the_damped_problem(method, damping):
     matrix = np.stack([h**0, 2 * h, 3 * h**2], axis=1) / 7**0.5
     r = matrix @ np.asarray(model.weights) - 2.0 / 7**0.5
     np.testing.assert_allclose(log.losses[0], r @ r, rtol=1e-12)
-    normal = matrix.T @ matrix + damping(r @ r) * np.eye(3)
+    columns = np.mean(np.sum(matrix**2, axis=0))
+    normal = matrix.T @ matrix + damping(r @ r, columns) * np.eye(3)
     update = np.linalg.solve(normal, -matrix.T @ r)
     np.testing.assert_allclose(trained.weights - model.weights, update, rtol=1e-8)
 
 
-def test_a_window_is_learned_to_ten_digits():
-    pinn, log = dfc.fit(turns(3.0), oscillator, key=KEY)
-    assert error(pinn) < 1e-8
-    assert log.criteria.min() < 1e-15
+@pytest.mark.parametrize("unit", [1.0, 1e-20, 1e15])
+def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
+    pinn, log = dfc.fit(turns(3.0, unit=unit), oscillator, key=KEY)
+    assert error(pinn, unit) < 1e-8
+    assert log.criteria.min() < 1e-15 * unit**2
     assert log.skipped == 0
 
 

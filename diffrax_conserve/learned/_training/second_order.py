@@ -128,11 +128,11 @@ class LevenbergMarquardt(eqx.Module):
     r"""Gauss-Newton steps with an adaptive damping, for small networks and fixed points.
 
     An update that does not reduce the loss is rejected, and the damping $\lambda$ is increased;
-    after an update that reduces the loss as the linear model predicts, it is decreased. The weights
-    of the last layer, in which the output is linear, are damped by $10^{-12} \lambda$, so that
-    every update solves for them almost exactly, as in variable projection: with equal damping the
-    residual reaches $10^{-5}$ instead of $10^{-10}$. The problem is ill-conditioned, and therefore
-    solved by a QR factorisation of $J$.
+    after an update that reduces the loss as the linear model predicts, it is decreased. Its unit is
+    the mean squared norm of the columns of $J$. The weights of the last layer, in which the output
+    is linear, are damped by $10^{-12} \lambda$, so that every update solves for them almost
+    exactly, as in variable projection: with equal damping the residual reaches $10^{-5}$ instead of
+    $10^{-10}$. The problem is ill-conditioned, and therefore solved by a QR factorisation of $J$.
 
     ??? cite "Reference"
 
@@ -159,15 +159,16 @@ class LevenbergMarquardt(eqx.Module):
         del fraction
         r, jacobian, loss = problem.rows(weights)
         units = jnp.where(linear, jnp.asarray(_FREEDOM, r.dtype), 1)
-        update = units * _damped_least_squares(jacobian * units, -r, state)
+        damping = state * jnp.mean(jnp.sum(jnp.square(jacobian), axis=0))
+        update = units * _damped_least_squares(jacobian * units, -r, damping)
         after = problem.loss(squared_norms(problem.defects(weights + update)), problem.typical)
         change = jacobian @ update
         predicted = -(2 * r @ change + change @ change)
         ratio = (loss - after) / predicted
         better = after < loss
         factor = jnp.where(ratio > 0.5, 0.1, jnp.where(ratio > 0.1, 0.5, 2.0))
-        damping = state * jnp.where(better, factor, 5.0).astype(r.dtype)
-        return jnp.where(better, weights + update, weights), damping, loss
+        state = state * jnp.where(better, factor, 5.0).astype(r.dtype)
+        return jnp.where(better, weights + update, weights), state, loss
 
 
 LevenbergMarquardt.__init__.__doc__ = "**Arguments:**\n\n- `damping`: that of the first update."
