@@ -37,7 +37,7 @@ def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) 
     From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
     map 5,000 pairs of an initial state and a time and the projection schedule. Changed: a PINN is
     projected from the first epoch on; the weight of the last iteration rises within each stage; the
-    loss of a flow map is bounded at each point; gradients are clipped.
+    loss of a flow map is bounded at each point, and normalised; gradients are clipped.
 
     **Arguments:**
 

@@ -76,6 +76,22 @@ def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
     assert log.skipped == 0
 
 
+def test_a_flow_map_does_not_depend_on_the_units_of_components():
+    def losses(units):
+        here = units * states()
+        network = dfc.DeepONet(here, 0.25, width=8, depth=1, key=KEY)
+        recipe = dataclasses.replace(dfc.learned.second_order(network), epochs=20, points=50)
+
+        def field(t, y, args):
+            return units * LORENZ.vector_field(t, y / units, args)
+
+        return dfc.fit(network, field, sample=here, key=KEY, recipe=recipe)[1].losses
+
+    ones = losses(jnp.ones(3))
+    assert ones[-1] < 0.5 * ones[0]
+    np.testing.assert_allclose(losses(jnp.array([1.5e11, 1.0, 3e-20])), ones, rtol=1e-6)
+
+
 def test_the_recipe_goes_by_size():
     small = dfc.learned.second_order(turns(3.0, windows=5))
     assert isinstance(small.optimiser, dfc.learned.LevenbergMarquardt)

@@ -176,7 +176,9 @@ class DeepONet(AbstractFlowMap):
         return self.domain.lower if isinstance(self.domain, Box) else self.domain.example
 
     def measure(self, y0: Y, rate: Float[Array, " n"]) -> Float[Array, " m"]:
-        return rate if isinstance(self.domain, Box) else self.domain.frame(y0).measure(rate)
+        if isinstance(self.domain, Box):
+            return rate / self.scale
+        return self.domain.frame(y0).measure(rate)
 
     def weights(self) -> AbstractCore:
         return self.core
@@ -192,8 +194,8 @@ class DeepONet(AbstractFlowMap):
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
 - `states`: initial states, stacked along a leading axis: any PyTree of real arrays. $N$ gets
-    $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, and $h$ scaled to $[-1, 1]$. The
-    box around them is the `domain` of the flow map.
+    $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, the unit of the loss, and $h$
+    scaled to $[-1, 1]$. The box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.

@@ -86,18 +86,15 @@ def to_coefficients(count: int) -> np.ndarray:
 
 @ft.cache
 def _evaluation(count: int, where: tuple[float, ...]) -> np.ndarray:
-    x = 2 * np.asarray(where) - 1
-    return chebyshev.chebvander(x, count - 1) @ to_coefficients(count)
+    return chebyshev.chebvander(2 * np.asarray(where) - 1, count - 1) @ to_coefficients(count)
 
 
 @ft.cache
 def _integration(count: int) -> np.ndarray:
-    """The matrix from values at the points to integrals; column `j` belongs to the `j`-th Lagrange
-    polynomial."""
-    x = 2 * chebyshev_points(count) - 1
+    """The matrix from values at the points to integrals from the first point to each."""
     # The factor 1/2 is `ds/dx`.
     antiderivative = chebyshev.chebint(np.eye(count), lbnd=-1, axis=0) / 2
-    basis = chebyshev.chebvander(x, count)
+    basis = chebyshev.chebvander(2 * chebyshev_points(count) - 1, count)
     matrix = basis @ antiderivative @ to_coefficients(count)
     matrix[0] = 0.0  # exactly
     return matrix
