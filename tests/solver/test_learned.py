@@ -165,6 +165,16 @@ def test_nothing_raises_in_a_batch(case, adaptive, errors_raise):
         assert (adaptive and text == "not finite") or text in dfx.RESULTS[result]
 
 
+def test_each_leaf_of_the_start_is_compared_in_its_own_unit():
+    y0 = {"position": jnp.array(1.5e11), "velocity": jnp.array(3e4)}
+    solver = dfc.PINNSolver(dfc.PINN(y0, 0.0, 1.0, key=jr.key(0)))
+    for factor, right in ((1.0, True), (1.01, False)):
+        other = y0 | {"velocity": factor * y0["velocity"]}
+        term = dfx.ODETerm(lambda t, y, args: y)
+        sol = dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.5, other, throw=False)
+        assert (sol.result == dfx.RESULTS.successful) == right
+
+
 def test_roundoff_in_the_times_is_not_refused():
     sol = solve(FLOW, t0=1e6, t1=1e6 + 1.0, saveat=dfx.SaveAt(t1=True))
     np.testing.assert_allclose(sol.ys[0], path(FLOW, 1.0), atol=1e-8)

@@ -1,6 +1,5 @@
 """A trained PINN as a diffrax solver."""
 
-import math
 from collections.abc import Callable
 from typing import ClassVar, final
 
@@ -13,7 +12,7 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
 from ..._tree import tree_sub
-from .._networks.flat import tree_max, working_dtype
+from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
 from .checks import Refused, check_learned_terms, check_output
@@ -79,8 +78,9 @@ class PINNSolver(dfx.AbstractSolver[Refused]):
         check_output(self.pinn, (t0,), y0, "pinn")
         time = jnp.asarray(t0) * time_direction(terms, t0)
         state = self.pinn(time)
-        tolerance = math.sqrt(jnp.finfo(working_dtype(y0)).eps)
-        starts = tree_max(tree_sub(y0, state)) <= tolerance * tree_max(state)
+        tolerance = float(jnp.finfo(working_dtype(y0)).eps) ** 0.5
+        size = jnp.maximum(self.pinn.scale, jnp.abs(flatten(state)))
+        starts = jnp.all(jnp.abs(flatten(tree_sub(y0, state))) <= tolerance * size)
         return jnp.where(self._covers(time), jnp.where(starts, 0, _ANOTHER_START), _OUTSIDE)
 
     def step(
@@ -122,5 +122,5 @@ PINNSolver.__init__.__doc__ = r"""**Arguments:**
 
 `TypeError` or `ValueError` if `pinn` is not a PINN, or has another structure than the state. The
 [`result`][diffrax.RESULTS] is a failure if a time is outside the interval, or `y0` is not the state
-of the network at the initial time, to the square root of roundoff.
+of the network at the initial time, to the square root of roundoff of each leaf.
 """
