@@ -201,9 +201,9 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             target=PackedTarget(start),
             due=due,
         )
-        # An infinite error makes an adaptive solve try a smaller step; a step without hope is
-        # accepted, and its result ends the solve.
-        shown = jnp.where(hopeless, 0, jnp.inf)
+        # A huge error makes an adaptive solve try a smaller step; a step without hope is accepted,
+        # and its result ends the solve. The norm of an infinite complex number is NaN.
+        shown = jnp.where(hopeless, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
         error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
