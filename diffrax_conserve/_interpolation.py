@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, PyTree
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import Step, Target
 from ._projection.equations import any_lane
-from ._tree import tree_scale, tree_sub, tree_tangents
+from ._tree import tree_sub, tree_tangents
 
 # The candidates that are tried, closer and closer to the end of the step; the last is the end.
 _CANDIDATES = 12
@@ -119,7 +119,8 @@ def _projected_jvp(primals: Any, tangents: Any) -> Any:
     y, direct = _projected(*primals)
     given = primals[:-1], tangents[:-1]
     _, t_y = eqx.filter_jvp(lambda project, *args: project(*args)[0], *given)
-    t_y = tree_scale(jnp.where(direct, 1, jnp.nan), tree_tangents(y, t_y))
+    factor = jnp.where(direct, 1, jnp.nan)
+    t_y = jtu.tree_map(lambda x: factor.astype(x.dtype) * x, tree_tangents(y, t_y))
     return (y, direct), (t_y, None)
 
 

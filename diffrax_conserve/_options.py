@@ -57,8 +57,10 @@ def check_numbers(name: str, tree: Any, *, least: float | None = None) -> None:
 
 def check_counts(**counts: Any) -> None:
     for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"`{name}` is {value!r}, but it must be a positive integer.")
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise TypeError(f"`{name}` is {value!r}, but it must be an integer.")
+        if value < 1:
+            raise ValueError(f"`{name}` is {value}, but it must be a positive integer.")
 
 
 def check_function(name: str, fn: Any, call: str, returns: str) -> None:
@@ -98,7 +100,6 @@ def check_solution(sol: Any, user: str) -> None:
 
 
 def found_in(sol: Any, kind: type, user: str, solver: str) -> Any:
-    """What of a `kind` is in the state of the solver; raises if there is nothing."""
     check_solution(sol, user)
     is_one = lambda x: isinstance(x, kind)  # noqa: E731
     found = [*filter(is_one, jtu.tree_leaves(sol.solver_state, is_leaf=is_one))]

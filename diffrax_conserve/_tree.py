@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
-from ._custom_types import RealScalarLike, Y
+from ._custom_types import Y
 
 
 def real_view(y: Any) -> Any:
@@ -30,11 +30,6 @@ def tree_add(a: Y, b: Y) -> Y:
 
 def tree_sub(a: Y, b: Y) -> Y:
     return jtu.tree_map(lambda x, y: x - y, a, b)
-
-
-def tree_scale(factor: RealScalarLike, a: Y) -> Y:
-    """`factor * a`, in the dtypes of `a`."""
-    return jtu.tree_map(lambda x: jnp.asarray(factor, x.dtype) * x, a)
 
 
 def tree_all_finite(a: PyTree[Array]) -> Array:

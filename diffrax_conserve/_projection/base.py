@@ -143,7 +143,7 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
         # A maximum can lose NaN on a CPU.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        success = equations.verdict(after, jacobian, y) > 0 if ok is None else ok
+        success = equations.verdict(after, jacobian, y)[0] > 0 if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         reached = kinds.where(

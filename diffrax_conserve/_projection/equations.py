@@ -76,25 +76,26 @@ class Equations(eqx.Module):
 
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
-    ) -> Int[Array, ""]:
+    ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
         """-1 if a residual is not finite; 0 if `y` is off the manifold; 1 if it is on it; 2 if all
-        residuals are so small, within an eighth of the tolerance, that only chance could reduce
-        them. A residual within a tolerance that underflows says nothing."""
+        are noise, an eighth of the tolerance, which only chance could reduce. And the noise. A
+        residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        reached = jnp.where(jnp.abs(g) <= 0.125 * limit, jnp.int8(2), jnp.int8(1))
+        noise = 0.125 * limit
+        reached = jnp.where(jnp.abs(g) <= noise, jnp.int8(2), jnp.int8(1))
         missed = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(0), jnp.int8(-1))
         # Not by a maximum of residuals, which can lose NaN on a CPU.
-        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, missed))
+        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, missed)), noise
 
     def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.verdict(g, jacobian, y) > 0
+        return self.verdict(g, jacobian, y)[0] > 0
 
     def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
         """The rows of `G M⁻¹`."""
@@ -190,17 +191,18 @@ def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float
     return jnp.sum(multiplier[:, None] * rows, axis=0)
 
 
-def gram_solve(gram: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+def gram_solve(gram: Float[Array, "m m"], b: Array, *noise: Array) -> Float[Array, " m"]:
     """`gram⁻¹ b`, for a matrix not symmetric in general."""
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype)))
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), *noise))
 
 
 def eliminated(
-    gram: Float[Array, "m m"], b: Float[Array, " m"], rows: Float[Array, "m n"]
+    gram: Float[Array, "m m"], b: Float[Array, " m"], rows: Float[Array, "m n"], *noise: Array
 ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
     """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
     `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
-    in the sum, which is wrong if XLA evaluates `b` once for each."""
+    in the sum, which is wrong if XLA evaluates `b` once for each. What is within the `noise` of
+    `b`, if it is given, counts as zero in `L⁻¹ b`: a small pivot would amplify it."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         one, diagonal = _one(gram), jnp.abs(jnp.diagonal(gram))
@@ -213,12 +215,17 @@ def eliminated(
         return x.astype(dtype) * unit, rows
     least = 4 * m * float(jnp.finfo(dtype).eps)
     u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
+    (given,) = noise or (jnp.zeros_like(b),)
+    small = list(given)
     for k in range(m):
         regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
         pivot = jnp.where(regular, u[k][k], jnp.inf)
+        x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
         for i in range(k + 1, m):
             below, right = u[i][k] / pivot, u[k][i] / pivot
             x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
+            # What is not corrected is within half of the tolerance.
+            small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * given[i])
             for j in range(k + 1, m):
                 u[i][j] = u[i][j] - below * u[k][j]
         x[k] = x[k] / pivot

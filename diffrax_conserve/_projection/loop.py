@@ -50,8 +50,8 @@ class _Kept(NamedTuple):
     inverse: Float[Array, "m m"] | None = None
 
 
-# The residuals and the Jacobian at a state.
-_Seen = tuple[Float[Array, " m"], Float[Array, "m n"]]
+# The residuals and the Jacobian at a state, and if it is judged the noise of the residuals.
+_Seen = Any
 # The best state so far, its largest residual, and the scales of residuals at the first one.
 _Best = tuple[Float[Array, " n"], Float[Array, ""], Float[Array, " m"]]
 # The state, whether it is on the manifold, and the number of iterations.
@@ -116,27 +116,28 @@ def _solve(
         inverse = inverse_factor(gram_matrix(unit, rows), sizes)
         return _Kept(equations.weighted(jacobian), inverse), (g, jacobian)
 
-    def judge(seen: _Seen, y: Any, left: Array) -> Array:
+    def judge(seen: _Seen, y: Any, left: Array) -> tuple[Array, _Seen]:
         """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1. A
         candidate on the manifold is corrected once, with a count of `max_steps + 2`; if that moves
         it off the manifold, the candidate is the result, which -2 tells."""
-        level = equations.verdict(*seen, y)
+        level, noise = equations.verdict(seen[0], seen[1], y)
         on, first, second = level > 0, left == max_steps + 1, left == max_steps + 2
         # Within the tolerance at most two more.
         now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
         now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
         # NaN stays NaN, in the state after one more, unless the step is shortened.
         now = jnp.where((level < 0) & (first if damped else ~second), jnp.minimum(now, 1), now)
-        return jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
+        now = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
+        return now, (seen[0], seen[1], noise)
 
     def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:
-        return jnp.where(left > 0, _corrected(equations, kept, *seen, y), y)
+        return jnp.where(left > 0, _corrected(equations, kept, seen, y), y)
 
     def test(kept: _Kept, y: Any, left: Array) -> tuple[Any, Array]:
         seen = equations.linearise(y)
         if not small:  # otherwise XLA evaluates residuals for each use
             seen = lax.optimization_barrier(seen)
-        left = judge(seen, y, left)
+        left, seen = judge(seen, y, left)
         return move(kept, seen, y, left), left
 
     y: Any = candidate
@@ -154,19 +155,19 @@ def _solve(
     kept, seen = start(y)
     count = jnp.asarray(0)
     if seen is not None:
-        left = judge(seen, y, left)
+        left, seen = judge(seen, y, left)
         count = count + (left > 0).astype(int)
     elif not in_arrays:  # the first iteration before the loop, which saves a tenth
         y, left = test(kept, y, left)
         count = count + (left > 0).astype(int)
 
-    last: Any = (y, jnp.asarray(jnp.inf, candidate.dtype), equations.magnitude) if damped else seen
+    last: Any = (y, jnp.full_like(candidate[0], jnp.inf), equations.magnitude) if damped else seen
 
     def body(carry: tuple[Any, Any, Array, Array]) -> tuple[Any, Any, Array, Array]:
         y, last, left, count = carry
         if damped:
             seen = lax.optimization_barrier(equations.linearise(y))
-            left = judge(seen, y, left)
+            left, seen = judge(seen, y, left)
             better, last = _better(equations, seen, y, last)
             shorter = last[0] + (y - last[0]) / 4
             y = jnp.where(better | (left <= 0), move(kept, seen, y, left), shorter)
@@ -174,8 +175,7 @@ def _solve(
             y, left = test(kept, y, left)
         else:
             y = move(kept, last, y, left)
-            last = equations.linearise(y)
-            left = judge(last, y, left)
+            left, last = judge(equations.linearise(y), y, left)
         return y, last, left, count + (left > 0).astype(int)
 
     first = (y, last, left, count)
@@ -192,19 +192,23 @@ def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[A
     return better, (jnp.where(better, y, state), jnp.where(better, jnp.max(sizes), least), scale)
 
 
-def _corrected(equations: Equations, kept: _Kept, g: Array, jacobian: Array, y: Array) -> Array:
+def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Array:
     """`y - Dᵀ (G Dᵀ)⁻¹ g`."""
+    g, jacobian, noise = seen
     if kept.inverse is not None:
+        g = jnp.where(jnp.abs(g) <= noise, 0, g)
         x = combined(g.astype(kept.inverse.dtype), kept.inverse.T)
         rows, multiplier = kept.rows, combined(x, kept.inverse).astype(g.dtype)
         change = combined(multiplier, rows)
     else:
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
+        # With bounds what is noise for one constraint may be needed for another.
+        given = (noise / sizes,) if equations.clip is None else ()
         gram, right = gram_matrix(unit, rows), g / sizes
-        change = combined(*eliminated(gram, right, rows))
+        change = combined(*eliminated(gram, right, rows, *given))
         used = equations.clip is not None or equations.may_vanish
-        multiplier = gram_solve(gram, right) if used else right
+        multiplier = gram_solve(gram, right, *given) if used else right
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: a true zero is never small relative to itself.

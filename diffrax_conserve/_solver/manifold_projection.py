@@ -38,9 +38,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     carried in the solver state: the drift does not grow with the number of steps, and a solve that
     continues from a `solver_state` keeps the original values.
 
-    The projected method has the order of the wrapped one. A last stage that the wrapped solver
-    keeps for the next step (Tsit5, Dopri5, Bosh3: "first same as last") is evaluated again at the
-    projected state, so that lanes of a batch do not depend on each other; implicit methods keep it.
+    The projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
+    the next step is evaluated again at the projected state; implicit methods keep it.
 
     Success means that each residual is within 16 units of roundoff of $|I_0| + \sum_k |y_k
     \partial_k I|$ and the terms that cancel inside `fn`, such as the 1 of `1 - cos(q)`, unless the

@@ -1,7 +1,5 @@
 """Explicit Runge-Kutta methods with their stages written out."""
 
-import functools as ft
-import operator
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
@@ -116,9 +114,9 @@ Unrolled.__init__.__doc__ = """**Arguments:**
 
 def _combined(weights: np.ndarray, increments: list[Y]) -> Y:
     """The weighted sum of the increments, without those whose weight is zero."""
-    pairs = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
-    parts = [jtu.tree_map(ft.partial(operator.mul, weight), k) for weight, k in pairs]
-    return jtu.tree_map(lambda *leaves: sum(leaves), *parts)
+    used = [(float(w), k) for w, k in zip(weights, increments, strict=False) if w != 0]
+    total = lambda *ks: sum(w * k for (w, _), k in zip(used, ks, strict=True))  # noqa: E731
+    return jtu.tree_map(total, *(k for _, k in used))
 
 
 def _displaced(y: Y, weights: np.ndarray, increments: list[Y]) -> Y:

@@ -142,6 +142,51 @@ def test_rigid_bodies_near_a_steady_rotation_are_solved(dtype):
     assert np.all(done), np.mean(done)
 
 
+def three_waves(t, y, args):
+    return 1j * jnp.stack([jnp.conj(y[1]) * y[2], jnp.conj(y[0]) * y[2], y[0] * y[1]])
+
+
+def quanta(t, y, args):
+    count = y.real**2 + y.imag**2
+    return count[0] + count[2], count[1] + count[2], 2 * jnp.real(y[0] * y[1] * jnp.conj(y[2]))
+
+
+def test_weak_waves_beside_a_strong_one_are_solved():
+    """The gradients are nearly parallel, so that roundoff of one integral is large for another."""
+    rng = np.random.default_rng(1)
+    y0 = rng.normal(size=(200, 3)) + 1j * rng.normal(size=(200, 3))
+    y0[:, :2] *= 10 ** rng.uniform(-6, -3, (200, 1))
+    controller = dfx.PIDController(rtol=1e-8, atol=1e-10)
+    given = three_waves, quanta, dfx.Dopri5(), controller, y0, jnp.zeros(200)
+    done = okay(*given, jnp.asarray([1.0, 0.01]))
+    assert np.all(done), np.mean(done)
+
+
+TODA = (
+    lambda t, y, args: jnp.sum(y[1]),
+    lambda t, y, args: jnp.sum(y[1] ** 2) / 2 + jnp.sum(jnp.exp(y[0] - jnp.roll(y[0], -1))),
+)
+
+
+def toda(t, y, args):
+    force = jnp.exp(y[0] - jnp.roll(y[0], -1))
+    return jnp.stack([y[1], jnp.roll(force, 1) - force])
+
+
+def test_small_vibrations_are_moved_by_little():
+    """The energy has only roundoff, which is not corrected where the momentum is."""
+    amplitude = 10 ** np.random.default_rng(2).uniform(-12, -5, (100, 1, 1))
+    y0 = jnp.asarray(amplitude * np.random.default_rng(3).normal(size=(100, 2, 3)))
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 1, 23))
+
+    def states(solver):
+        return jax.jit(jax.vmap(lambda y: solve(toda, solver, y, t1=1, dt0=0.05, saveat=saveat).ys))
+
+    manifold = tuple(map(dfc.FirstIntegral, TODA))
+    moved = states(dfc.ManifoldProjection(dfx.Dopri5(), manifold))(y0) - states(dfx.Dopri5())(y0)
+    assert np.max(np.abs(moved) / amplitude[..., None]) < 1e-9
+
+
 def almost_circular_failures(dtype):
     rng = np.random.default_rng(6)
     e, angle = 10 ** rng.uniform(-9, -1, 500), rng.uniform(0, 2 * np.pi, 500)

@@ -98,7 +98,7 @@ def test_mistakes_are_named():
             dfc.project(MANIFOLD, Y0, projection=dfc.Staged(*stages))
     with pytest.raises(TypeError, match="must be a pair"):
         dfc.Staged(FIRST)
-    with pytest.raises(TypeError, match="not a projection of a state by itself"):
+    with pytest.raises(TypeError, match="a projection with `sees_step = False`"):
         dfc.Staged(("circle", dfc.Directional()))
 
 
