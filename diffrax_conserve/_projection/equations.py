@@ -215,17 +215,17 @@ def eliminated(
         return x.astype(dtype) * unit, rows
     least = 4 * m * float(jnp.finfo(dtype).eps)
     u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
-    (given,) = noise or (jnp.zeros_like(b),)
-    small = list(given)
+    small = [*noise[0]] if noise else []
     for k in range(m):
         regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
         pivot = jnp.where(regular, u[k][k], jnp.inf)
-        x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
+        if small:
+            x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
         for i in range(k + 1, m):
             below, right = u[i][k] / pivot, u[k][i] / pivot
             x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
-            # What is not corrected is within half of the tolerance.
-            small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * given[i])
+            if small:  # what is not corrected is within half of the tolerance
+                small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * noise[0][i])
             for j in range(k + 1, m):
                 u[i][j] = u[i][j] - below * u[k][j]
         x[k] = x[k] / pivot
