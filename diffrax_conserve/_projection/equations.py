@@ -191,18 +191,18 @@ def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float
     return jnp.sum(multiplier[:, None] * rows, axis=0)
 
 
-def gram_solve(gram: Float[Array, "m m"], b: Array, *noise: Array) -> Float[Array, " m"]:
+def gram_solve(gram: Float[Array, "m m"], b: Array, noise: Array | None = None) -> Array:
     """`gram⁻¹ b`, for a matrix not symmetric in general."""
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), *noise))
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), noise))
 
 
 def eliminated(
-    gram: Float[Array, "m m"], b: Float[Array, " m"], rows: Float[Array, "m n"], *noise: Array
+    gram: Float[Array, "m m"], b: Array, rows: Float[Array, "m n"], noise: Array | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
     """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
     `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
-    in the sum, which is wrong if XLA evaluates `b` once for each. What is within the `noise` of
-    `b`, if it is given, counts as zero in `L⁻¹ b`: a small pivot would amplify it."""
+    in the sum, which is wrong if XLA evaluates `b` once for each. If a small matrix is written out,
+    what is within the `noise` of `b` is zero in `L⁻¹ b`: a small pivot would amplify it."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         one, diagonal = _one(gram), jnp.abs(jnp.diagonal(gram))
@@ -215,17 +215,17 @@ def eliminated(
         return x.astype(dtype) * unit, rows
     least = 4 * m * float(jnp.finfo(dtype).eps)
     u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
-    small = [*noise[0]] if noise else []
+    small = [] if noise is None else list(noise)
     for k in range(m):
         regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
         pivot = jnp.where(regular, u[k][k], jnp.inf)
-        if small:
+        if noise is not None:
             x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
         for i in range(k + 1, m):
             below, right = u[i][k] / pivot, u[k][i] / pivot
             x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
-            if small:  # what is not corrected is within half of the tolerance
-                small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * noise[0][i])
+            if noise is not None:  # what is not corrected is within half of the tolerance
+                small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * noise[i])
             for j in range(k + 1, m):
                 u[i][j] = u[i][j] - below * u[k][j]
         x[k] = x[k] / pivot

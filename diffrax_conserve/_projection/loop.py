@@ -51,7 +51,7 @@ class _Kept(NamedTuple):
 
 
 # The residuals and the Jacobian at a state, and if it is judged the noise of the residuals.
-_Seen = Any
+_Seen = tuple[Array, ...]
 # The best state so far, its largest residual, and the scales of residuals at the first one.
 _Best = tuple[Float[Array, " n"], Float[Array, ""], Float[Array, " m"]]
 # The state, whether it is on the manifold, and the number of iterations.
@@ -204,11 +204,11 @@ def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Arra
         sizes, unit = scaled_rows(jacobian)
         rows = equations.weighted(unit) if kept.rows is None else kept.rows
         # With bounds what is noise for one constraint may be needed for another.
-        given = (noise / sizes,) if equations.clip is None else ()
+        noise = noise / sizes if equations.clip is None else None
         gram, right = gram_matrix(unit, rows), g / sizes
-        change = combined(*eliminated(gram, right, rows, *given))
+        change = combined(*eliminated(gram, right, rows, noise))
         used = equations.clip is not None or equations.may_vanish
-        multiplier = gram_solve(gram, right, *given) if used else right
+        multiplier = gram_solve(gram, right, noise) if used else right
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: a true zero is never small relative to itself.

@@ -136,7 +136,7 @@ def test_a_conservative_network_is_its_candidate_moved():
 
 
 def test_what_is_refused():
-    with pytest.raises(ValueError, match="must be a positive integer"):
+    with pytest.raises(ValueError, match=r"`steps` .*must be a positive integer"):
         dfc.learned.ConservativeLayer(RADIUS, steps=0)
     with pytest.raises(TypeError, match="neither a `FirstIntegral`"):
         dfc.learned.ConservativeLayer(lambda t, y, args: y)

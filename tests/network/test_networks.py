@@ -88,11 +88,7 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: dfc.DeepONet((EAST, LORENZ.y0), 1.0, key=KEY), ValueError, "leading axis"),
         (lambda: dfc.DeepONet(LORENZ.sample, 1.0, key=KEY), TypeError, "Draw states from it"),
         (lambda: dfc.PINN(jnp.array([1j]), 0.0, 1.0, key=KEY), TypeError, "complex"),
-        (
-            lambda: dfc.learned.Taylor(LORENZ.vector_field, 0),
-            ValueError,
-            "`order` is 0, but it must be a posit",
-        ),
+        (lambda: dfc.learned.Taylor(LORENZ.vector_field, 0), ValueError, "`order` .*must be a pos"),
     ],
 )
 def test_mistakes_are_named(make, error, match):

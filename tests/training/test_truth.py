@@ -85,10 +85,10 @@ def test_the_estimate_of_a_flow_map_is_its_error():
 
 def test_a_window_that_failed_is_trained_until_it_is_right():
     """Three turns in one window are too many for so few units."""
-    network = pinn(t1=18.0, width=20)
-    with pytest.warns(UserWarning, match=r"Window 0 of 1, from 0 to 18, has an estimated error"):
+    network = pinn(t1=20.0, width=20)
+    with pytest.warns(UserWarning, match=r"Window 0 of 1, from 0 to 20, has an estimated error"):
         _, log = dfc.fit(network, oscillator, key=KEY, recipe=recipe(network, 40, retries=0))
-    assert log.error > 1e-3
+    assert log.error > 1e-2
     trained, log = dfc.fit(
         network, oscillator, key=KEY, recipe=recipe(network, 40, points=80), target=1e-5
     )
