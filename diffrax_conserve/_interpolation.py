@@ -23,7 +23,7 @@ from ._projection.base import Step, Target
 from ._projection.equations import any_lane
 from ._tree import tree_sub, tree_tangents
 
-# The candidates that are tried, closer and closer to the end of the step; the last is the end.
+# The candidates that are tried, each twice as far from the last; the last one is the end.
 _CANDIDATES = 12
 
 
@@ -47,9 +47,9 @@ class PackedTarget(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
-    Where the projection of the interpolant fails, it starts again closer and closer to the nearer
-    end of the step, a state on the manifold, and at last there. If that fails too, the value is
-    NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
+    Where the projection of the interpolant fails, it starts again at its result, if that is closer
+    to the manifold, or else, at first by a hair, closer to the nearer end of the step, a state on
+    the manifold, and at last there. If that fails too, the value is NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -74,9 +74,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         step = target.step(self.t0, self.t1, self.ends[0], self.error)
 
-        def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Bool[Array, ""]]:
+        def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Array, Array]:
             y, info = target.project(t, candidate, step)
-            return y, info.ok
+            return y, info.ok, info.residual_after < info.residual_before
 
         # Arrays over which the functions of the manifold close become leaves.
         project = eqx.filter_closure_convert(project, t0, candidate, step)
@@ -89,24 +89,22 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 def _projected(
     project: Callable[..., Any], t: Array, candidate: Y, step: Step | None, end: Y
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The first candidate that can be projected, on the way from the interpolant to `end`; and
-    whether that was the interpolant."""
+    """The projection of the interpolant, or of what the loop tries in its place; and whether it is
+    that of the interpolant."""
 
     def body(carry: tuple[Array, Array, Y]) -> tuple[Array, Array, Y]:
-        index, going, last = carry
-        share = 0.5 ** (index * (index + 1) // 2)
-        share = jnp.where(index == _CANDIDATES - 1, 0, share)
+        index, going, start = carry
+        y, ok, nearer = project(t, start, step)
+        share = 2.0 ** (index + 2 - _CANDIDATES)
 
-        # The ends are taken as they are: one may not be finite, and a sum is rounded.
-        def between(a: Array, b: Array) -> Array:
-            inside = b + share.astype(b.real.dtype) * (a - b)
-            return jnp.where(index == 0, a, jnp.where(share == 0, b, inside))
+        def tried(y: Array, start: Array, end: Array) -> Array:
+            closer = start + share.astype(end.real.dtype) * (end - start)
+            # The end is taken as it is: it may not be finite, and a sum is rounded.
+            closer = jnp.where(share < 1, closer, jnp.where(share > 1, jnp.nan, end))
+            return jnp.where(going, jnp.where(ok | (nearer & (share < 1)), y, closer), start)
 
-        start = jtu.tree_map(between, candidate, end)
-        y, ok = project(t, start, step)
-        y = jtu.tree_map(lambda x, y: jnp.where(going, jnp.where(ok, x, jnp.nan), y), y, last)
-        more = going & ~ok & (index + 1 < _CANDIDATES)
-        return index + going.astype(int), more, y
+        start = jtu.tree_map(tried, y, start, end)
+        return index + going.astype(int), going & ~ok & (share <= 1), start
 
     carry = jnp.asarray(0), jnp.asarray(True), candidate
     index, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, carry)
