@@ -49,7 +49,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     Where the projection of the interpolant fails, it starts again at its result, if that is closer
     to the manifold, or else, at first by a hair, closer to the nearer end of the step, a state on
-    the manifold, and at last there. If that fails too, the value is NaN. There is no extrapolation: a time outside the step is replaced by the nearer end.
+    the manifold, and at last there. If that fails too, the value is NaN. There is no extrapolation:
+    a time outside the step is replaced by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -117,16 +117,14 @@ def _solve(
         return _Kept(equations.weighted(jacobian), inverse), (g, jacobian)
 
     def judge(seen: _Seen, y: Any, left: Array) -> tuple[Array, _Seen]:
-        """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1. A
-        candidate on the manifold is corrected once, with a count of `max_steps + 2`; if that moves
-        it off the manifold, the candidate is the result, which -2 tells."""
+        """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1."""
         level, noise = equations.verdict(seen[0], seen[1], y)
-        on, first, second = level > 0, left == max_steps + 1, left == max_steps + 2
-        # Within the tolerance at most two more.
-        now = jnp.where(on, jnp.where(first, max_steps + 2, jnp.minimum(left - 1, 2)), left - 1)
-        now = jnp.where((left == 1) & ~on, -1, jnp.where(second, jnp.where(on, 0, -2), now))
+        on = level > 0
+        # Within the tolerance one more.
+        now = jnp.where(on, jnp.minimum(left - 1, 1), jnp.where(left == 1, -1, left - 1))
         # NaN stays NaN, in the state after one more, unless the step is shortened.
-        now = jnp.where((level < 0) & (first if damped else ~second), jnp.minimum(now, 1), now)
+        stays = (left == max_steps + 1) if damped else (left > 0)
+        now = jnp.where((level < 0) & stays, jnp.minimum(now, 1), now)
         now = jnp.where(left > 0, jnp.where(level == 2, 0, now), left).astype(left.dtype)
         return now, (seen[0], seen[1], noise)
 
@@ -180,7 +178,7 @@ def _solve(
 
     first = (y, last, left, count)
     y, _, left, count = lax.while_loop(lambda carry: any_lane(carry[2] > 0), body, first)
-    return jnp.where(left == -2, candidate, joined(candidate, y)), left != -1, count
+    return joined(candidate, y), left != -1, count
 
 
 def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[Array, _Best]:
