@@ -2,7 +2,6 @@
 
 import pydoc
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,7 +9,6 @@ import numpy as np
 
 import diffrax_conserve as dfc
 
-from .problems import solve
 from .thinned import some_of
 
 MATRIX = np.arange(6.0).reshape(2, 3) / 7
@@ -111,16 +109,6 @@ def test_a_batch_is_printed_by_its_ranges():
     assert str(info).startswith("2 of 3 projections succeeded")
     _, info = project(ys.at[2, 0].set(3.0))
     assert "correction       1.0e+00 to 4.0e+00" in str(info)
-
-
-def test_statistics_print_numbers():
-    rotation = lambda t, y, args: jnp.array([-y[1], y[0]])  # noqa: E731
-    saveat = dfx.SaveAt(t1=True, solver_state=True)
-    solver = dfc.ManifoldProjection(dfc.RK4(), SPHERE)
-    sol = solve(rotation, solver, jnp.array([1.0, 0.0]), dt0=0.125, saveat=saveat)
-    text = str(dfc.statistics(sol))
-    assert text.splitlines()[1] == "  num_projections  8"
-    assert "worst" not in text
 
 
 def test_help_opens_with_an_introduction():

@@ -66,15 +66,6 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
 
 
-def test_sweeps_converge_to_the_same_path():
-    """Whatever the flow map."""
-
-    def end(flow_map):
-        return step(unchecked(flow_map, nodes=6, corrections=14), LORENZ.y0, 0.1)[0]
-
-    np.testing.assert_allclose(end(flow_map()), end(Still()), rtol=0, atol=1e-13)
-
-
 def test_dense_output_goes_through_the_corrected_path():
     ts = jnp.array([0.07, 0.4, 0.93])
     reference = LORENZ.reference(ts)

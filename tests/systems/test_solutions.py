@@ -53,13 +53,6 @@ def test_an_unbound_kepler_orbit_is_refused(errors_raise):
         systems.Kepler().reference([1.0], y0)
 
 
-def test_small_swings_have_the_period_of_galileo():
-    system = systems.CartesianPendulum(length=2.0, gravity=9.81)
-    angle = 1e-5
-    y0 = (2.0 * jnp.array([np.sin(angle), -np.cos(angle)]), jnp.zeros(2))
-    np.testing.assert_allclose(system.period(y0), 2 * np.pi * np.sqrt(2.0 / 9.81), rtol=1e-10)
-
-
 def test_equal_vortices_on_an_equilateral_triangle_rotate_rigidly():
     angles = 2 * np.pi * np.arange(3) / 3
     y0 = jnp.stack([np.cos(angles), np.sin(angles)], axis=1)
