@@ -21,10 +21,12 @@ from jaxtyping import Array, Bool, PyTree
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import Step, Target
 from ._projection.equations import any_lane
-from ._tree import tree_sub, tree_tangents
+from ._tree import ravel, tree_sub, tree_tangents
 
 # The candidates that are tried, each twice as far from the last; the last one is the end.
-_CANDIDATES = 12
+_TRIES = 12
+# A state, whether it is the projection, and whether it is closer to the manifold.
+_Tried = tuple[Y, Bool[Array, ""], Bool[Array, ""]]
 
 
 @final
@@ -47,10 +49,10 @@ class PackedTarget(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
-    Where the projection of the interpolant fails, it starts again at its result, if that is closer
-    to the manifold, or else, at first by a hair, closer to the nearer end of the step, a state on
-    the manifold, and at last there. If that fails too, the value is NaN. There is no extrapolation:
-    a time outside the step is replaced by the nearer end.
+    Where the projection of the interpolant fails, that for far candidates is tried, again at its
+    result, if that is closer to the manifold, or else, at first by a hair, closer to the nearer end
+    of the step, a state on the manifold, and at last there. If that fails too, the value is NaN.
+    There is no extrapolation: a time outside the step is replaced by the nearer end.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -74,49 +76,61 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         candidate = self.inner.evaluate(t0, left=left)
         target = self.target.unpack().advanced(self.t0, t0, self.inner.evaluate)
         step = target.step(self.t0, self.t1, self.ends[0], self.error)
+        # As far from the interpolant as both ends together nothing is nearest to it.
+        apart = (jnp.linalg.norm(ravel(tree_sub(end, candidate))) for end in self.ends)
+        limit = jnp.inf if target.projection.metric is not None else sum(apart)
 
-        def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Array, Array]:
-            y, info = target.project(t, candidate, step)
-            return y, info.ok, info.residual_after < info.residual_before
+        def by(far: bool) -> Callable[..., _Tried]:
+            def project(t: Array, candidate: Y, step: Step | None) -> _Tried:
+                y, info = target.project(t, candidate, step, far)
+                ok = info.ok & (info.correction <= lax.stop_gradient(limit))
+                return y, ok, info.residual_after < info.residual_before
 
-        # Arrays over which the functions of the manifold close become leaves.
-        project = eqx.filter_closure_convert(project, t0, candidate, step)
-        y, _ = _projected(project, t0, candidate, step, end)
+            # Arrays over which the functions of the manifold close become leaves.
+            return eqx.filter_closure_convert(project, t0, candidate, step)
+
+        y, _ = _projected(by(False), by(True), t0, candidate, step, end)
         due = self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
 
 @eqx.filter_custom_jvp
 def _projected(
-    project: Callable[..., Any], t: Array, candidate: Y, step: Step | None, end: Y
+    project: Callable[..., Any],
+    far: Callable[..., Any],
+    t: Array,
+    candidate: Y,
+    step: Step | None,
+    end: Y,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The projection of the interpolant, or of what the loop tries in its place; and whether it is
-    that of the interpolant."""
+    """The projection of the interpolant, or by `far` of what is tried in its place; and whether it
+    is the first."""
+    y, direct, _ = project(t, candidate, step)
 
     def body(carry: tuple[Array, Array, Y]) -> tuple[Array, Array, Y]:
-        index, going, start = carry
-        y, ok, nearer = project(t, start, step)
-        share = 2.0 ** (index + 2 - _CANDIDATES)
+        tries, going, start = carry
+        y, ok, nearer = far(t, start, step)
+        share = 2.0 ** (tries + 2 - _TRIES)
 
-        def tried(y: Array, start: Array, end: Array) -> Array:
+        def following(y: Array, start: Array, end: Array) -> Array:
             closer = start + share.astype(end.real.dtype) * (end - start)
             # The end is taken as it is: it may not be finite, and a sum is rounded.
             closer = jnp.where(share < 1, closer, jnp.where(share > 1, jnp.nan, end))
             return jnp.where(going, jnp.where(ok | (nearer & (share < 1)), y, closer), start)
 
-        start = jtu.tree_map(tried, y, start, end)
-        return index + going.astype(int), going & ~ok & (share <= 1), start
+        start = jtu.tree_map(following, y, start, end)
+        return tries + going.astype(int), going & ~ok & (share <= 1), start
 
-    carry = jnp.asarray(0), jnp.asarray(True), candidate
-    index, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, carry)
-    return y, index == 1
+    first = jnp.asarray(0), ~direct, jtu.tree_map(ft.partial(jnp.where, direct), y, candidate)
+    _, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, first)
+    return y, direct
 
 
 @_projected.def_jvp
 def _projected_jvp(primals: Any, tangents: Any) -> Any:
     """Only the projection of the interpolant itself has a derivative."""
     y, direct = _projected(*primals)
-    given = primals[:-1], tangents[:-1]
+    given = (primals[0], *primals[2:-1]), (tangents[0], *tangents[2:-1])
     _, t_y = eqx.filter_jvp(lambda project, *args: project(*args)[0], *given)
     factor = jnp.where(direct, 1, jnp.nan)
     t_y = jtu.tree_map(lambda x: factor.astype(x.dtype) * x, tree_tangents(y, t_y))

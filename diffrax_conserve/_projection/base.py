@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
@@ -20,7 +21,11 @@ from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 from .equations import Equations, equations_of, relative
+from .loop import solve
 from .options import inverse_metric
+
+# The largest number of damped steps.
+_FAR_STEPS = 100
 
 
 @final
@@ -233,8 +238,10 @@ class Target(eqx.Module):
 
     @eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
     def project(
-        self, t: RealScalarLike, candidate: Y, step: Step | None = None
+        self, t: RealScalarLike, candidate: Y, step: Step | None = None, far: bool = False
     ) -> tuple[Y, ProjectionInfo]:
+        """With `far` by damped steps along fresh gradients, which nothing differentiates, unless
+        there are bounds."""
         values = self.values if self.gained is None else self.values + self.gained
         manifold, t, args = self.manifold, t * self.direction, self.args
         like = jax.eval_shape(lambda: candidate)
@@ -245,7 +252,14 @@ class Target(eqx.Module):
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
         shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
         problem = Problem(equations, t, args, shaped, like, keys, step)
-        y, info = self.projection.solve(problem, ravel(candidate))
+        vector, given = ravel(candidate), ft.partial(getattr, self.projection)
+        if far and given("lower", None) is given("upper", None) is None:
+            within = dict(rtol=given("rtol", None), atol=given("atol", None))
+            equations = problem.tolerating(**within)
+            y, ok, count = solve(equations, vector, max_steps=_FAR_STEPS, fresh=True, damped=True)
+            info = problem.judge(vector, y, count, ok=ok, **within)
+        else:
+            y, info = self.projection.solve(problem, vector)
         return unravel(y, problem.like), info
 
     def project_if(
