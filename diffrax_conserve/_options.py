@@ -100,6 +100,7 @@ def check_solution(sol: Any, user: str) -> None:
 
 
 def found_in(sol: Any, kind: type, user: str, solver: str) -> Any:
+    """What of a `kind` is in the state of the solver; raises if there is nothing."""
     check_solution(sol, user)
     is_one = lambda x: isinstance(x, kind)  # noqa: E731
     found = [*filter(is_one, jtu.tree_leaves(sol.solver_state, is_leaf=is_one))]

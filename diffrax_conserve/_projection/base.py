@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools as ft
 from collections.abc import Callable
 from typing import Any, ClassVar, final
 
@@ -192,6 +191,10 @@ class AbstractProjection(eqx.Module):
         """
 
 
+def has_bounds(projection: AbstractProjection) -> bool:
+    return any(getattr(projection, name, None) is not None for name in ("lower", "upper"))
+
+
 def check_projection(projection: Any) -> None:
     if not isinstance(projection, AbstractProjection):
         name = getattr(projection, "__name__", "SimplifiedNewton")
@@ -252,9 +255,9 @@ class Target(eqx.Module):
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
         shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
         problem = Problem(equations, t, args, shaped, like, keys, step)
-        vector, given = ravel(candidate), ft.partial(getattr, self.projection)
-        if far and given("lower", None) is given("upper", None) is None:
-            within = dict(rtol=given("rtol", None), atol=given("atol", None))
+        vector = ravel(candidate)
+        if far and not has_bounds(self.projection):
+            within = {name: getattr(self.projection, name, None) for name in ("rtol", "atol")}
             equations = problem.tolerating(**within)
             y, ok, count = solve(equations, vector, max_steps=_FAR_STEPS, fresh=True, damped=True)
             info = problem.judge(vector, y, count, ok=ok, **within)

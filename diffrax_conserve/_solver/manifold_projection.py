@@ -13,7 +13,7 @@ from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealS
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import FirstIntegral, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
-from .._projection.base import AbstractProjection, Target, check_projection
+from .._projection.base import AbstractProjection, Target, check_projection, has_bounds
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .diffrax_private import member
@@ -95,8 +95,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
         check_counts(every=self.every)
-        bounds = [getattr(self.projection, name, None) for name in ("lower", "upper")]
-        if bounds != [None, None] and self.every > 1:
+        if has_bounds(self.projection) and self.every > 1:
             raise ValueError(
                 "`projection` has bounds, which a step that is not projected does not keep: leave "
                 "out `every`, or `lower` and `upper`."
