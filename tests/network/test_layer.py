@@ -56,6 +56,13 @@ def test_where_the_gradient_vanishes_nothing_blows_up():
         assert float(jnp.max(jnp.abs(y))) <= 1 + 5
 
 
+def test_dependent_integrals_change_nothing():
+    once, twice = (dfc.learned.ConservativeLayer(m, steps=8) for m in (RADIUS, (RADIUS, RADIUS)))
+    candidate = jnp.array([1.1, 0.3])
+    a, b = (moved(x, candidate, x.values(0.0, EAST), ONE) for x in (once, twice))
+    np.testing.assert_allclose(a, b, atol=1e-9)
+
+
 def test_many_constraints_use_the_dense_solve():
     sphere = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2, axis=1))
     layer = dfc.learned.ConservativeLayer(sphere, steps=8)
