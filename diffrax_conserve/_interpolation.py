@@ -23,10 +23,10 @@ from ._projection.base import Step, Target
 from ._projection.equations import any_lane
 from ._tree import ravel, tree_sub, tree_tangents
 
-# The candidates that are tried, each twice as far from the last; the last one is the end.
-_TRIES = 12
-# A state, whether it is the projection, and whether it is closer to the manifold.
-_Tried = tuple[Y, Bool[Array, ""], Bool[Array, ""]]
+# The first share of the way to the end of a step, which is multiplied by eight until it is one.
+_CLOSER = 2.0**-30
+# A state, and whether it is on the manifold.
+_Tried = tuple[Y, Bool[Array, ""]]
 
 
 @final
@@ -49,9 +49,9 @@ class PackedTarget(eqx.Module):
 class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
-    Where the projection of the interpolant fails, that for far candidates is tried, again at its
-    result, if that is closer to the manifold, or else, at first by a hair, closer to the nearer end
-    of the step, a state on the manifold, and at last there. If that fails too, the value is NaN.
+    Where the projection of the interpolant fails, that for far candidates is tried, then of states
+    that are closer, at first by a hair, to the nearer end of the step, a state on the manifold, and
+    at last there. If that fails too, the value is NaN.
     There is no extrapolation: a time outside the step is replaced by the nearer end.
     """
 
@@ -83,8 +83,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         def by(far: bool) -> Callable[..., _Tried]:
             def project(t: Array, candidate: Y, step: Step | None) -> _Tried:
                 y, info = target.project(t, candidate, step, far)
-                ok = info.ok & (info.correction <= lax.stop_gradient(limit))
-                return y, ok, info.residual_after < info.residual_before
+                return y, info.ok & (info.correction <= lax.stop_gradient(limit))
 
             # Arrays over which the functions of the manifold close become leaves.
             return eqx.filter_closure_convert(project, t0, candidate, step)
@@ -96,32 +95,31 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 @eqx.filter_custom_jvp
 def _projected(
-    project: Callable[..., Any],
-    far: Callable[..., Any],
+    project: Callable[..., _Tried],
+    far: Callable[..., _Tried],
     t: Array,
     candidate: Y,
     step: Step | None,
     end: Y,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The projection of the interpolant, or by `far` of what is tried in its place; and whether it
+    """The projection of the interpolant, or by `far` of a state closer to the end; and whether it
     is the first."""
-    y, direct, _ = project(t, candidate, step)
+    y, direct = project(t, candidate, step)
 
     def body(carry: tuple[Array, Array, Y]) -> tuple[Array, Array, Y]:
-        tries, going, start = carry
-        y, ok, nearer = far(t, start, step)
-        share = 2.0 ** (tries + 2 - _TRIES)
+        share, going, y = carry
 
-        def following(y: Array, start: Array, end: Array) -> Array:
-            closer = start + share.astype(end.real.dtype) * (end - start)
-            # The end is taken as it is: it may not be finite, and a sum is rounded.
-            closer = jnp.where(share < 1, closer, jnp.where(share > 1, jnp.nan, end))
-            return jnp.where(going, jnp.where(ok | (nearer & (share < 1)), y, closer), start)
+        def closer(start: Array, end: Array) -> Array:
+            part = share.astype(end.real.dtype)
+            # The end is taken as it is, where the interpolant may not be finite.
+            return jnp.where(part < 1, (1 - part) * start + part * end, end)
 
-        start = jtu.tree_map(following, y, start, end)
-        return tries + going.astype(int), going & ~ok & (share <= 1), start
+        found, ok = far(t, jtu.tree_map(closer, candidate, end), step)
+        found = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.nan), found)
+        y = jtu.tree_map(ft.partial(jnp.where, going), found, y)
+        return 8 * share, going & ~ok & (share < 1), y
 
-    first = jnp.asarray(0), ~direct, jtu.tree_map(ft.partial(jnp.where, direct), y, candidate)
+    first = jnp.asarray(_CLOSER), ~direct, y
     _, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, first)
     return y, direct
 

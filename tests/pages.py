@@ -149,7 +149,9 @@ def _numbers_agree(printed: str, shown: str, roundoff: float) -> bool:
     if mantissa == shown.lstrip("+-") and "." not in shown:
         return abs(a - b) <= 0.01 * larger  # a number of steps
     digits = min(len(mantissa.replace(".", "").lstrip("0")), 4)
-    return larger < roundoff or abs(a - b) <= 5 * 10.0**-digits * larger
+    # One digit is the size of an error, which after a training another processor changes.
+    share = 0.7 if digits == 1 else 5 * 10.0**-digits
+    return larger < roundoff or abs(a - b) <= share * larger
 
 
 def write(file: Path) -> None:

@@ -120,8 +120,9 @@ def _solve(
         """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1."""
         level, noise = equations.verdict(seen[0], seen[1], y)
         on = level > 0
-        # Within the tolerance one more.
-        now = jnp.where(on, jnp.minimum(left - 1, 1), jnp.where(left == 1, -1, left - 1))
+        # Within the tolerance one more, unless it would only serve a start far away.
+        more = jnp.minimum(left - 1, 0 if damped else 1)
+        now = jnp.where(on, more, jnp.where(left == 1, -1, left - 1))
         # NaN stays NaN, in the state after one more, unless the step is shortened.
         stays = (left == max_steps + 1) if damped else (left > 0)
         now = jnp.where((level < 0) & stays, jnp.minimum(now, 1), now)

@@ -220,5 +220,5 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved very short steps tell nothing.
-    near = jnp.sum(moved - max(1e-5, 4 * root) * size) <= 0
+    near = jnp.sum(moved - 4 * root * size) <= 0
     return cause, near | instant | lost

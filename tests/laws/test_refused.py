@@ -48,6 +48,17 @@ def test_a_pendulum_near_rest_is_solved(dtype, fixed):
     assert np.all(done), (np.mean(done), amplitude[~np.asarray(done)][:5])
 
 
+def test_a_body_whose_motion_is_below_the_tolerance_is_solved():
+    """It wobbles about an axis by a millionth; steps grow until their error is as large."""
+    body, rng = dfc.systems.RigidBody(), np.random.default_rng(5)
+    fns = [lambda *args, fn=entry.fn: fn(*args) for entry in body.manifold.values()]
+    y0 = np.eye(3)[rng.integers(0, 3, 300)] + 10 ** rng.uniform(-7, -5) * rng.normal(size=(300, 3))
+    for tol in (1e-3, 1e-5):
+        controller, times = dfx.PIDController(tol, tol), jnp.array([10.0, 1.0])
+        done = okay(body.vector_field, fns, dfx.Tsit5(), controller, y0, np.zeros(300), times)
+        assert np.all(done), (tol, y0[~np.asarray(done)][:5])
+
+
 @eqx.filter_jit
 @eqx.filter_vmap(in_axes=(None, 0, 0))
 def to_values(fn, candidate, value):
