@@ -226,7 +226,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
     this times the distance covered by the step, each the sum over the components. A component may
-    always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
+    always change by $2\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
     one as long as half a step tells that the quantity is not conserved, or that the state jumped
     to another part of the manifold. `every` multiplies the limit. It does not apply with a
     `Constraint`, whose correction may do all the work of a step, to stochastic equations, to

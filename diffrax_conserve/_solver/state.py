@@ -204,12 +204,12 @@ def verdict(
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    size, root = jnp.abs(candidate), float(info.eps) ** 0.5
-    # One sum, hence one kernel. In any step a component may change by the root of roundoff, as
-    # roundoff alone moves the state where gradients are nearly parallel.
+    # In any step a component may change by this share of itself, as roundoff alone moves the state
+    # where gradients are nearly parallel. One sum is one kernel.
+    harmless = 2 * float(info.eps) ** 0.5 * jnp.abs(candidate)
     share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    excess = jnp.sum(correction - jnp.maximum(share * moved, root * size))
+    excess = jnp.sum(correction - jnp.maximum(share * moved, harmless))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
@@ -220,5 +220,5 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved very short steps tell nothing.
-    near = jnp.sum(moved - 4 * root * size) <= 0
+    near = jnp.sum(moved - 2 * harmless) <= 0
     return cause, near | instant | lost
