@@ -137,6 +137,7 @@ def test_a_flow_map_gets_the_slope_of_the_field():
     np.testing.assert_allclose(network.slope(y), slope, rtol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:The trained flow map is wrong")
 @pytest.mark.parametrize(
     ("field", "options"), [(stiff, dict()), (LORENZ.vector_field, dict(taylor=0))]
 )

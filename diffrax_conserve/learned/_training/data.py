@@ -67,9 +67,7 @@ def reachable_states(
     """
     count = jtu.tree_leaves(as_states(y0s))[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
-    _, ys = trajectories(
-        vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6, atol=1e-6
-    )
+    _, ys = trajectories(vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6)
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
     return ys if keep is None else _the_good(ys, eqx.filter_jit(jax.vmap(keep))(ys))
 
@@ -125,9 +123,10 @@ def trajectories(
         adaptive = dfx.ClipStepSizeController(dfx.PIDController(rtol=rtol, atol=atol), step_ts=ts)
         controller = adaptive if dt0 is None else dfx.ConstantStepSize()
         by = dfx.Dopri8() if solver is None else solver
+        # A solution with a singularity at a finite time would need infinitely many steps.
         found = dfx.diffeqsolve(
             dfx.ODETerm(vector_field), by, 0.0, ts[-1], dt0, y0, args, saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=controller, adjoint=dfx.ForwardMode(), max_steps=_MAX_STEPS,
+            stepsize_controller=controller, adjoint=dfx.ForwardMode(), max_steps=10_000,
             throw=False,
         )  # fmt: skip
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
@@ -144,10 +143,6 @@ def _the_good(ys: Any, good: Array) -> Any:
             "time, or give another `solver`."
         )
     return jtu.tree_map(lambda x: x[good], ys)
-
-
-# A limit, because a solution with a singularity at a finite time would need infinitely many steps.
-_MAX_STEPS = 10_000
 
 
 def as_sampler(sample: Any) -> Sampler | None:
@@ -226,9 +221,6 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
             f"{flow_map.max_step}. Give it a longer one."
         )
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
-    pairs = whole.draw(_MANY, jr.key(0))
+    pairs = whole.draw(2000, jr.key(0))
     deviation = jnp.sqrt(jnp.mean(jnp.square(flow_map.compared(pairs.y1s, pairs.y0s)), axis=0))
     return eqx.tree_at(lambda d: d.deviation, whole, jnp.where(deviation > 0, deviation, 1))
-
-
-_MANY = 2000

@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -52,7 +53,7 @@ def fit(
     A `PINN` is trained window by window; each starts at the end of the previous one, projected to
     the manifold if one is given. A window whose estimated error is too large is cut in halves, as
     often as the recipe's `retries` allow. If the whole solution misses the `target`, the windows
-    are trained again, to smaller errors. If it is still wrong, a warning names window and error.
+    are trained again, to smaller errors. A warning tells if the solution, or a step, is wrong.
 
     A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
     same arguments, or with a recipe of more epochs; the result is the same, bit for bit, as without
@@ -118,8 +119,7 @@ def fit(
     check_types(key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
     target = None if target is None else float(target)
-    seconds = math.inf if seconds is None else seconds
-    loop = Loop(problem, key, target, seconds, progress, created)
+    loop = Loop(problem, key, target, seconds or math.inf, progress, created)
     if isinstance(model, PINN):
         return train_windows(loop, model, manifold, state)
     trained, log = _train_flow_map(loop, network, state)
@@ -139,4 +139,12 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
 
     state, carry, ended = loop.train(objective, state, close_enough, error)
     trained = objective.best(carry)
-    return trained, loop.log(state, carry, ended, error(trained))
+    found = error(trained)
+    if not found <= 0.1:  # not one correct digit
+        warnings.warn(
+            f"The trained flow map is wrong: its longest step has an estimated error of {found:.2g}"
+            ". Train it longer, give it a shorter `max_step` or more `width`, and states in which "
+            "every component varies, such as those of `learned.reachable_states`.",
+            stacklevel=3,
+        )
+    return trained, loop.log(state, carry, ended, found)
