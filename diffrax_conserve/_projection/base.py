@@ -23,8 +23,8 @@ from .equations import Equations, equations_of, relative
 from .loop import solve
 from .options import inverse_metric
 
-# The largest number of damped steps.
-_FAR_STEPS = 100
+# The largest number of damped steps: in mixed units they zigzag.
+_FAR_STEPS = 1000
 
 
 @final
@@ -245,10 +245,13 @@ class Target(eqx.Module):
     ) -> tuple[Y, ProjectionInfo]:
         """With `far` by damped steps along fresh gradients, which nothing differentiates, unless
         there are bounds."""
-        values = self.values if self.gained is None else self.values + self.gained
+        values, hidden = self.values, self.hidden
+        if self.gained is not None:  # a sum has the roundoff of its terms
+            values = self.values + self.gained
+            hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
         manifold, t, args = self.manifold, t * self.direction, self.args
         like = jax.eval_shape(lambda: candidate)
-        equations = equations_of(manifold, values, t, like, args, self.hidden)
+        equations = equations_of(manifold, values, t, like, args, hidden)
         weights = inverse_metric(self.projection.metric, like)
         equations = dataclasses.replace(equations, weights=weights)
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)

@@ -78,8 +78,8 @@ class Equations(eqx.Module):
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
         """-1 if a residual is not finite; 0 if `y` is off the manifold; 1 if it is on it; 2 if all
-        are noise, an eighth of the tolerance, which only chance could reduce. And the noise. A
-        residual within a tolerance that underflows says nothing."""
+        are within a quarter of the tolerance. And the noise, an eighth of it, which only chance
+        could reduce. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
@@ -87,7 +87,7 @@ class Equations(eqx.Module):
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         noise = 0.125 * limit
-        reached = jnp.where(jnp.abs(g) <= noise, jnp.int8(2), jnp.int8(1))
+        reached = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(2), jnp.int8(1))
         missed = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(0), jnp.int8(-1))
         # Not by a maximum of residuals, which can lose NaN on a CPU.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, missed)), noise

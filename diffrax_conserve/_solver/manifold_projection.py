@@ -151,6 +151,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             jnp.zeros_like(values) if has_rates(self.manifold) else None,
             None if self.every == 1 else jnp.asarray(0),
             jnp.asarray(True) if given and self._limit(terms) is not None else None,
+            jnp.asarray(False),
             ProjectionStatistics.zero(values.dtype),
         )
 
@@ -189,7 +190,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         states, limit = (y0, candidate, y1), self._limit(terms)
-        failed, hopeless = verdict(info.ok, state, (t0, t1), states, limit)
+        failed, hopeless, crept = verdict(info.ok, state, (t0, t1), states, limit)
         # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
         y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
@@ -206,7 +207,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
-        return y1, error, dense_info, state.next(inner, target.gained, info, due), result
+        return y1, error, dense_info, state.next(inner, target.gained, info, due, crept), result
 
     def _limit(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         """`max_correction` for the steps since the last projection, where it applies: not to
@@ -226,7 +227,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by more than
     this times the distance covered by the step, each the sum over the components. A component may
-    always change by $2\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
+    always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
     one as long as half a step tells that the quantity is not conserved, or that the state jumped
     to another part of the manifold. `every` multiplies the limit. It does not apply with a
     `Constraint`, whose correction may do all the work of a step, to stochastic equations, to

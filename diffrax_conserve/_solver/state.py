@@ -153,6 +153,7 @@ class State(eqx.Module):
       would lose digits in the values.
     - `num_steps`: counted only if not every step is projected.
     - `is_first`: whether no step was made yet, if the first one may have to reach a given `value`.
+    - `crept`: whether the last step succeeded only because it was short.
     """
 
     inner: Any
@@ -161,17 +162,25 @@ class State(eqx.Module):
     gained: Float[Array, " m"] | None
     num_steps: Int[Array, ""] | None
     is_first: Bool[Array, ""] | None
+    crept: Bool[Array, ""]
     statistics: ProjectionStatistics
 
     def next(
-        self, inner: Any, gained: Array | None, info: ProjectionInfo, due: Array | None
+        self,
+        inner: Any,
+        gained: Array | None,
+        info: ProjectionInfo,
+        due: Array | None,
+        crept: Bool[Array, ""],
     ) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
         is_first = self.is_first
         if is_first is not None:
             is_first = jnp.zeros_like(is_first) if due is None else is_first & ~due
         statistics = self.statistics.add(info, due)
-        return State(inner, self.values, self.hidden, gained, num_steps, is_first, statistics)
+        return State(
+            inner, self.values, self.hidden, gained, num_steps, is_first, crept, statistics
+        )
 
 
 def started(
@@ -198,18 +207,20 @@ def verdict(
     times: tuple[RealScalarLike, RealScalarLike],
     states: tuple[Y, Y, Y],
     max_correction: RealScalarLike | None,
-) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """The cause of the failure of a step, 0 if it succeeded, and whether a failure is final. The
-    `states` are the last one, the candidate and the result."""
+) -> tuple[Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """The cause of the failure of a step, 0 if it succeeded; whether it is final; and whether
+    a success is one only because the step is short. The `states` are the last, the candidate
+    and the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    # In any step a component may change by this share of itself, as roundoff alone moves the state
+    # In any step a component may change by the root of roundoff, as roundoff alone moves the state
     # where gradients are nearly parallel. One sum is one kernel.
-    harmless = 2 * float(info.eps) ** 0.5 * jnp.abs(candidate)
-    share = 0 if max_correction is None else jnp.asarray(max_correction, info.dtype)
+    size, root = jnp.abs(candidate), float(info.eps) ** 0.5
+    # One of exactly this share is too long, whatever is rounded.
+    share = 0 if max_correction is None else jnp.asarray(0.999 * max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    excess = jnp.sum(correction - jnp.maximum(share * moved, harmless))
+    excess = jnp.sum(correction - jnp.maximum(share * moved, root * size))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
@@ -219,6 +230,8 @@ def verdict(
     cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    # Of what is not conserved very short steps tell nothing.
-    near = jnp.sum(moved - 2 * harmless) <= 0
-    return cause, near | instant | lost
+    # Of what is not conserved steps pass if they are short enough, one after the other.
+    least = jnp.where(state.crept, max(1e-5, 4 * root), 4 * root)
+    near = jnp.sum(moved - least * size) <= 0
+    crept = jnp.sum(correction - share * moved) > 0
+    return cause, near | instant | lost, crept
