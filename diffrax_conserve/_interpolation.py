@@ -25,8 +25,6 @@ from ._tree import ravel, tree_sub, tree_tangents
 
 # The first share of the way to the end of a step, which is multiplied by eight until it is one.
 _CLOSER = 2.0**-30
-# A state, and whether it is on the manifold.
-_Tried = tuple[Y, Bool[Array, ""]]
 
 
 @final
@@ -80,8 +78,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         apart = (jnp.linalg.norm(ravel(tree_sub(end, candidate))) for end in self.ends)
         limit = jnp.inf if target.projection.metric is not None else sum(apart)
 
-        def by(far: bool) -> Callable[..., _Tried]:
-            def project(t: Array, candidate: Y, step: Step | None) -> _Tried:
+        def by(far: bool) -> Callable[..., Any]:
+            def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Array]:
                 y, info = target.project(t, candidate, step, far)
                 return y, info.ok & (info.correction <= lax.stop_gradient(limit))
 
@@ -95,8 +93,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 @eqx.filter_custom_jvp
 def _projected(
-    project: Callable[..., _Tried],
-    far: Callable[..., _Tried],
+    project: Callable[..., Any],
+    far: Callable[..., Any],
     t: Array,
     candidate: Y,
     step: Step | None,

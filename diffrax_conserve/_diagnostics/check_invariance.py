@@ -220,14 +220,8 @@ def _relative_sizes(
     return defect, violation, jnp.all(jacobian == 0) & jnp.all(partial == 0)
 
 
-def _verdict(
-    name: str,
-    entry: Entry,
-    rtol: float,
-    defects: np.ndarray,
-    residuals: np.ndarray,
-    constant: np.ndarray,
-) -> InvarianceEntry:
+def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:
+    defects, residuals, constant = found
     # The first NaN, or the largest.
     state, worst = int(np.argmax(defects)), int(np.argmax(residuals))
     if not residuals[worst] <= rtol:
@@ -237,11 +231,6 @@ def _verdict(
             "y)[0]`, or make it a `FirstIntegral` if it is conserved at any value."
         )
     kind = "first integral" if rate_of(entry) is None else "balance"
-    return InvarianceEntry(
-        name=name,
-        kind="constraint" if isinstance(entry, Constraint) else kind,
-        defect=float(defects[state]),
-        state=state,
-        ok=bool(defects[state] <= rtol),
-        is_constant=bool(np.all(constant)),
-    )
+    kind = "constraint" if isinstance(entry, Constraint) else kind
+    defect, is_constant = float(defects[state]), bool(np.all(constant))
+    return InvarianceEntry(name, kind, defect, state, defect <= rtol, is_constant)

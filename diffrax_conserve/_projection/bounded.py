@@ -41,16 +41,12 @@ class Box(eqx.Module):
 
     def compose(self, equations: Equations) -> Equations:
         """The equations as functions of `z`."""
-        parts = tuple(_Clipped(part, self) for part in equations.parts)
+        parts = tuple(eqx.Partial(_clipped, self, part) for part in equations.parts)
         return dataclasses.replace(equations, parts=parts, clip=self.clip)
 
 
-class _Clipped(eqx.Module):
-    part: Callable[[Array], Array]
-    box: Box
-
-    def __call__(self, z: Float[Array, " n"]) -> Float[Array, " k"]:
-        return self.part(self.box.clip(z))
+def _clipped(box: Box, part: Callable[[Array], Array], z: Array) -> Array:
+    return part(box.clip(z))
 
 
 def box_of(

@@ -152,13 +152,12 @@ def _solve(
     if in_arrays:
         y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
     kept, seen = start(y)
-    count = jnp.asarray(0)
     if seen is not None:
         left, seen = judge(seen, y, left)
-        count = count + (left > 0).astype(int)
     elif not in_arrays:  # the first iteration before the loop, which saves a tenth
         y, left = test(kept, y, left)
-        count = count + (left > 0).astype(int)
+    # It is judged before the loop, or not yet.
+    count = (left <= max_steps).astype(int) * (left > 0)
 
     last: Any = (y, jnp.full_like(candidate[0], jnp.inf), equations.magnitude) if damped else seen
 

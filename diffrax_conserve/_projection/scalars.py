@@ -83,7 +83,7 @@ def walk(
 
     def read(var: Any) -> Any:
         if isinstance(var, jex.Literal):
-            return constant(np.asarray(var.val, _dtype(var)))
+            return constant(np.asarray(var.val, var.aval.dtype))  # pyright: ignore
         return env[var]
 
     for eqn in closed.jaxpr.eqns:
@@ -213,7 +213,7 @@ class _WriteOut:
             return [self._elementwise(fn, inputs)]
         if name in _REDUCTIONS and given.keys() == {"axes"}:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
-        same_type = _dtype(eqn.invars[0]) == _dtype(eqn.outvars[0])
+        same_type = eqn.invars[0].aval.dtype == eqn.outvars[0].aval.dtype
         if name == "dot_general" and given.keys() <= _DOT and same_type:
             return [self._dot(inputs, params["dimension_numbers"])]
         raise _NotWrittenOut(name)
@@ -276,7 +276,3 @@ class _WriteOut:
         self.num_operations += operations
         if self.num_operations > self.limit:
             raise _NotWrittenOut
-
-
-def _dtype(var: Any) -> np.dtype:
-    return var.aval.dtype

@@ -145,14 +145,14 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         values, hidden = started(self.manifold, values, t, y0, args)
         given = any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold))
         return State(
-            self.solver.init(terms, t0, t1, y0, args),
-            values,
-            hidden,
-            jnp.zeros_like(values) if has_rates(self.manifold) else None,
-            None if self.every == 1 else jnp.asarray(0),
-            jnp.asarray(True) if given and self._limit(terms) is not None else None,
-            jnp.asarray(False),
-            ProjectionStatistics.zero(values.dtype),
+            inner=self.solver.init(terms, t0, t1, y0, args),
+            values=values,
+            hidden=hidden,
+            gained=jnp.zeros_like(values) if has_rates(self.manifold) else None,
+            num_steps=None if self.every == 1 else jnp.asarray(0),
+            is_first=jnp.asarray(True) if given and self._limit(terms) is not None else None,
+            crept=jnp.asarray(False),
+            statistics=ProjectionStatistics.zero(values.dtype),
         )
 
     def step(
@@ -174,15 +174,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, state.inner, made_jump
         )
-        start = Target(
-            self.projection,
-            self.manifold,
-            state.values,
-            state.hidden,
-            args,
-            time_direction(terms, t1),
-            state.gained,
-        )
+        conserved = state.values, state.hidden, args, time_direction(terms, t1), state.gained
+        start = Target(self.projection, self.manifold, *conserved)
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
@@ -207,7 +200,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
-        return y1, error, dense_info, state.next(inner, target.gained, info, due, crept), result
+        state = state.next(info, due, inner=inner, gained=target.gained, crept=crept)
+        return y1, error, dense_info, state, result
 
     def _limit(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         """`max_correction` for the steps since the last projection, where it applies: not to

@@ -165,22 +165,13 @@ class State(eqx.Module):
     crept: Bool[Array, ""]
     statistics: ProjectionStatistics
 
-    def next(
-        self,
-        inner: Any,
-        gained: Array | None,
-        info: ProjectionInfo,
-        due: Array | None,
-        crept: Bool[Array, ""],
-    ) -> "State":
+    def next(self, info: ProjectionInfo, due: Array | None, **fields: Any) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
         is_first = self.is_first
         if is_first is not None:
             is_first = jnp.zeros_like(is_first) if due is None else is_first & ~due
-        statistics = self.statistics.add(info, due)
-        return State(
-            inner, self.values, self.hidden, gained, num_steps, is_first, crept, statistics
-        )
+        fields |= dict(num_steps=num_steps, is_first=is_first)
+        return dataclasses.replace(self, statistics=self.statistics.add(info, due), **fields)
 
 
 def started(
