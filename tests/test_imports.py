@@ -164,17 +164,3 @@ def test_private_names_of_other_packages_are_those_allowed():
         if is_private(name)
     }
     assert used == PRIVATE_ALLOWED
-
-
-def test_the_package_exports_names_and_a_version_and_does_nothing_else():
-    introduction, *statements = ast.parse((ROOT / "__init__.py").read_text(encoding="utf-8")).body
-    assert isinstance(introduction, ast.Expr)
-    for statement in statements:
-        if isinstance(statement, ast.ImportFrom):
-            assert statement.level == 1, ast.unparse(statement)
-            assert all(alias.asname == alias.name for alias in statement.names), (
-                f"`{ast.unparse(statement)}`: write `from ._x import Y as Y`"
-            )
-        else:
-            assert isinstance(statement, ast.Assign), ast.unparse(statement)
-            assert [ast.unparse(target) for target in statement.targets] == ["__version__"]

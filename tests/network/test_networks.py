@@ -127,14 +127,6 @@ def test_untrained_it_has_the_order_of_its_polynomial(core, order):
     np.testing.assert_allclose(slopes, -(order + 1), atol=0.15)
 
 
-@KINDS
-def test_every_kind_starts_at_its_state(core):
-    network = flow_map(core=core, taylor=dfc.learned.Taylor(LORENZ.vector_field))
-    np.testing.assert_array_equal(network(LORENZ.y0, 0.0), LORENZ.y0)
-    slope = jax.jacfwd(lambda h: network(LORENZ.y0, h))(0.0)
-    np.testing.assert_allclose(slope, LORENZ.vector_field(0.0, LORENZ.y0, None), rtol=1e-14)
-
-
 def test_a_solve_across_windows():
     pinn = dfc.PINN(EAST, 0.0, 4.0, windows=2, width=8, depth=1, slope=2.0, key=jr.key(0))
     end = pinn.window(0)(2.0)

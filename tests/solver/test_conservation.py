@@ -19,7 +19,6 @@ from ..problems import (
     KEPLER0,
     RIGID_BODY,
     drift_of,
-    evaluated,
     exponential,
     exponential_solution,
     kepler,
@@ -43,23 +42,6 @@ def test_drift_is_at_roundoff_in_single_precision(name):
     sol = solve(system.vector_field, solver, jax.tree.map(single, system.y0), **options)
     assert largest(drift_of(sol, system.manifold)) <= 1e-6
     assert all(y.dtype == jnp.float32 for y in jax.tree.leaves(sol.ys))
-
-
-def test_saved_and_dense_times_lie_on_the_manifold():
-    """Where the solution without projection does not."""
-    system, ts = dfc.systems.get("kepler"), jnp.linspace(0, 4, 173)
-
-    def run(solver, saveat):
-        return solve(system.vector_field, solver, system.y0, t1=4.0, dt0=0.02, saveat=saveat)
-
-    projected = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
-    saved = run(projected, dfx.SaveAt(ts=ts, dense=True))
-    assert largest(drift_of(saved, system.manifold)) <= 4e-15
-    ys = evaluated(saved, ts)
-    for a, b in zip(jax.tree.leaves(ys), jax.tree.leaves(saved.ys), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-    plain = run(dfc.RK4(), dfx.SaveAt(ts=ts))
-    assert largest(drift_of(plain, system.manifold)) > 1e-12
 
 
 def test_drift_does_not_grow_over_a_million_steps():
