@@ -157,7 +157,7 @@ def _solve(
     elif not in_arrays:  # the first iteration before the loop, which saves a tenth
         y, left = test(kept, y, left)
     # It is judged before the loop, or not yet.
-    count = (left <= max_steps).astype(int) * (left > 0)
+    count = ((left > 0) & (left <= max_steps)).astype(int)
 
     last: Any = (y, jnp.full_like(candidate[0], jnp.inf), equations.magnitude) if damped else seen
 
