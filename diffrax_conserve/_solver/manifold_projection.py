@@ -219,7 +219,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
-- `max_correction`: a projection to first integrals fails if it moves the candidate by more than
+- `max_correction`: a projection to first integrals fails if it moves the candidate by as much as
     this times the distance covered by the step, each the sum over the components. A component may
     always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
     one as long as half a step tells that the quantity is not conserved, or that the state jumped

@@ -199,18 +199,18 @@ def verdict(
     states: tuple[Y, Y, Y],
     max_correction: RealScalarLike | None,
 ) -> tuple[Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """The cause of the failure of a step, 0 if it succeeded; whether it is final; and whether
-    a success is one only because the step is short. The `states` are the last, the candidate
-    and the result."""
+    """The cause of the failure of a step, 0 if it succeeded; whether a failure is final; whether a
+    success is one only because the step is short. The `states` are the last one, the candidate and
+    the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    # In any step a component may change by the root of roundoff, as roundoff alone moves the state
-    # where gradients are nearly parallel. One sum is one kernel.
     size, root = jnp.abs(candidate), float(info.eps) ** 0.5
-    # One of exactly this share is too long, whatever is rounded.
+    # A little less, so that a correction of exactly this share is too long, whatever is rounded.
     share = 0 if max_correction is None else jnp.asarray(0.999 * max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
+    # One sum is one kernel. In any step a component may change by the root of roundoff, as roundoff
+    # alone moves the state where gradients are nearly parallel.
     excess = jnp.sum(correction - jnp.maximum(share * moved, root * size))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
