@@ -222,7 +222,6 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved steps pass if they are short enough, one after the other.
-    least = jnp.where(state.crept, max(1e-5, 4 * root), 4 * root)
-    near = jnp.sum(moved - least * size) <= 0
+    hopeless = (state.crept & (cause == _TOO_FAR)) | (jnp.sum(moved - 4 * root * size) <= 0)
     crept = jnp.sum(correction - share * moved) > 0
-    return cause, near | instant | lost, crept
+    return cause, hopeless | instant | lost, crept
