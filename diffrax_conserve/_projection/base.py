@@ -118,18 +118,12 @@ class Problem(eqx.Module):
         """The state of the solve whose numbers are `y`."""
         return unravel(y, self.like)
 
-    def tolerating(self, rtol: float | Array | None, atol: float | Array | None) -> Equations:
-        """The equations with these tolerances."""
-        return dataclasses.replace(self.equations, rtol=rtol, atol=atol)
-
     def judge(
         self,
         candidate: Float[Array, " n"],
         y: Float[Array, " n"],
         num_steps: IntScalarLike = 1,
         *,
-        rtol: float | Array | None = None,
-        atol: float | Array | None = None,
         ok: Bool[Array, ""] | None = None,
     ) -> ProjectionInfo:
         """The report on a projection from `candidate` to `y`, as `solve` must return it.
@@ -137,11 +131,10 @@ class Problem(eqx.Module):
         **Arguments:**
 
         - `num_steps`: the number of iterations.
-        - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
         - `ok`: the verdict, if it is known. By default: whether every residual is small at `y`.
         """
         # The verdict has no derivative.
-        equations, candidate, y = tree_stop_gradient((self.tolerating(rtol, atol), candidate, y))
+        equations, candidate, y = tree_stop_gradient((self.equations, candidate, y))
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
@@ -173,8 +166,9 @@ class AbstractProjection(eqx.Module):
     """A map from a candidate to a state on the manifold.
 
     Write your own as a subclass with a field `metric` and the method `solve`; see "Your own
-    projection" in the guide. Set `sees_step = False` in the class if it does not use
-    `Problem.step`: then it needs no step, as in a stage of [`diffrax_conserve.Staged`][].
+    projection" in the guide. Residuals are judged by its fields `rtol` and `atol`, if it has them.
+    Set `sees_step = False` in the class if it does not use `Problem.step`: then it needs no step,
+    as in a stage of [`diffrax_conserve.Staged`][].
     """
 
     metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
@@ -189,6 +183,12 @@ class AbstractProjection(eqx.Module):
 
         Never raises at run time; `info.ok` is true only if every residual is small.
         """
+
+    def adapted(self, equations: Equations, like: Any) -> Equations:
+        """The equations with the metric and the tolerances of this projection."""
+        options = {name: getattr(self, name, None) for name in ("rtol", "atol")}
+        weights = inverse_metric(self.metric, like)
+        return dataclasses.replace(equations, weights=weights, **options)
 
 
 def has_bounds(projection: AbstractProjection) -> bool:
@@ -252,18 +252,15 @@ class Target(eqx.Module):
         manifold, t, args = self.manifold, t * self.direction, self.args
         like = jax.eval_shape(lambda: candidate)
         equations = equations_of(manifold, values, t, like, args, hidden)
-        weights = inverse_metric(self.projection.metric, like)
-        equations = dataclasses.replace(equations, weights=weights)
+        equations = self.projection.adapted(equations, like)
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
         shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
         problem = Problem(equations, t, args, shaped, like, keys, step)
         vector = ravel(candidate)
         if far and not has_bounds(self.projection):
-            within = {name: getattr(self.projection, name, None) for name in ("rtol", "atol")}
-            equations = problem.tolerating(**within)
             y, ok, count = solve(equations, vector, max_steps=_FAR_STEPS, fresh=True, damped=True)
-            info = problem.judge(vector, y, count, ok=ok, **within)
+            info = problem.judge(vector, y, count, ok=ok)
         else:
             y, info = self.projection.solve(problem, vector)
         return unravel(y, problem.like), info

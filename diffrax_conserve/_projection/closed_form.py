@@ -57,7 +57,7 @@ class ClosedForm(AbstractProjection):
                 "same structure, shapes and dtypes."
             )
         y = ravel(y)
-        return y, problem.judge(candidate, y, rtol=self.rtol, atol=self.atol)
+        return y, problem.judge(candidate, y)
 
 
 ClosedForm.__init__.__doc__ = r"""**Arguments:**

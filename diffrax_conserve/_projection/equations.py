@@ -117,8 +117,7 @@ def measure(
 ) -> tuple[Values, Values]:
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
     vector = ravel(y)
-    numbers = ravel(values).astype(vector.dtype)
-    equations = equations_of(manifold, numbers, t, y, args)
+    equations = equations_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)

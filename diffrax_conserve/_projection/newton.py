@@ -72,11 +72,11 @@ class Newton(AbstractProjection):
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
-        equations = problem.tolerating(self.rtol, self.atol)
         box = box_of(self.lower, self.upper, problem.like)
-        unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
+        steps = self.max_steps
+        unknowns, _, _, count = _nearest(problem.equations, candidate, box, max_steps=steps)
         y = unknowns[: candidate.size]
-        return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol)
+        return y, problem.judge(candidate, y, count)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS

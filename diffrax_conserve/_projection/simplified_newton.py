@@ -63,13 +63,13 @@ class SimplifiedNewton(AbstractProjection):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        equations = problem.tolerating(self.rtol, self.atol)
+        equations = problem.equations
         box = box_of(self.lower, self.upper, problem.like)
         if box is None:
             y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
         else:
             y, ok, count = project_within(box, equations, candidate, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, rtol=self.rtol, atol=self.atol, ok=ok)
+        return y, problem.judge(candidate, y, count, ok=ok)
 
 
 SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS

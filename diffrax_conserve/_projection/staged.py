@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .equations import Equations
-from .options import inverse_metric
 
 
 @final
@@ -105,7 +104,6 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
         tuple(it.compress(problem.equations.parts, wanted)),
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
-        inverse_metric(projection.metric, problem.like),
         may_vanish=problem.equations.may_vanish,
     )
-    return dataclasses.replace(problem, equations=equations)
+    return dataclasses.replace(problem, equations=projection.adapted(equations, problem.like))

@@ -51,6 +51,7 @@ class Seen(dfc.AbstractProjection):
     """Moves nothing, and checks what it sees against what the solver knows."""
 
     metric: None = None
+    atol: float = 1.0
 
     def solve(self, problem, candidate):
         step = problem.step
@@ -58,7 +59,7 @@ class Seen(dfc.AbstractProjection):
         start = (problem.t != step.t0) | (jnp.max(jnp.abs(step.y0 - candidate)) < 1e-14)
         right = inside & start & (step.t1 != step.t0)
         y = jnp.where(right, candidate, jnp.nan)
-        return y, problem.judge(candidate, y, atol=1.0)
+        return y, problem.judge(candidate, y)
 
 
 def test_a_projection_sees_the_step_of_every_candidate():
@@ -78,7 +79,7 @@ class Unseeing(Seen):
 
     def solve(self, problem, candidate):
         assert problem.step is None
-        return candidate, problem.judge(candidate, candidate, atol=1.0)
+        return candidate, problem.judge(candidate, candidate)
 
 
 def test_what_asks_for_no_step_gets_none_and_saves_none():
@@ -88,11 +89,8 @@ def test_what_asks_for_no_step_gets_none_and_saves_none():
 
 
 def test_what_is_no_solution_is_a_failure():
-    class Lazy(Unseeing):
-        def solve(self, problem, candidate):
-            return candidate, problem.judge(candidate, candidate)
-
-    solver = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=Lazy())
+    lazy = Unseeing(atol=0.0)
+    solver = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=lazy)
     assert solve(solver, dt0=0.3, throw=False).result != dfx.RESULTS.successful
     # Outside a solve there is no step.
     with pytest.raises(AttributeError, match="y0"):

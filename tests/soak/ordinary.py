@@ -1,7 +1,7 @@
 """Attack: ordinary candidates, as a step of an integrator proposes them. A projection that fails
-where a damped Gauss-Newton iteration in long double succeeds is counted: a false failure. Of those of
-`SimplifiedNewton` some are no failure of the iteration: along the gradients at the candidate, where
-it is to look, the same oracle finds no state of the manifold. They are counted apart.
+where a damped Gauss-Newton iteration in long double succeeds is counted: a false failure. Those of
+`SimplifiedNewton` are counted apart if the same oracle finds no state along the gradients at the
+candidate, where that is to look.
 
 The candidate is 1e-12 to 1e-2 of its size away from a state of the manifold. To the families of the
 other attacks come networks, and functions with constants that their gradients do not show. A lane
