@@ -118,9 +118,9 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     - `epochs`: the number of updates; more reduce the error, down to what the network can do.
     """
     # With 2,000 columns a QR factorisation takes about as long as SPRING's Cholesky factorisation.
+    updates = lambda default: default if epochs is None else epochs  # noqa: E731
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= 2000:
         # Up to 1,024 windows in the place of one.
         options: dict[str, Any] = dict(times=grid, check_every=5, retries=10)
-        return Recipe(epochs or 40, 120, LevenbergMarquardt(), complete, **options)
-    options = dict(taylor=1, check_every=20, refresh=1)
-    return Recipe(epochs or 1000, 250, SPRING(), complete, **options)
+        return Recipe(updates(40), 120, LevenbergMarquardt(), complete, **options)
+    return Recipe(updates(1000), 250, SPRING(), complete, taylor=1, check_every=20, refresh=1)
