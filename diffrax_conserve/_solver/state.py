@@ -222,6 +222,6 @@ def verdict(
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved steps pass if they are short enough, one after the other.
-    hopeless = (state.crept & (cause == _TOO_FAR)) | (jnp.sum(moved - 4 * root * size) <= 0)
+    least = jnp.where(state.crept & (cause == _TOO_FAR), max(1e-4, root ** (2 / 3)), 4 * root)
     crept = jnp.sum(correction - share * moved) > 0
-    return cause, hopeless | instant | lost, crept
+    return cause, (jnp.sum(moved - least * size) <= 0) | instant | lost, crept
