@@ -107,7 +107,7 @@ def main(argv=None):
     options = parser.parse_args(argv)
     records = json.loads(OUT.read_text()) if OUT.exists() and not options.smoke else []
     data = functools.cache(lambda name: defaults.flow_map_data(SYSTEMS[name], options.smoke))
-    for setting in options.setting or SETTINGS:
+    for setting in options.setting or list(SETTINGS)[: 2 if options.smoke else None]:
         make = functools.partial(dfc.DeepONet, **SETTINGS[setting][0])
         changes = SETTINGS[setting][1] | ({"epochs": 4} if options.smoke else {})
         for name in list(SYSTEMS)[: 1 if options.smoke else None]:
