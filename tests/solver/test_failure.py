@@ -226,6 +226,27 @@ def test_no_wrong_integral_keeps_an_adaptive_solve_from_its_end(name):
     assert np.mean(passed) < (0.5 if field is swing else 0.005)
 
 
+def test_a_species_that_is_kept_ends_a_solve_in_single_precision():
+    """Once A is spent in A -> B -> C, what keeps C is half of each step, up to roundoff."""
+    rng = np.random.default_rng(3)
+    field = lambda t, y, args: jnp.stack([-y[0], y[0] - y[1], y[1]])  # noqa: E731
+
+    @jax.jit
+    @jax.vmap
+    def attempts(y0, tol):
+        controller = dfx.PIDController(rtol=tol, atol=tol)
+        options = dict(stepsize_controller=controller, max_steps=1000, throw=False)
+        kept = dfc.FirstIntegral(lambda t, y, args: y[2])
+        sol = run(kept, dfx.Tsit5(), y0, field, t1=10.0, **options)
+        return sol.stats["num_steps"], sol.result == dfx.RESULTS.successful
+
+    y0 = np.array([1.0, 0.0, 0.0]) * rng.uniform(0.1, 3, (200, 1))
+    tol = 10 ** rng.uniform(-6, -3, 200)
+    counts, passed = attempts(y0.astype(np.float32), tol.astype(np.float32))
+    assert np.max(counts) < 300
+    assert not np.any(passed)
+
+
 def test_a_first_projection_may_be_as_long_as_a_given_value_needs():
     sol = run(dfc.FirstIntegral(square, value=4.0), saveat=dfx.SaveAt(steps=True), max_steps=16)
     squares = np.sum(np.asarray(sol.ys)[:10] ** 2, axis=1)
