@@ -184,11 +184,11 @@ class AbstractProjection(eqx.Module):
         Never raises at run time; `info.ok` is true only if every residual is small.
         """
 
-    def adapted(self, equations: Equations, like: Any) -> Equations:
-        """The equations with the metric and the tolerances of this projection."""
-        options = {name: getattr(self, name, None) for name in ("rtol", "atol")}
-        weights = inverse_metric(self.metric, like)
-        return dataclasses.replace(equations, weights=weights, **options)
+
+def adapted(equations: Equations, projection: AbstractProjection, like: Any) -> Equations:
+    """The equations with the metric and the tolerances of a projection."""
+    within = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
+    return dataclasses.replace(equations, weights=inverse_metric(projection.metric, like), **within)
 
 
 def has_bounds(projection: AbstractProjection) -> bool:
@@ -252,7 +252,7 @@ class Target(eqx.Module):
         manifold, t, args = self.manifold, t * self.direction, self.args
         like = jax.eval_shape(lambda: candidate)
         equations = equations_of(manifold, values, t, like, args, hidden)
-        equations = self.projection.adapted(equations, like)
+        equations = adapted(equations, self.projection, like)
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
         shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))

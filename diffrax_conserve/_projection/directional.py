@@ -74,8 +74,8 @@ class Directional(AbstractProjection):
         # Normalised, so that products with the gradient do not overflow or underflow.
         length = lax.stop_gradient(jnp.max(jnp.abs(error)))
         direction = error[None] / jnp.where(length > 0, length, 1)
-        steps = self.max_steps
-        y, ok, count = project_along(problem.equations, candidate, direction, max_steps=steps)
+        equations = problem.equations
+        y, ok, count = project_along(equations, candidate, direction, max_steps=self.max_steps)
         return y, problem.judge(candidate, y, count, ok=ok)
 
 

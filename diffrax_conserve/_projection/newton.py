@@ -72,9 +72,9 @@ class Newton(AbstractProjection):
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
+        equations = problem.equations
         box = box_of(self.lower, self.upper, problem.like)
-        steps = self.max_steps
-        unknowns, _, _, count = _nearest(problem.equations, candidate, box, max_steps=steps)
+        unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
         y = unknowns[: candidate.size]
         return y, problem.judge(candidate, y, count)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._tree import ravel
-from .base import AbstractProjection, Problem, ProjectionInfo
+from .base import AbstractProjection, Problem, ProjectionInfo, adapted
 from .equations import Equations
 
 
@@ -106,4 +106,4 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
         problem.equations.hidden[rows],
         may_vanish=problem.equations.may_vanish,
     )
-    return dataclasses.replace(problem, equations=projection.adapted(equations, problem.like))
+    return dataclasses.replace(problem, equations=adapted(equations, projection, problem.like))

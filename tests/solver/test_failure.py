@@ -2,7 +2,6 @@
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -205,22 +204,24 @@ WRONG = {
 }
 
 
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, 0, 0))
+def attempted(field, fn, y0, tol):
+    """The number of attempts, whether there were fewer than 1,000, and whether it succeeded."""
+    controller = dfx.PIDController(rtol=tol, atol=tol)
+    options = dict(stepsize_controller=controller, max_steps=1000, throw=False)
+    sol = run(dfc.FirstIntegral(fn), dfx.Tsit5(), y0, field, t1=10.0, **options)
+    ends = sol.result != dfx.RESULTS.max_steps_reached
+    return sol.stats["num_steps"], ends, sol.result == dfx.RESULTS.successful
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_no_wrong_integral_keeps_an_adaptive_solve_from_its_end(name):
     """Very short steps would pass, one after the other."""
     rng = np.random.default_rng(3)
     field, fn = WRONG[name]
-
-    @eqx.filter_jit
-    @jax.vmap
-    def ended(y0, tol):
-        controller = dfx.PIDController(rtol=tol, atol=tol)
-        options = dict(stepsize_controller=controller, max_steps=1000, throw=False)
-        sol = run(dfc.FirstIntegral(fn), dfx.Tsit5(), y0, field, t1=10.0, **options)
-        return sol.result != dfx.RESULTS.max_steps_reached, sol.result == dfx.RESULTS.successful
-
     y0, tol = 1.2 * rng.normal(size=(200, 2)), 10 ** rng.uniform(-9, -3, 200)
-    ends, passed = ended(y0, tol)
+    _, ends, passed = attempted(field, fn, y0, tol)
     assert np.all(ends), (y0[~np.asarray(ends)][:3], tol[~np.asarray(ends)][:3])
     # Not all are noticed: see `check_invariance`.
     assert np.mean(passed) < (0.5 if field is swing else 0.005)
@@ -230,19 +231,9 @@ def test_a_species_that_is_kept_ends_a_solve_in_single_precision():
     """Once A is spent in A -> B -> C, what keeps C is half of each step, up to roundoff."""
     rng = np.random.default_rng(3)
     field = lambda t, y, args: jnp.stack([-y[0], y[0] - y[1], y[1]])  # noqa: E731
-
-    @jax.jit
-    @jax.vmap
-    def attempts(y0, tol):
-        controller = dfx.PIDController(rtol=tol, atol=tol)
-        options = dict(stepsize_controller=controller, max_steps=1000, throw=False)
-        kept = dfc.FirstIntegral(lambda t, y, args: y[2])
-        sol = run(kept, dfx.Tsit5(), y0, field, t1=10.0, **options)
-        return sol.stats["num_steps"], sol.result == dfx.RESULTS.successful
-
     y0 = np.array([1.0, 0.0, 0.0]) * rng.uniform(0.1, 3, (200, 1))
-    tol = 10 ** rng.uniform(-6, -3, 200)
-    counts, passed = attempts(y0.astype(np.float32), tol.astype(np.float32))
+    y0, tol = y0.astype(np.float32), (10 ** rng.uniform(-6, -3, 200)).astype(np.float32)
+    counts, _, passed = attempted(field, lambda t, y, args: y[2], y0, tol)
     assert np.max(counts) < 300
     assert not np.any(passed)
 

@@ -152,6 +152,7 @@ NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_fi
         (lambda: refuse(seconds=-1.0), ValueError, "must be positive"),
         (lambda: refuse(target=[1e-3]), TypeError, "`target` is "),
         (lambda: refuse(target=0.0), ValueError, "must be positive"),
+        (lambda: RECIPE(epochs=0), ValueError, "`epochs` is 0, but it must be a positive integer"),
         (lambda: dfc.learned.second_order(circle(), epochs=0), ValueError, "`epochs` is 0, but"),
         (lambda: RECIPE(refresh=0), ValueError, "`refresh`"),
         (lambda: RECIPE(optimiser="adam"), TypeError, "`optimiser` is 'adam'"),
