@@ -154,8 +154,6 @@ def _solve(
     kept, seen = start(y)
     if seen is not None:
         left, seen = judge(seen, y, left)
-    elif not in_arrays:  # the first iteration before the loop, which saves a tenth
-        y, left = test(kept, y, left)
     # It is judged before the loop, or not yet.
     count = ((left > 0) & (left <= max_steps)).astype(int)
 

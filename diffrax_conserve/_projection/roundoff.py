@@ -76,7 +76,8 @@ def _rounded(x: Array, size: Array, total: Array, squares: Array) -> Array:
 def _adjoint(given: tuple[Array, Array], adjoint: Array) -> tuple[Array, ...]:
     size, total = given
     unit = float(jnp.finfo(adjoint.dtype).eps) / float(jnp.finfo(total.dtype).eps)
-    terms = jnp.nan_to_num(unit * jnp.abs(adjoint * size).astype(total.dtype), posinf=0)
+    terms = unit * jnp.abs(adjoint * size).astype(total.dtype)
+    terms = jnp.where(terms < jnp.inf, terms, 0)
     return adjoint, jnp.zeros_like(size), jnp.sum(terms), jnp.sum(terms**2)
 
 
