@@ -176,7 +176,7 @@ def ignore_max_correction(package):
     package.method("ManifoldProjection.step", mutate)
 
 
-@noticed_by("tests/projection/test_derivatives.py", "-k", "unrolled")
+@noticed_by("tests/projection/test_derivatives.py", "-k", "finite_differences")
 def forget_the_curvature_in_the_derivative(package):
     def mutate(solve):
         def mutated(self, problem, candidate):

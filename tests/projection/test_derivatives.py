@@ -1,4 +1,4 @@
-"""Derivatives of a projection, against finite differences and against the unrolled iteration."""
+"""Derivatives of a projection, against finite differences."""
 
 import equinox as eqx
 import jax
@@ -65,34 +65,6 @@ def test_gradient_agrees_with_finite_differences(projection):
 @each_projection
 def test_second_derivatives(projection):
     dct.assert_gradients(lambda inputs: jax.grad(loss)(inputs, projection), INPUTS, rtol=1e-6)
-
-
-def unrolled_simplified_newton(inputs):
-    """Twelve iterations of the textbook formula, differentiated as they stand."""
-    energy = Energy(inputs["inertia"])
-
-    def g(y):
-        out = jnp.stack(
-            [energy(inputs["t"], y, inputs["args"]), momentum(inputs["t"], y, inputs["args"])]
-        )
-        return out - jnp.stack(inputs["values"])
-
-    jacobian = jax.jacrev(g)(inputs["y"]) / inputs["metric"]
-    gram = jacobian @ jax.jacrev(g)(inputs["y"]).T
-    multiplier = jnp.zeros(2)
-    for _ in range(12):
-        multiplier = multiplier - jnp.linalg.solve(gram, g(inputs["y"] + jacobian.T @ multiplier))
-    return inputs["y"] + jacobian.T @ multiplier
-
-
-def test_derivatives_agree_with_the_unrolled_iteration():
-    def implicit(inputs):
-        return projected(inputs, dfc.SimplifiedNewton())
-
-    ours = jax.jit(jax.jacrev(implicit))(INPUTS)
-    theirs = jax.jit(jax.jacrev(unrolled_simplified_newton))(INPUTS)
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-10)
 
 
 @each_projection

@@ -115,14 +115,6 @@ def test_order():
     assert re.search(r"measured order is (1\.9|2\.0)., but 3 is claimed", text)
 
 
-def test_gradients():
-    def f(y, system, power):
-        return system.energy(0.0, y["w"], None) ** power, y["w"] * y["scale"]
-
-    y = {"w": OMEGA0, "scale": jnp.array(2.0)}
-    dct.assert_gradients(f, y, dfc.systems.RigidBody(), 3)
-
-
 def test_wrong_gradients_are_found_and_the_argument_is_named():
     def f(y):
         return jnp.sum(y["good"] ** 2) + jnp.sum(jax.lax.stop_gradient(y["bad"]) ** 2)
