@@ -1,7 +1,6 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
 from . import paper as paper
-from ._files import pretrained_path as pretrained_path
 from ._files import read_info as read_info
 from ._networks.cores import Concatenated as Concatenated
 from ._networks.cores import Gated as Gated
@@ -14,6 +13,7 @@ from ._networks.taylor import Taylor as Taylor
 from ._networks.wrappers import BoxCox as BoxCox
 from ._networks.wrappers import Repeated as Repeated
 from ._networks.wrappers import Transformed as Transformed
+from ._pretrained import pretrained_path as pretrained_path
 from ._solvers.flow_map_solver import FlowMapSolver as FlowMapSolver
 from ._solvers.policies import Refuse as Refuse
 from ._solvers.policies import Report as Report
