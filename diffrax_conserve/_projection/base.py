@@ -209,7 +209,8 @@ class Target(eqx.Module):
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
     - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
-    - `gained`: the integrals of the rates of the manifold since the start of the solve.
+    - `gained`: the integrals of the rates of the manifold since the start of the solve, and what
+        rounding added to them: a step may gain less than their roundoff.
     """
 
     projection: AbstractProjection
@@ -218,7 +219,7 @@ class Target(eqx.Module):
     hidden: Float[Array, " m"]
     args: Args
     direction: Real[Array, ""]
-    gained: Float[Array, " m"] | None = None
+    gained: Float[Array, "2 m"] | None = None
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
@@ -226,9 +227,11 @@ class Target(eqx.Module):
         """The target at a time `end` in a step, given the `path` of the solution from `start`."""
         if self.gained is None:
             return self
-        gained = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
-        gained = self.gained + ravel(gained).astype(self.gained.dtype)
-        return dataclasses.replace(self, gained=gained)
+        more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
+        last, excess = self.gained
+        more = ravel(more).astype(last.dtype) - excess
+        total = last + more
+        return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None
@@ -247,7 +250,7 @@ class Target(eqx.Module):
         there are bounds."""
         values, hidden = self.values, self.hidden
         if self.gained is not None:  # a sum has the roundoff of its terms
-            values = self.values + self.gained
+            values = self.values + self.gained[0]
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
         manifold, t, args = self.manifold, t * self.direction, self.args
         like = jax.eval_shape(lambda: candidate)

@@ -159,7 +159,7 @@ class State(eqx.Module):
     inner: Any
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    gained: Float[Array, " m"] | None
+    gained: Float[Array, "2 m"] | None
     num_steps: Int[Array, ""] | None
     is_first: Bool[Array, ""] | None
     crept: Bool[Array, ""]

@@ -114,10 +114,31 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     y0, args = jax.tree.map(jnp.float32, (Y0, (1e-6, 0.0)))
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     solution = solve(y0, args, t1=200.0, dt0=0.01, saveat=saveat, max_steps=None)
-    gained = float(solution.solver_state.gained[0])
+    gained = float(solution.solver_state.gained[0, 0])
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, manifold=None, **PRECISE)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))
     assert gained == pytest.approx(lost, rel=1e-2)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+def test_a_damped_system_comes_to_rest(dtype):
+    """The energy falls to nothing, and with it the roundoff of a long sum would be on the way."""
+
+    @jax.jit
+    @jax.vmap
+    def end(friction, q):
+        y0, args = (q, 0 * q), (friction, 0 * q)
+        options = dict(saveat=dfx.SaveAt(t1=True), dt0=0.04, max_steps=None, throw=False)
+        options |= dict(t1=60.0, solver=dfx.Heun(), adjoint=dfx.ForwardMode())
+        kept, plain = (solve(y0, args, manifold=x, **options) for x in (BALANCE, None))
+        return kept.result == dfx.RESULTS.successful, kept.ys, plain.ys
+
+    rng = np.random.default_rng(0)
+    frictions, angles = 10 ** rng.uniform(-1.5, 0.9, 200), rng.uniform(-2, 2, 200)
+    ok, *ys = end(jnp.asarray(frictions, dtype), jnp.asarray(angles, dtype))
+    assert np.all(ok)
+    kept, plain = (np.stack(y)[:, :, 0] for y in ys)
+    assert np.max(np.abs(kept - plain)[:, frictions > 1]) < 30 * float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def test_mistakes_are_named():
