@@ -8,6 +8,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Y
@@ -61,7 +62,7 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
         check_number("metric", weight)
         if isinstance(weight, jax.core.Tracer):
             return eqx.error_if(weight, ~jnp.all(weight > 0), message)
-        if not jnp.all(jnp.asarray(weight) > 0):
+        if not np.all(np.asarray(weight) > 0):  # known, also within a jitted function
             raise ValueError(message)
         return weight
 
