@@ -1,7 +1,5 @@
 """What `print` shows, and functions that are written out in scalars."""
 
-import pydoc
-
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -96,10 +94,3 @@ def test_the_report_is_printed_as_success_or_failure_or_by_its_ranges():
     assert str(project(ys)[1]).startswith("2 of 3 projections succeeded")
     _, info = project(ys.at[2, 0].set(3.0))
     assert "correction       1.0e+00 to 4.0e+00" in str(info)
-
-
-def test_help_opens_with_an_introduction():
-    text = pydoc.plain(pydoc.render_doc(dfc))
-    assert "diffrax_conserve - Keep any diffrax solve" in text
-    names = [name for name in dfc.__doc__.replace(",", " ").split() if hasattr(dfc, name)]
-    assert {"FirstIntegral", "ManifoldProjection", "drift", "project"} <= set(names)

@@ -19,7 +19,7 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
-from .equations import Equations, equations_of, relative
+from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of, relative
 from .loop import solve
 from .options import inverse_metric
 
@@ -209,8 +209,7 @@ class Target(eqx.Module):
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
     - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
-    - `gained`: the integrals of the rates of the manifold since the start of the solve, and what
-        rounding added to them: a step may gain less than their roundoff.
+    - `gained`: the integrals of the rates since the start, and what rounding added to them.
     """
 
     projection: AbstractProjection
@@ -229,9 +228,29 @@ class Target(eqx.Module):
             return self
         more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
         last, excess = self.gained
-        more = ravel(more).astype(last.dtype) - excess
+        more, y = ravel(more).astype(last.dtype), ravel(path(start))
+        # At rest roundoff is left, which the state cannot follow: then the value follows the state.
+        equations, y = tree_stop_gradient((self.equations(start, path(start)), y))
+        off, jacobian = equations.linearise(y)
+        limit = ROUNDOFF_MULTIPLE * float(jnp.finfo(y.dtype).eps) * equations.scale(jacobian, y)
+        follow = (more != 0) & (jnp.abs(off) <= limit)
+        more = more - excess + jnp.where(follow, off - jnp.clip(off, -limit / 2, limit / 2), 0)
         total = last + more
         return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
+
+    @property
+    def value(self) -> Float[Array, " m"]:
+        """The conserved values now."""
+        return self.values if self.gained is None else self.values + self.gained[0]
+
+    def equations(self, t: RealScalarLike, y: Y) -> Equations:
+        """The equations at a time of the solver, for states like `y`."""
+        hidden, like = self.hidden, jax.eval_shape(lambda: y)
+        if self.gained is not None:  # a sum has the roundoff of its terms
+            hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
+        t = t * self.direction
+        equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
+        return adapted(equations, self.projection, like)
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None
@@ -248,17 +267,13 @@ class Target(eqx.Module):
     ) -> tuple[Y, ProjectionInfo]:
         """With `far` by damped steps along fresh gradients, which nothing differentiates, unless
         there are bounds."""
-        values, hidden = self.values, self.hidden
-        if self.gained is not None:  # a sum has the roundoff of its terms
-            values = self.values + self.gained[0]
-            hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
+        equations, like = self.equations(t, candidate), jax.eval_shape(lambda: candidate)
         manifold, t, args = self.manifold, t * self.direction, self.args
-        like = jax.eval_shape(lambda: candidate)
-        equations = equations_of(manifold, values, t, like, args, hidden)
-        equations = adapted(equations, self.projection, like)
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
-        shaped = unflatten(values, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like))
+        shaped = unflatten(
+            self.value, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
+        )
         problem = Problem(equations, t, args, shaped, like, keys, step)
         vector = ravel(candidate)
         if far and not has_bounds(self.projection):

@@ -70,27 +70,24 @@ class Equations(eqx.Module):
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
 
-    def shown(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
-        return shown_terms(jacobian, y if self.clip is None else self.clip(y))
-
     def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
-        return self.magnitude + self.shown(jacobian, y)
+        y = y if self.clip is None else self.clip(y)
+        return self.magnitude + shown_terms(jacobian, y)
 
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
         """-1 if a residual is not finite; 0 if `y` is off the manifold; 1 if it is on it; 2 if all
-        residuals are within twice the noise. And the noise, an eighth of the tolerance, which only
-        chance could reduce; half of it where the whole of it moves the state by more than a 64th of
-        itself, as near rest. A residual within a tolerance that underflows says nothing."""
+        are within twice the noise. And the noise, an eighth of the tolerance, which only chance
+        could reduce, or half of it where the tolerance is more than a 64th of what the gradient
+        shows, as near rest. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
-        shown = self.shown(jacobian, y)
-        scale = self.magnitude + shown
+        scale = self.scale(jacobian, y)
         rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        noise = jnp.where(64 * limit < shown, 0.125 * limit, 0.5 * limit)
+        noise = jnp.where(64 * limit < scale - self.magnitude, 0.125, 0.5) * limit
         reached = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(2), jnp.int8(1))
         missed = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(0), jnp.int8(-1))
         # Not by a maximum of residuals, which can lose NaN on a CPU.

@@ -148,9 +148,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             inner=self.solver.init(terms, t0, t1, y0, args),
             values=values,
             hidden=hidden,
-            gained=jnp.zeros((2, *values.shape), values.dtype)
-            if has_rates(self.manifold)
-            else None,
+            gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
             num_steps=None if self.every == 1 else jnp.asarray(0),
             is_first=jnp.asarray(True) if given and self._limit(terms) is not None else None,
             crept=jnp.asarray(False),

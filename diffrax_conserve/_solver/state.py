@@ -148,9 +148,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 class State(eqx.Module):
     """What later steps need.
 
-    - `values`, `hidden`: as in a `Target`; a value is NaN if the solve cannot start.
-    - `gained`: the integrals of the rates, if there are any. The increment of one step is small and
-      would lose digits in the values.
+    - `values`, `hidden`, `gained`: as in a `Target`; a value is NaN if the solve cannot start.
     - `num_steps`: counted only if not every step is projected.
     - `is_first`: whether no step was made yet, if the first one may have to reach a given `value`.
     - `crept`: whether the last step succeeded only because it was short.

@@ -122,23 +122,21 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
 def test_a_damped_system_comes_to_rest(dtype):
-    """The energy falls to nothing, and with it the roundoff of a long sum would be on the way."""
+    """The roundoff of a long sum would keep the energy from its least value."""
+    options = dict(saveat=dfx.SaveAt(t1=True), t1=60.0, dt0=0.04, max_steps=None, throw=False)
+    options |= dict(solver=dfx.Heun(), adjoint=dfx.ForwardMode())
 
-    @jax.jit
     @jax.vmap
     def end(friction, q):
         y0, args = (q, 0 * q), (friction, 0 * q)
-        options = dict(saveat=dfx.SaveAt(t1=True), dt0=0.04, max_steps=None, throw=False)
-        options |= dict(t1=60.0, solver=dfx.Heun(), adjoint=dfx.ForwardMode())
         kept, plain = (solve(y0, args, manifold=x, **options) for x in (BALANCE, None))
-        return kept.result == dfx.RESULTS.successful, kept.ys, plain.ys
+        return kept.result == dfx.RESULTS.successful, kept.ys[0], plain.ys[0]
 
     rng = np.random.default_rng(0)
     frictions, angles = 10 ** rng.uniform(-1.5, 0.9, 200), rng.uniform(-2, 2, 200)
-    ok, *ys = end(jnp.asarray(frictions, dtype), jnp.asarray(angles, dtype))
+    ok, kept, plain = jax.jit(end)(*(jnp.asarray(x, dtype) for x in (frictions, angles)))
     assert np.all(ok)
-    kept, plain = (np.stack(y)[:, :, 0] for y in ys)
-    assert np.max(np.abs(kept - plain)[:, frictions > 1]) < 30 * float(jnp.finfo(dtype).eps) ** 0.5
+    assert np.max(np.abs(kept - plain)[frictions > 1]) < 2e-7
 
 
 def test_mistakes_are_named():

@@ -41,7 +41,7 @@ def test_nan_is_no_success_where_nothing_is_projected():
 def test_options_can_be_traced_and_batched():
     @jax.jit
     def final(rtol, max_correction):
-        projection = dfc.SimplifiedNewton(rtol=rtol)
+        projection = dfc.SimplifiedNewton(rtol=rtol, metric=2.0)
         solver = dfc.ManifoldProjection(
             dfc.RK4(), RIGID_BODY, projection=projection, max_correction=max_correction
         )
