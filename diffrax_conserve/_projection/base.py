@@ -226,21 +226,20 @@ class Target(eqx.Module):
         """The target at a time `end` in a step, given the `path` of the solution from `start`."""
         if self.gained is None:
             return self
-        more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
         last, excess = self.gained
-        more, y = ravel(more).astype(last.dtype), ravel(path(start))
+        more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
+        more = ravel(more).astype(last.dtype) - excess
         # At rest roundoff is left, which the state cannot follow: then the value follows the state.
-        equations, y = tree_stop_gradient((self.equations(start, path(start)), y))
+        equations, y = tree_stop_gradient((self.equations(start, path(start)), ravel(path(start))))
         off, jacobian = equations.linearise(y)
         limit = ROUNDOFF_MULTIPLE * float(jnp.finfo(y.dtype).eps) * equations.scale(jacobian, y)
         follow = (more != 0) & (jnp.abs(off) <= limit)
-        more = more - excess + jnp.where(follow, off - jnp.clip(off, -limit / 2, limit / 2), 0)
+        more = more + jnp.where(follow, off - jnp.clip(off, -limit / 2, limit / 2), 0)
         total = last + more
         return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
 
     @property
     def value(self) -> Float[Array, " m"]:
-        """The conserved values now."""
         return self.values if self.gained is None else self.values + self.gained[0]
 
     def equations(self, t: RealScalarLike, y: Y) -> Equations:

@@ -148,13 +148,11 @@ def _solve(
             # From here on arrays are tuples of scalars.
             start, test = written
             y = components(y)
-    in_arrays = not isinstance(y, tuple)
-    if in_arrays:
+    if not isinstance(y, tuple):
         y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
     kept, seen = start(y)
     if seen is not None:
         left, seen = judge(seen, y, left)
-    # It is judged before the loop, or not yet.
     count = ((left > 0) & (left <= max_steps)).astype(int)
 
     last: Any = (y, jnp.full_like(candidate[0], jnp.inf), equations.magnitude) if damped else seen

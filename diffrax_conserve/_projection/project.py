@@ -73,9 +73,14 @@ def project(
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
     """The roundoff of a function at the candidate may be far from that at the result. So a first
     projection finds where it is measured. If it is less at the result, success by it is none."""
-    near, _ = _tolerating(target, t, candidate).project(t, candidate)
+
+    def tolerating(y: Y) -> Target:
+        hidden = hidden_scale(target.manifold, t, y, target.args)[2]
+        return dataclasses.replace(target, hidden=hidden)
+
+    near, _ = tolerating(candidate).project(t, candidate)
     near = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), near, candidate)
-    target = _tolerating(target, t, near)
+    target = tolerating(near)
     y, info = target.project(t, candidate)
     value, jacobian, found = hidden_scale(target.manifold, t, y, target.args)
     shown = jnp.abs(value) + shown_terms(jacobian, ravel(y))
@@ -83,11 +88,6 @@ def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, Proj
     missed = optx.RESULTS.nonlinear_max_steps_reached
     result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)
     return y, dataclasses.replace(info, ok=ok, result=result)
-
-
-def _tolerating(target: Target, t: RealScalarLike, y: Y) -> Target:
-    """The target with the roundoff at `y`."""
-    return dataclasses.replace(target, hidden=hidden_scale(target.manifold, t, y, target.args)[2])
 
 
 def given_values(

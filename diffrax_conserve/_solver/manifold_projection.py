@@ -38,7 +38,8 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     carried in the solver state: the drift does not grow with the number of steps, and a solve that
     continues from a `solver_state` keeps the original values.
 
-    The projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
+    Conserving one integral is not always better than none: see "Choosing a projection". The
+    projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
     the next step is evaluated again at the projected state; implicit methods keep it.
 
     Success means that each residual is within 16 units of roundoff of $|I_0| + \sum_k |y_k
@@ -66,10 +67,6 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
         solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
         ```
-
-    !!! warning
-
-        Conserving one integral is not always better than none: see "Choosing a projection".
 
     ??? cite "Reference"
 

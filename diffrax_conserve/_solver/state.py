@@ -130,17 +130,6 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         sol = diffrax.diffeqsolve(term, solver, 0, 9, 1.0, jnp.array([1.0, 0.0]), saveat=saveat)
         print(dfc.statistics(sol))
         ```
-
-        ```text
-        projections of the accepted steps
-          num_projections  9
-          num_iterations   9
-          max_iterations   1
-          residual_before  8.6e-05
-          residual_after   4.0e-08
-          correction       1.3e-04
-          roundoff         0.0e+00
-        ```
     """
     return found_in(sol, ProjectionStatistics, "statistics", "a `ManifoldProjection`")
 
