@@ -226,11 +226,11 @@ class Target(eqx.Module):
         """The target at a time `end` in a step, given the `path` of the solution from `start`."""
         if self.gained is None:
             return self
-        last, excess = self.gained
+        y, (last, excess) = path(start), self.gained
         more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
         more = ravel(more).astype(last.dtype) - excess
         # At rest roundoff is left, which the state cannot follow: then the value follows the state.
-        equations, y = tree_stop_gradient((self.equations(start, path(start)), ravel(path(start))))
+        equations, y = tree_stop_gradient((self.equations(start, y), ravel(y)))
         off, jacobian = equations.linearise(y)
         limit = ROUNDOFF_MULTIPLE * float(jnp.finfo(y.dtype).eps) * equations.scale(jacobian, y)
         follow = (more != 0) & (jnp.abs(off) <= limit)

@@ -128,7 +128,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
         solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
         sol = diffrax.diffeqsolve(term, solver, 0, 9, 1.0, jnp.array([1.0, 0.0]), saveat=saveat)
-        print(dfc.statistics(sol))
+        longest = dfc.statistics(sol).max_iterations
         ```
     """
     return found_in(sol, ProjectionStatistics, "statistics", "a `ManifoldProjection`")
