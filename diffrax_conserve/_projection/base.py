@@ -19,7 +19,7 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
-from .equations import ROUNDOFF_MULTIPLE, Equations, equations_of, relative
+from .equations import Equations, equations_of, relative
 from .loop import solve
 from .options import inverse_metric
 
@@ -226,17 +226,22 @@ class Target(eqx.Module):
         """The target at a time `end` in a step, given the `path` of the solution from `start`."""
         if self.gained is None:
             return self
-        y, (last, excess) = path(start), self.gained
+        last, excess = self.gained
         more = integrated_rates(self.manifold, start, end, path, self.args, self.direction)
         more = ravel(more).astype(last.dtype) - excess
-        # At rest roundoff is left, which the state cannot follow: then the value follows the state.
-        equations, y = tree_stop_gradient((self.equations(start, y), ravel(y)))
-        off, jacobian = equations.linearise(y)
-        limit = ROUNDOFF_MULTIPLE * float(jnp.finfo(y.dtype).eps) * equations.scale(jacobian, y)
-        follow = (more != 0) & (jnp.abs(off) <= limit)
-        more = more + jnp.where(follow, off - jnp.clip(off, -limit / 2, limit / 2), 0)
         total = last + more
         return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
+
+    def following(self, t: RealScalarLike, y: Y) -> "Target":
+        """At rest roundoff is left, which the state cannot follow: there the value follows it."""
+        if self.gained is None:
+            return self
+        equations, y = tree_stop_gradient((self.equations(t, y), ravel(y)))
+        off, jacobian = equations.linearise(y)
+        limit = equations.tolerance(equations.scale(jacobian, y))
+        rest = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
+        follow = jnp.where(rest, off - jnp.clip(off, -limit / 2, limit / 2), 0)
+        return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
 
     @property
     def value(self) -> Float[Array, " m"]:
@@ -270,10 +275,9 @@ class Target(eqx.Module):
         manifold, t, args = self.manifold, t * self.direction, self.args
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
-        shaped = unflatten(
-            self.value, jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
-        )
-        problem = Problem(equations, t, args, shaped, like, keys, step)
+        values = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
+        values = unflatten(self.value, values)
+        problem = Problem(equations, t, args, values, like, keys, step)
         vector = ravel(candidate)
         if far and not has_bounds(self.projection):
             y, ok, count = solve(equations, vector, max_steps=_FAR_STEPS, fresh=True, damped=True)

@@ -74,6 +74,12 @@ class Equations(eqx.Module):
         y = y if self.clip is None else self.clip(y)
         return self.magnitude + shown_terms(jacobian, y)
 
+    def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
+        eps = float(jnp.finfo(scale.dtype).eps)
+        rtol = ROUNDOFF_MULTIPLE * eps if self.rtol is None else self.rtol
+        limit = jnp.asarray(rtol, scale.dtype) * scale
+        return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
+
     def verdict(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
@@ -83,9 +89,7 @@ class Equations(eqx.Module):
         shows, as near rest. A residual within a tolerance that underflows says nothing."""
         info = jnp.finfo(y.dtype)
         scale = self.scale(jacobian, y)
-        rtol = ROUNDOFF_MULTIPLE * float(info.eps) if self.rtol is None else self.rtol
-        limit = jnp.asarray(rtol, scale.dtype) * scale
-        limit = limit if self.atol is None else limit + jnp.asarray(self.atol, y.dtype)
+        limit = self.tolerance(scale)
         valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
         noise = jnp.where(64 * limit < scale - self.magnitude, 0.125, 0.5) * limit
         reached = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(2), jnp.int8(1))

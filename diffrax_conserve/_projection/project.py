@@ -73,16 +73,13 @@ def project(
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
     """The roundoff of a function at the candidate may be far from that at the result. So a first
     projection finds where it is measured. If it is less at the result, success by it is none."""
-
-    def tolerating(y: Y) -> Target:
-        hidden = hidden_scale(target.manifold, t, y, target.args)[2]
-        return dataclasses.replace(target, hidden=hidden)
-
-    near, _ = tolerating(candidate).project(t, candidate)
+    measured = lambda y: hidden_scale(target.manifold, t, y, target.args)  # noqa: E731
+    target = dataclasses.replace(target, hidden=measured(candidate)[2])
+    near, _ = target.project(t, candidate)
     near = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), near, candidate)
-    target = tolerating(near)
+    target = dataclasses.replace(target, hidden=measured(near)[2])
     y, info = target.project(t, candidate)
-    value, jacobian, found = hidden_scale(target.manifold, t, y, target.args)
+    value, jacobian, found = measured(y)
     shown = jnp.abs(value) + shown_terms(jacobian, ravel(y))
     ok = info.ok & jnp.all(target.hidden <= 2 * (shown + found))
     missed = optx.RESULTS.nonlinear_max_steps_reached

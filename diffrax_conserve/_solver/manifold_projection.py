@@ -172,7 +172,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             terms, t0, t1, y0, args, state.inner, made_jump
         )
         conserved = state.values, state.hidden, args, time_direction(terms, t1), state.gained
-        start = Target(self.projection, self.manifold, *conserved)
+        start = Target(self.projection, self.manifold, *conserved).following(t0, y0)
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
