@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ._manifold import evaluate, is_entry, named_entries, rate_of
+from ._manifold import evaluate, exactly, is_entry, named_entries, rate_of
 
 # Gauss quadrature of order eight, the highest order of any solver in diffrax.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -37,7 +37,8 @@ def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
         fn = rate_of(entry)
         if fn is None:
             return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), fn(t, y, args), like)
+        rates = exactly(fn, t, y, args)
+        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), rates, like)
 
     values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)

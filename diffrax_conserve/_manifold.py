@@ -216,8 +216,16 @@ def entry_name(manifold: Manifold, position: int) -> str:
 def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by `fn(t, y, args)`."""
     return jtu.tree_map(
-        lambda entry: jtu.tree_map(jnp.asarray, entry.fn(t, y, args)), manifold, is_leaf=is_entry
+        lambda entry: jtu.tree_map(jnp.asarray, exactly(entry.fn, t, y, args)),
+        manifold,
+        is_leaf=is_entry,
     )
+
+
+def exactly(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:
+    """`fn(t, y, args)`, without the three digits that float32 matrix products have on a GPU."""
+    with jax.default_matmul_precision("highest"):
+        return fn(t, y, args)
 
 
 def conserved_values(
@@ -239,7 +247,7 @@ def conserved_values(
             ) from error
     found = []
     for (name, entry), value in zip(entries, values, strict=True):
-        output = entry.fn(t, y, args)
+        output = exactly(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
             value = jtu.tree_map(jnp.zeros_like, output)

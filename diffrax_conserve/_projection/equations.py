@@ -132,7 +132,7 @@ def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -
     """The function of each entry, from the numbers of a state to a vector."""
 
     def flat(entry: Any) -> Part:
-        return lambda y: ravel(entry.fn(t, unravel(y, like), args)).astype(y.dtype)
+        return lambda y: ravel(evaluate(entry, t, unravel(y, like), args)).astype(y.dtype)
 
     return [flat(entry) for entry in jtu.tree_leaves(manifold, is_leaf=is_entry)]
 
@@ -215,7 +215,7 @@ def eliminated(
         right = (b * unit).astype(one.dtype)
         lu, x = jsp.linalg.lu_factor(scaled + _added(gram) * one), jnp.zeros_like(right)
         for _ in range(3):  # which removes what is added
-            x = x + jsp.linalg.lu_solve(lu, right - scaled @ x)
+            x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
         return x.astype(dtype) * unit, rows
     least = 4 * m * float(jnp.finfo(dtype).eps)
     u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)

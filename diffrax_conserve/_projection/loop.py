@@ -263,7 +263,7 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
         dual = rows = directions
     sizes, dual = scaled_rows(dual)
     rows = rows / sizes[:, None]
-    along = dual @ (y - candidate)
+    along = combined(y - candidate, dual.T)
     multiplier = gram_solve(gram_matrix(dual, rows), along) / sizes
 
     def displaced(equations: Equations, candidate: Array, directions: Array | None) -> Any:

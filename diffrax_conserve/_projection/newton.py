@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .bounded import Box, box_of, check_bounds, project_within
-from .equations import Equations, gram_matrix, gram_solve, scaled_rows
+from .equations import Equations, combined, gram_matrix, gram_solve, scaled_rows
 from .loop import certain, solve
 from .options import NEWTON_OPTIONS, check_options, option, positive_weights
 
@@ -110,7 +110,7 @@ def _nearest(
     n, (sizes, unit, gram, units) = y.size, _scaled(equations, y)
     if n + equations.magnitude.size > _NEAREST_MAX:
         return jnp.concatenate([y, 0 * equations.magnitude]), sizes, jnp.asarray(False), count
-    start = jnp.concatenate([y, gram_solve(gram, unit @ (y - candidate))])
+    start = jnp.concatenate([y, gram_solve(gram, combined(y - candidate, unit.T))])
     optimality = dataclasses.replace(
         equations,
         parts=(_Optimality(equations, candidate, box, sizes),),
@@ -165,8 +165,8 @@ def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array
     u, s, vt = jnp.linalg.svd(fixed)
     inverse = jnp.where(s > 64 * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)
     return lax.custom_linear_solve(
-        lambda x: matrix @ x,
+        lambda x: combined(x, matrix.T),
         b,
-        lambda _, b: vt.T @ (inverse * (u.T @ b)),
-        lambda _, b: u @ (inverse * (vt @ b)),
+        lambda _, b: combined(inverse * combined(b, u), vt),
+        lambda _, b: combined(inverse * combined(b, vt.T), u.T),
     )

@@ -105,7 +105,7 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
         branches = [ft.partial(_values, changed, branch) for branch in params["branches"]]
         return [(x, kind) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
     if name == "scan":
-        return [(x, kind) for x in _scanned(changed, params, inputs)]
+        return [(x, kind) for x in _scanned(changed, eqn, inputs)]
     evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
     products = name in _SUMS_OF_PRODUCTS
     computed = any(of == _COMPUTED for _, of in given)
@@ -131,17 +131,25 @@ def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> li
     return [x for x, _ in _inside(closed, [(x, _COMPUTED) for x in inputs], changed)]
 
 
-def _scanned(changed: Callable[[Any, Any], Any], params: Any, inputs: list[Any]) -> list[Any]:
-    first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
+def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
+    params, inner = eqn.params, eqn.params["jaxpr"].jaxpr
+    # In the body what is carried has the same shape.
+    num_carry = sum(map(_is_alike, eqn.outvars, inner.outvars))
+    last = sum(map(_is_alike, eqn.invars, inner.invars))
+    first = last - num_carry
 
     @jax.checkpoint  # so that no step of a long scan is kept
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
         outs = _values(changed, params["jaxpr"], *inputs[:first], *carry, *x)
-        return outs[: last - first], outs[last - first :]
+        return outs[:num_carry], outs[num_carry:]
 
     given = inputs[first:last], inputs[last:]
     carry, ys = jax.lax.scan(body, *given, params["length"], params["reverse"])
     return [*carry, *ys]
+
+
+def _is_alike(var: Any, inside: Any) -> bool:
+    return var.aval.shape == inside.aval.shape
 
 
 def _is_opaque(jaxpr: Any) -> bool:

@@ -3,6 +3,7 @@
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
@@ -353,3 +354,25 @@ def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
     q = jax.random.normal(jax.random.key(0), (1000, 3))
     needed = jax.jit(start).lower(q, energy(0.0, q, None)).compile().memory_analysis()
     assert needed.temp_size_in_bytes < 100 * q.nbytes, needed  # one array for all pairs is 333
+
+
+@pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton()])
+def test_products_of_matrices_have_all_digits(projection):
+    """By default those in float32 have three on a GPU: a right network was refused there."""
+    matrix = jnp.linspace(-1.0, 1.0, 48, dtype=jnp.float32).reshape(6, 8)
+    product = lambda t, y, args: jnp.tanh(matrix @ y)  # noqa: E731
+    kept = dfc.FirstIntegral(product, rate=product)
+    solver = dfc.ManifoldProjection(dfx.Euler(), kept, projection=projection)
+
+    def saved(y0):
+        options = dict(saveat=dfx.SaveAt(ts=jnp.ones(1)), adjoint=dfx.ForwardMode())
+        return solve(lambda t, y, args: -y, solver, y0, **options).ys
+
+    closed = jax.make_jaxpr(lambda y: jax.jvp(saved, (y,), (y,)))(jnp.ones(8, jnp.float32))
+    jaxprs, precisions = [closed.jaxpr], set()
+    for jaxpr in jaxprs:
+        for eqn in jaxpr.eqns:
+            jaxprs.extend(jex.jaxprs_in_params(eqn.params))
+            if eqn.primitive.name == "dot_general":
+                precisions.add(eqn.params["precision"])
+    assert precisions == {(lax.Precision.HIGHEST, lax.Precision.HIGHEST)}

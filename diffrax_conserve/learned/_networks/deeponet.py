@@ -142,7 +142,8 @@ class DeepONet(AbstractFlowMap):
             own = (h * frame.clock).astype(start.dtype)
             fraction = own / (self.max_step * self.domain.fastest).astype(start.dtype)
             inputs, basis = (x.astype(start.dtype) for x in (frame.inputs, frame.basis))
-            learned = basis @ self._network(inputs, known, fraction)
+            part = self._network(inputs, known, fraction)
+            learned = jnp.matmul(basis, part, precision="highest")
         if self.taylor is not None:
             taylor = dataclasses.replace(self.taylor, args=args[0]) if args else self.taylor
             start = flatten(taylor(y0, h)).astype(start.dtype)

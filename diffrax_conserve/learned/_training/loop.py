@@ -174,7 +174,8 @@ class Loop:
         if self.compiled is not None:
             return
         numbers = jnp.asarray(0), jnp.asarray(0), jnp.asarray(False)
-        lowered = eqx.filter_jit(advance).lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
+        with jax.default_matmul_precision("highest"):  # on a GPU it is three digits in float32
+            lowered = eqx.filter_jit(advance).lower(objective, state.carry, *numbers)  # pyright: ignore[reportFunctionMemberAccess]
         self.compiled = lowered.compile()
         estimate(objective.best(state.carry))
         self.compile_seconds = time.perf_counter() - self.created
