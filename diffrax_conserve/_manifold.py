@@ -215,11 +215,8 @@ def entry_name(manifold: Manifold, position: int) -> str:
 
 def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by `fn(t, y, args)`."""
-    return jtu.tree_map(
-        lambda entry: jtu.tree_map(jnp.asarray, exactly(entry.fn, t, y, args)),
-        manifold,
-        is_leaf=is_entry,
-    )
+    value = lambda entry: jtu.tree_map(jnp.asarray, exactly(entry.fn, t, y, args))  # noqa: E731
+    return jtu.tree_map(value, manifold, is_leaf=is_entry)
 
 
 def exactly(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:

@@ -195,10 +195,7 @@ def _relative_sizes(
     values = ravel(conserved_values(entry, t, y, args)).astype(dtype)
     equations = equations_of(entry, values, t, y, args)
     residual, jacobian = equations.linearise(vector)
-
-    def in_time(t: Array) -> Array:
-        return ravel(evaluate(entry, t, y, args)).astype(dtype)
-
+    in_time = lambda t: ravel(evaluate(entry, t, y, args)).astype(dtype)  # noqa: E731
     _, partial = jax.jvp(in_time, (t,), (jnp.ones_like(t),))
     rate = ravel(rates(entry, t, y, args)).astype(dtype)
 

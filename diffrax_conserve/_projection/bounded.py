@@ -7,7 +7,7 @@ the dual of a quadratic program, whose solution is the nearest point within the 
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._printing import is_traced
+from .base import AbstractProjection, has_bounds
 from .equations import Equations
 from .loop import Solved, project_along
-from .options import spread
+from .options import check_options, option, positive_weights, spread
 
 # A component beyond its bound has this derivative: with zero, a constraint all of whose components
 # are at bounds would never change.
@@ -49,16 +50,6 @@ def _clipped(box: Box, part: Callable[[Array], Array], z: Array) -> Array:
     return part(box.clip(z))
 
 
-def box_of(
-    lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None, like: Any
-) -> Box | None:
-    """The box for the options `lower` and `upper`, or `None` if neither is given."""
-    if lower is None and upper is None:
-        return None
-    low, high = -np.inf if lower is None else lower, np.inf if upper is None else upper
-    return Box(_bound("lower", low, like), _bound("upper", high, like))
-
-
 def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
     if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
         bound = jtu.tree_map(lambda _: bound, like)
@@ -74,6 +65,28 @@ def project_within(
     bounded = box.compose(equations)
     z, ok, count = project_along(bounded, candidate, rows, max_steps=2 * max_steps)
     return box.clip(z), ok, count
+
+
+class AbstractNewton(AbstractProjection):
+    """The options that the Newton iterations share."""
+
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+    lower: PyTree[ArrayLike] | None = option(None)
+    upper: PyTree[ArrayLike] | None = option(None)
+    sees_step: ClassVar[bool] = False
+
+    def __check_init__(self):
+        check_options(self)
+        check_bounds(self.lower, self.upper)
+
+    def box(self, like: Any) -> Box | None:
+        if not has_bounds(self):
+            return None
+        low = -np.inf if self.lower is None else self.lower
+        high = np.inf if self.upper is None else self.upper
+        return Box(_bound("lower", low, like), _bound("upper", high, like))
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

@@ -50,7 +50,8 @@ class ClosedForm(AbstractProjection):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
         y = self.fn(problem.t, state, problem.args, problem.values)
-        got, expected = _shapes_and_dtypes(y), _shapes_and_dtypes(state)
+        kind = lambda x: (jnp.shape(x), jnp.result_type(x))  # noqa: E731
+        got, expected = jtu.tree_map(kind, y), jtu.tree_map(kind, state)
         if not eqx.tree_equal(got, expected):
             raise ValueError(
                 f"`fn` of a `ClosedForm` returned {got}, but the state is {expected}. Return the "
@@ -71,7 +72,3 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
 
 `TypeError` if `fn` cannot be called so; `ValueError`, when it is used, if it returns another state.
 """
-
-
-def _shapes_and_dtypes(tree: Any) -> Any:
-    return jtu.tree_map(lambda x: (jnp.shape(x), jnp.result_type(x)), tree)

@@ -209,11 +209,11 @@ def eliminated(
     what is within the `noise` of `b` is zero in `L⁻¹ b`: a small pivot would amplify it."""
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
-        one, diagonal = _one(gram), jnp.abs(jnp.diagonal(gram))
+        added, diagonal = _added(gram), jnp.abs(jnp.diagonal(gram))
         unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
         scaled = gram * unit[:, None] * unit
-        right = (b * unit).astype(one.dtype)
-        lu, x = jsp.linalg.lu_factor(scaled + _added(gram) * one), jnp.zeros_like(right)
+        right = (b * unit).astype(added.dtype)
+        lu, x = jsp.linalg.lu_factor(scaled + added), jnp.zeros_like(right)
         for _ in range(3):  # which removes what is added
             x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
         return x.astype(dtype) * unit, rows
@@ -239,9 +239,10 @@ def eliminated(
 def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
     """`L⁻¹ S⁻¹` for `gram = L Lᵀ` and the diagonal matrix `S` of `sizes`. With the inverse of a
     triangle each solve is two products."""
-    added = _added(gram) * _one(gram) * jnp.where(gram > 0, gram, 1)
+    added = _added(gram) * jnp.where(gram > 0, gram, 1)
     lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
-    return jsp.linalg.solve_triangular(lower, _one(gram), lower=True) / sizes
+    one = jnp.eye(len(gram), dtype=added.dtype)
+    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
 
 
 def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
@@ -254,10 +255,7 @@ def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Ar
     return sizes, rows / sizes[:, None]
 
 
-def _one(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    return jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))
-
-
-def _added(gram: Float[Array, "m m"]) -> float:
+def _added(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Roundoff that is added to a unit diagonal: dependent constraints have small multipliers."""
-    return 16 * len(gram) ** 0.5 * float(jnp.finfo(gram.dtype).eps)
+    roundoff = 16 * len(gram) ** 0.5 * float(jnp.finfo(gram.dtype).eps)
+    return roundoff * jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))

@@ -1,26 +1,26 @@
 """Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
 
 import dataclasses
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
-from .base import AbstractProjection, Problem, ProjectionInfo
-from .bounded import Box, box_of, check_bounds, project_within
+from .base import Problem, ProjectionInfo
+from .bounded import AbstractNewton, Box, project_within
 from .equations import Equations, combined, gram_matrix, gram_solve, scaled_rows
 from .loop import certain, solve
-from .options import NEWTON_OPTIONS, check_options, option, positive_weights
+from .options import NEWTON_OPTIONS, option
 
 # The largest number of unknowns and constraints for which the nearest point is sought.
 _NEAREST_MAX = 512
 
 
 @final
-class Newton(AbstractProjection):
+class Newton(AbstractNewton):
     r"""Projects to the nearest point of the manifold, with a fresh Jacobian in each iteration.
 
     Finds the stationary point of the distance, $(y, \lambda)$ with
@@ -52,17 +52,7 @@ class Newton(AbstractProjection):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.4, (4.3).
     """
 
-    rtol: float | Array | None = option(None)
-    atol: float | Array | None = option(None)
     max_steps: int = option(100, static=True)
-    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
-    lower: PyTree[ArrayLike] | None = option(None)
-    upper: PyTree[ArrayLike] | None = option(None)
-    sees_step: ClassVar[bool] = False
-
-    def __check_init__(self):
-        check_options(self)
-        check_bounds(self.lower, self.upper)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
@@ -73,7 +63,7 @@ class Newton(AbstractProjection):
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
         equations = problem.equations
-        box = box_of(self.lower, self.upper, problem.like)
+        box = self.box(problem.like)
         unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
         y = unknowns[: candidate.size]
         return y, problem.judge(candidate, y, count)

@@ -132,24 +132,22 @@ def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> li
 
 
 def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
-    params, inner = eqn.params, eqn.params["jaxpr"].jaxpr
-    # In the body what is carried has the same shape.
-    num_carry = sum(map(_is_alike, eqn.outvars, inner.outvars))
-    last = sum(map(_is_alike, eqn.invars, inner.invars))
-    first = last - num_carry
+    params, inside = eqn.params, eqn.params["jaxpr"]
+    # What is carried has the same shape inside.
+    last = sum(
+        var.aval.shape == x.shape for var, x in zip(eqn.invars, inside.in_avals, strict=True)
+    )
+    same = (var.aval.shape == x.shape for var, x in zip(eqn.outvars, inside.out_avals, strict=True))
+    first = last - (num_carry := sum(same))
 
     @jax.checkpoint  # so that no step of a long scan is kept
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
-        outs = _values(changed, params["jaxpr"], *inputs[:first], *carry, *x)
+        outs = _values(changed, inside, *inputs[:first], *carry, *x)
         return outs[:num_carry], outs[num_carry:]
 
     given = inputs[first:last], inputs[last:]
     carry, ys = jax.lax.scan(body, *given, params["length"], params["reverse"])
     return [*carry, *ys]
-
-
-def _is_alike(var: Any, inside: Any) -> bool:
-    return var.aval.shape == inside.aval.shape
 
 
 def _is_opaque(jaxpr: Any) -> bool:

@@ -1,18 +1,18 @@
 """The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, with the constraint Jacobian
 frozen at the candidate, for candidates as close as an integrator's local error."""
 
-from typing import ClassVar, final
+from typing import final
 
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, Float
 
-from .base import AbstractProjection, Problem, ProjectionInfo
-from .bounded import box_of, check_bounds, project_within
+from .base import Problem, ProjectionInfo
+from .bounded import AbstractNewton, project_within
 from .loop import project_along
-from .options import NEWTON_OPTIONS, check_options, option, positive_weights
+from .options import NEWTON_OPTIONS, option
 
 
 @final
-class SimplifiedNewton(AbstractProjection):
+class SimplifiedNewton(AbstractNewton):
     r"""Projects along the gradients at the candidate, with the constraint Jacobian frozen there.
 
     For the candidate $\hat y$, with $G = \partial g/\partial y\,(\hat y)$ and the metric $M$,
@@ -48,23 +48,13 @@ class SimplifiedNewton(AbstractProjection):
         equations (4.4) to (4.6).
     """
 
-    rtol: float | Array | None = option(None)
-    atol: float | Array | None = option(None)
     max_steps: int = option(50, static=True)
-    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
-    lower: PyTree[ArrayLike] | None = option(None)
-    upper: PyTree[ArrayLike] | None = option(None)
-    sees_step: ClassVar[bool] = False
-
-    def __check_init__(self):
-        check_options(self)
-        check_bounds(self.lower, self.upper)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         equations = problem.equations
-        box = box_of(self.lower, self.upper, problem.like)
+        box = self.box(problem.like)
         if box is None:
             y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
         else:

@@ -140,10 +140,7 @@ class TangentField(eqx.Module):
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
         equations = dataclasses.replace(equations, weights=inverse_metric(self.metric, y))
-
-        def evaluated(t: RealScalarLike, y: Y) -> Array:
-            return ravel(evaluate(self.manifold, t, y, args))
-
+        evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
         wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (found - numbers)
