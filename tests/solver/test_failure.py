@@ -143,11 +143,10 @@ RIGHT = jnp.array([1.38, 0.0])  # the energy is negative: the two wells are not 
 @eqx.filter_jit
 def in_the_well(solver, controller, max_correction):
     """The solve, and whether nothing of it is in the left well."""
-    solver = dfc.ManifoldProjection(
-        solver, WELL, projection=dfc.Newton(), max_correction=max_correction
-    )
+    given = dict(projection=dfc.Newton(), max_correction=max_correction)
     options = dict(saveat=dfx.SaveAt(steps=True), max_steps=300, stepsize_controller=controller)
-    sol = solve(double_well, solver, RIGHT, t1=42.0, dt0=1.4, throw=False, **options)
+    options |= given | dict(vector_field=double_well, t1=42.0, dt0=1.4, throw=False)
+    sol = run(WELL, solver, RIGHT, **options)
     return sol, ~jnp.any(sol.ys[:, 0] < 0)
 
 
@@ -179,19 +178,12 @@ def swing(t, y, args):
 
 @pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()], ids=["fixed", "adaptive"])
 def test_a_pendulum_that_keeps_its_squared_angle_or_momentum_is_told_within_100_steps(solver):
-    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
-    fixed = isinstance(solver, dfc.RK4)
+    fixed, tol = isinstance(solver, dfc.RK4), 1e-6
+    controller = dfx.ConstantStepSize() if fixed else dfx.PIDController(tol, tol)
+    options = dict(vector_field=swing, t1=10.0, stepsize_controller=controller, throw=False)
     either = dfc.FirstIntegral(lambda t, y, square: jnp.where(square, y[0] ** 2, y[1]))
     for square_is_kept in (True, False):
-        sol = run(
-            either,
-            solver,
-            args=jnp.array(square_is_kept),
-            vector_field=swing,
-            t1=10.0,
-            stepsize_controller=dfx.ConstantStepSize() if fixed else adaptive,
-            throw=False,
-        )
+        sol = run(either, solver, args=jnp.array(square_is_kept), **options)
         assert TOO_FAR in dfx.RESULTS[sol.result]
         assert sol.stats["num_steps"] <= 100
 
