@@ -117,8 +117,7 @@ def _projected(
         y = jtu.tree_map(ft.partial(jnp.where, going), found, y)
         return 8 * share, going & ~ok & (share < 1), y
 
-    first = jnp.asarray(_CLOSER), ~direct, y
-    _, _, y = lax.while_loop(lambda carry: any_lane(carry[1]), body, first)
+    _, _, y = lax.while_loop(lambda x: any_lane(x[1]), body, (jnp.asarray(_CLOSER), ~direct, y))
     return y, direct
 
 

@@ -143,10 +143,9 @@ class Problem(eqx.Module):
         success = equations.verdict(after, jacobian, y)[0] > 0 if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
-        reached = kinds.where(
-            jnp.isfinite(after), kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
-        )
-        failed = kinds.where(jnp.isfinite(before), reached, kinds.nonfinite)
+        missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
+        failed = kinds.where(jnp.isfinite(after), missed, diverged)
+        failed = kinds.where(jnp.isfinite(before), failed, kinds.nonfinite)
         parts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
         entry = jnp.asarray(np.repeat(np.arange(len(parts)), parts))
         return ProjectionInfo(

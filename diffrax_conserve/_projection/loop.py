@@ -120,8 +120,9 @@ def _solve(
         """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1."""
         level, noise = equations.verdict(seen[0], seen[1], y)
         on = level > 0
-        # Within the tolerance one more, unless it would only serve a start far away.
-        more = jnp.minimum(left - 1, 0 if damped else 1)
+        # Within the tolerance one more, unless it would only serve a start far away, or some, as at
+        # bounds one may lead away.
+        more = jnp.minimum(left - 1, 0 if damped else 1 if equations.clip is None else 4)
         now = jnp.where(on, more, jnp.where(left == 1, -1, left - 1))
         # NaN stays NaN, in the state after one more, unless the step is shortened.
         stays = (left == max_steps + 1) if damped else (left > 0)
@@ -172,8 +173,7 @@ def _solve(
             left, last = judge(equations.linearise(y), y, left)
         return y, last, left, count + (left > 0).astype(int)
 
-    first = (y, last, left, count)
-    y, _, left, count = lax.while_loop(lambda carry: any_lane(carry[2] > 0), body, first)
+    y, _, left, count = lax.while_loop(lambda x: any_lane(x[2] > 0), body, (y, last, left, count))
     return joined(candidate, y), left != -1, count
 
 

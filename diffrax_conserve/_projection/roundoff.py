@@ -134,11 +134,9 @@ def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> li
 def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
     params, inside = eqn.params, eqn.params["jaxpr"]
     # What is carried has the same shape inside.
-    last = sum(
-        var.aval.shape == x.shape for var, x in zip(eqn.invars, inside.in_avals, strict=True)
-    )
-    same = (var.aval.shape == x.shape for var, x in zip(eqn.outvars, inside.out_avals, strict=True))
-    first = last - (num_carry := sum(same))
+    alike = lambda var, x: var.aval.shape == x.shape  # noqa: E731
+    num_carry = sum(map(alike, eqn.outvars, inside.out_avals))
+    first = (last := sum(map(alike, eqn.invars, inside.in_avals))) - num_carry
 
     @jax.checkpoint  # so that no step of a long scan is kept
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:

@@ -180,7 +180,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         states, limit = (y0, candidate, y1), self._limit(terms)
-        failed, hopeless, crept = verdict(info.ok, state, (t0, t1), states, limit)
+        failed, hopeless, crept = verdict(info.ok, state, (t0, t1), states, error, limit)
         # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
         y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
@@ -218,11 +218,12 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by as much as
     this times the distance covered by the step, each the sum over the components. A component may
-    always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
-    one as long as half a step tells that the quantity is not conserved, or that the state jumped
-    to another part of the manifold. `every` multiplies the limit. It does not apply with a
-    `Constraint`, whose correction may do all the work of a step, to stochastic equations, to
-    learned solvers, and to the first projection to a given `value`. `None` is no limit.
+    always change by $\sqrt\varepsilon$ of itself; if the step moves it by less than eight times
+    its error estimate, that counts, up to an eighth of the largest component. Corrections are of
+    the size of the local error: one as long as half a step tells that the quantity is not
+    conserved, or that the state jumped to another part of the manifold. `every` multiplies the
+    limit. It does not apply with a `Constraint`, whose correction may do all the work of a step, to
+    stochastic equations, to learned solvers, and to the first step to a `value`. `None` is none.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 

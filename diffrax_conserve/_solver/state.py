@@ -154,9 +154,8 @@ class State(eqx.Module):
 
     def next(self, info: ProjectionInfo, due: Array | None, **fields: Any) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
-        is_first = self.is_first
-        if is_first is not None:
-            is_first = jnp.zeros_like(is_first) if due is None else is_first & ~due
+        idle = False if due is None else ~due
+        is_first = None if self.is_first is None else self.is_first & idle
         fields |= dict(num_steps=num_steps, is_first=is_first)
         return dataclasses.replace(self, statistics=self.statistics.add(info, due), **fields)
 
@@ -184,21 +183,26 @@ def verdict(
     state: State,
     times: tuple[RealScalarLike, RealScalarLike],
     states: tuple[Y, Y, Y],
+    error: Y | None,
     max_correction: RealScalarLike | None,
 ) -> tuple[Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """The cause of the failure of a step, 0 if it succeeded; whether a failure is final; whether a
-    success is one only because the step is short. The `states` are the last one, the candidate and
-    the result."""
+    success is one only because the step is short. The `states` are the last one, the candidate, of
+    which there may be an estimate of its `error`, and the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
     size, root = jnp.abs(candidate), float(info.eps) ** 0.5
+    # A step that moves less than its error covers that, unless it is a part of the state.
+    covered = moved
+    if not (error is None or max_correction is None):
+        covered = jnp.maximum(moved, jnp.minimum(8 * jnp.abs(ravel(error)), jnp.max(size) / 8))
     # A little less, so that a correction of exactly this share is too long, whatever is rounded.
     share = 0 if max_correction is None else jnp.asarray(0.999 * max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
     # One sum is one kernel. In any step a component may change by the root of roundoff, as roundoff
     # alone moves the state where gradients are nearly parallel.
-    excess = jnp.sum(correction - jnp.maximum(share * moved, root * size))
+    excess = jnp.sum(correction - jnp.maximum(share * covered, root * size))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)

@@ -356,6 +356,34 @@ def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
     assert needed.temp_size_in_bytes < 100 * q.nbytes, needed  # one array for all pairs is 333
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_amounts_may_be_spent(dtype):
+    """An enzyme, without negative amounts: near rest a step overshoots zero by its error."""
+
+    def field(t, y, k):
+        bound, loose, made = k[0] * y[0] * y[1], k[1] * y[2], k[2] * y[2]
+        return jnp.stack([loose - bound, loose + made - bound, bound - loose - made, made])
+
+    kept = lambda t, y, k: jnp.stack([y[1] + y[2], y[0] + y[2] + y[3]])  # noqa: E731
+    projection = dfc.SimplifiedNewton(lower=0.0)
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(kept), projection=projection)
+
+    @jax.jit
+    @jax.vmap
+    def done(y0, k, dt0, tol):
+        options = dict(args=k, t1=5.0, dt0=dt0, throw=False, max_steps=2000)
+        controllers = dfx.ConstantStepSize(), dfx.PIDController(rtol=tol, atol=tol)
+        sols = [solve(field, solver, y0, stepsize_controller=x, **options) for x in controllers]
+        return [dfx.is_okay(sol.result) for sol in sols]
+
+    rng = np.random.default_rng(6)
+    given = [10 ** rng.uniform(*ends, (300, n)) for *ends, n in ((-3, 1, 2), (-1, 1.5, 3))]
+    y0, tol = np.pad(given[0], ((0, 0), (0, 2))), 10 ** rng.uniform(-5, -1.5, 300)
+    dt0 = 0.5 / (given[1][:, 0] * np.sum(y0, axis=1) + np.sum(given[1][:, 1:], axis=1))
+    results = done(*(x.astype(dtype) for x in (y0, given[1], np.maximum(dt0, 3e-3), tol)))
+    assert np.all(results), [np.flatnonzero(~x)[:9] for x in np.asarray(results)]
+
+
 @pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton()])
 def test_products_of_matrices_have_all_digits(projection):
     """By default those in float32 have three on a GPU: a right network was refused there."""
