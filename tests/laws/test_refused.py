@@ -116,15 +116,10 @@ def test_a_small_vibration_far_from_the_origin_is_solved(centre):
     rng = np.random.default_rng(5)
     amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-4.5, 0, 200)
     y0 = np.stack([centre + amplitude, 0 * amplitude], axis=1)
-    done = okay(
-        lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)]),
-        lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2,
-        dfx.Tsit5(),
-        dfx.PIDController(rtol=1e-2, atol=1e-2),
-        y0,
-        jnp.zeros(200),
-        jnp.asarray([60.0, 0.01]),
-    )
+    field = lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)])  # noqa: E731
+    energy = lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2  # noqa: E731
+    given = dfx.Tsit5(), dfx.PIDController(rtol=1e-2, atol=1e-2), y0, jnp.zeros(200)
+    done = okay(field, energy, *given, jnp.asarray([60.0, 0.01]))
     assert np.all(done), amplitude[~np.asarray(done)][:5]
 
 
@@ -358,17 +353,16 @@ def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_amounts_may_be_spent(dtype):
-    """An enzyme, without negative amounts: near rest a step overshoots zero by its error."""
+    """Of an enzyme: near rest a step overshoots zero by its error."""
 
     def field(t, y, k):
         bound, loose, made = k[0] * y[0] * y[1], k[1] * y[2], k[2] * y[2]
         return jnp.stack([loose - bound, loose + made - bound, bound - loose - made, made])
 
     kept = lambda t, y, k: jnp.stack([y[1] + y[2], y[0] + y[2] + y[3]])  # noqa: E731
-    projection = dfc.SimplifiedNewton(lower=0.0)
-    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(kept), projection=projection)
+    bounded = dfc.SimplifiedNewton(lower=0.0)
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(kept), projection=bounded)
 
-    @jax.jit
     @jax.vmap
     def done(y0, k, dt0, tol):
         options = dict(args=k, t1=5.0, dt0=dt0, throw=False, max_steps=2000)

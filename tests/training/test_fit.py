@@ -35,15 +35,8 @@ def recipe(model, epochs=60, points=30, **options):
 def train(
     model, vector_field=oscillator, key=KEY, sample=None, args=None, progress=False, **options
 ):
-    return dfc.fit(
-        model,
-        vector_field,
-        key=key,
-        sample=sample,
-        args=args,
-        recipe=recipe(model, **options),
-        progress=progress,
-    )
+    given = dict(key=key, sample=sample, args=args, progress=progress)
+    return dfc.fit(model, vector_field, recipe=recipe(model, **options), **given)
 
 
 def grid(key, count, first, last):

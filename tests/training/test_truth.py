@@ -44,13 +44,9 @@ def true_error(network):
 def test_the_estimate_is_the_error(windows, epochs):
     """From hopeless trainings to good ones, with jumps of the state between windows."""
     network = pinn(windows=windows)
-    trained, log = dfc.fit(
-        network,
-        oscillator,
-        key=KEY,
-        recipe=recipe(network, epochs, retries=0),
-        manifold=dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)) if windows != 1 else None,
-    )
+    square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2)) if windows != 1 else None
+    options = dict(key=KEY, recipe=recipe(network, epochs, retries=0), manifold=square)
+    trained, log = dfc.fit(network, oscillator, **options)
     assert trained.edges == network.edges
     np.testing.assert_allclose(log.error, true_error(trained), rtol=0.02)
     assert log.errors.shape == (network.windows,)
