@@ -214,5 +214,5 @@ def verdict(
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
     # Of what is not conserved steps pass if they are short enough, one after the other.
     least = jnp.where(state.crept & (cause == _TOO_FAR), max(1e-4, root ** (2 / 3)), 4 * root)
-    crept = jnp.sum(correction - share * moved) > 0
+    crept = jnp.sum(correction - share * covered) > 0
     return cause, (jnp.sum(moved - least * size) <= 0) | instant | lost, crept
