@@ -37,8 +37,7 @@ def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
         fn = rate_of(entry)
         if fn is None:
             return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-        rates = exactly(fn, t, y, args)
-        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), rates, like)
+        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), exactly(fn, t, y, args), like)
 
     values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)

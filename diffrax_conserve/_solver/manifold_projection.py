@@ -223,7 +223,8 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     the size of the local error: one as long as half a step tells that the quantity is not
     conserved, or that the state jumped to another part of the manifold. `every` multiplies the
     limit. It does not apply with a `Constraint`, whose correction may do all the work of a step, to
-    stochastic equations, to learned solvers, and to the first step to a `value`. `None` is none.
+    stochastic equations, to learned solvers, and to the first projection to a given
+    `value`. `None` is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 
