@@ -51,9 +51,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     terms: find a consistent state by [`diffrax_conserve.project`][].
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
-    an adaptive solve tries a smaller step, until the candidate is very close to the last state;
-    then it ends. A solve with fixed steps ends at once. The last state is NaN; the
-    `diffrax.RESULTS` tells the cause, [`diffrax_conserve.statistics`][] the entry of the manifold.
+    an adaptive solve tries a smaller step, until the candidate is close to the last state, and far
+    closer to the solution as its error estimate tells; then it ends. A solve with fixed steps ends
+    at once. The last state is NaN; the `diffrax.RESULTS` tells the cause,
+    [`diffrax_conserve.statistics`][] the entry of the manifold.
 
     !!! example
 
@@ -148,7 +149,6 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
             num_steps=None if self.every == 1 else jnp.asarray(0),
             is_first=jnp.asarray(True) if given and self._limit(terms) is not None else None,
-            crept=jnp.asarray(False),
             statistics=ProjectionStatistics.zero(values.dtype),
         )
 
@@ -180,7 +180,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         states, limit = (y0, candidate, y1), self._limit(terms)
-        failed, hopeless, crept = verdict(info.ok, state, (t0, t1), states, error, limit)
+        failed, hopeless = verdict(info.ok, state, (t0, t1), states, error, limit)
         # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
         y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
@@ -197,7 +197,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
-        state = state.next(info, due, inner=inner, gained=target.gained, crept=crept)
+        state = state.next(info, due, inner=inner, gained=target.gained)
         return y1, error, dense_info, state, result
 
     def _limit(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
@@ -218,13 +218,11 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
 - `max_correction`: a projection to first integrals fails if it moves the candidate by as much as
     this times the distance covered by the step, each the sum over the components. A component may
-    always change by $\sqrt\varepsilon$ of itself; if the step moves it by less than eight times
-    its error estimate, that counts, up to an eighth of the largest component. Corrections are of
-    the size of the local error: one as long as half a step tells that the quantity is not
-    conserved, or that the state jumped to another part of the manifold. `every` multiplies the
-    limit. It does not apply with a `Constraint`, whose correction may do all the work of a step, to
-    stochastic equations, to learned solvers, and to the first projection to a given
-    `value`. `None` is no limit.
+    always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
+    one as long as half a step tells that the quantity is not conserved, or that the state jumped to
+    another part of the manifold. `every` multiplies the limit. It does not apply with a
+    `Constraint`, whose correction may do all the work of a step, to stochastic equations, to
+    learned solvers, and to the first projection to a given `value`. `None` is no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 

@@ -140,7 +140,6 @@ class State(eqx.Module):
     - `values`, `hidden`, `gained`: as in a `Target`; a value is NaN if the solve cannot start.
     - `num_steps`: counted only if not every step is projected.
     - `is_first`: whether no step was made yet, if the first one may have to reach a given `value`.
-    - `crept`: whether the last step succeeded only because it was short.
     """
 
     inner: Any
@@ -149,7 +148,6 @@ class State(eqx.Module):
     gained: Float[Array, "2 m"] | None
     num_steps: Int[Array, ""] | None
     is_first: Bool[Array, ""] | None
-    crept: Bool[Array, ""]
     statistics: ProjectionStatistics
 
     def next(self, info: ProjectionInfo, due: Array | None, **fields: Any) -> "State":
@@ -185,24 +183,20 @@ def verdict(
     states: tuple[Y, Y, Y],
     error: Y | None,
     max_correction: RealScalarLike | None,
-) -> tuple[Int[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
-    """The cause of the failure of a step, 0 if it succeeded; whether a failure is final; whether a
-    success is one only because the step is short. The `states` are the last one, the candidate, of
-    which there may be an estimate of its `error`, and the result."""
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """The cause of the failure of a step, 0 if it succeeded, and whether a failure is final. The
+    `states` are the last one, the candidate, of which there may be an estimate of its `error`, and
+    the result."""
     last, candidate, result = (ravel(y) for y in states)
     info = jnp.finfo(candidate.dtype)
     moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    size, root = jnp.abs(candidate), float(info.eps) ** 0.5
-    # A step that moves less than its error covers that, unless it is a part of the state.
-    covered = moved
-    if not (error is None or max_correction is None):
-        covered = jnp.maximum(moved, jnp.minimum(8 * jnp.abs(ravel(error)), jnp.max(size) / 8))
+    size = jnp.abs(candidate)
     # A little less, so that a correction of exactly this share is too long, whatever is rounded.
     share = 0 if max_correction is None else jnp.asarray(0.999 * max_correction, info.dtype)
     share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
     # One sum is one kernel. In any step a component may change by the root of roundoff, as roundoff
     # alone moves the state where gradients are nearly parallel.
-    excess = jnp.sum(correction - jnp.maximum(share * covered, root * size))
+    excess = jnp.sum(correction - jnp.maximum(share * moved, float(info.eps) ** 0.5 * size))
     cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         too_far = ok & ~(excess <= 0)
@@ -212,7 +206,9 @@ def verdict(
     cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    # Of what is not conserved steps pass if they are short enough, one after the other.
-    least = jnp.where(state.crept & (cause == _TOO_FAR), max(1e-4, root ** (2 / 3)), 4 * root)
-    crept = jnp.sum(correction - share * covered) > 0
-    return cause, (jnp.sum(moved - least * size) <= 0) | instant | lost, crept
+    # A shorter step helps where this one is long, or its error a part of it that is resolved. What
+    # a short and accurate step loses was not conserved.
+    errors = jnp.zeros_like(moved) if error is None else jnp.abs(ravel(error))
+    accurate = jnp.sum(moved - 256 * errors) > 0
+    least = jnp.where(accurate, 1e-2, 64 * float(info.eps))
+    return cause, (jnp.sum(moved - least * size) <= 0) | instant | lost

@@ -123,6 +123,48 @@ def test_a_small_vibration_far_from_the_origin_is_solved(centre):
     assert np.all(done), amplitude[~np.asarray(done)][:5]
 
 
+def far(q, args):
+    return jnp.maximum(jnp.abs(q) - 1, 0)
+
+
+def wall(t, y, args):
+    return jnp.stack([y[1], -args * jnp.sign(y[0]) * far(y[0], args)])
+
+
+def wall_energy(t, y, args):
+    return y[1] ** 2 / 2 + args * far(y[0], args) ** 2 / 2
+
+
+def well(t, y, args):
+    return jnp.stack([y[1], y[0] - y[0] ** 3, 0 * y[2]])
+
+
+def well_energy(t, y, args):
+    return y[1] ** 2 / 2 + (y[0] ** 2 - 1) ** 2 / 4
+
+
+def test_steps_across_an_elastic_wall_are_tried_again():
+    """There a step is inaccurate, and the projection fails, until it is very short."""
+    rng = np.random.default_rng(3)
+    y0, stiff = (
+        np.stack([rng.uniform(-1, 1, 200), rng.normal(size=200)]),
+        10 ** rng.uniform(1, 6, 200),
+    )
+    controller, times = dfx.PIDController(1e-5, 1e-8), jnp.asarray([6.0, 0.01], jnp.float32)
+    given = y0.T.astype(np.float32), stiff.astype(np.float32), times
+    done = okay(wall, wall_energy, dfx.Tsit5(), controller, *given)
+    assert np.sum(~done) <= 3, (np.sum(~done), y0.T[~np.asarray(done)][:5])
+
+
+def test_an_amplitude_below_the_tolerance_beside_what_rests_is_solved():
+    """Its steps are short beside the state, and too long for it."""
+    y0 = np.stack([1 + 10 ** np.linspace(-10, -6, 200), np.zeros(200), np.full(200, 10.0)], axis=1)
+    for tol in (1e-2, 1e-5):
+        given = dfx.Tsit5(), dfx.PIDController(tol, 1e-3 * tol), y0, jnp.zeros(200)
+        done = okay(well, well_energy, *given, jnp.asarray([20.0, 0.01]))
+        assert np.all(done), (tol, y0[~np.asarray(done)][:5])
+
+
 def kepler(t, y, args):
     return jnp.concatenate([y[2:], -y[:2] / jnp.sum(y[:2] ** 2) ** 1.5])
 
