@@ -57,7 +57,7 @@ def test_a_body_whose_motion_is_below_the_tolerance_is_solved():
     for tol in (1e-3, 1e-5):
         controller, times = dfx.PIDController(tol, tol), jnp.array([10.0, 1.0])
         done = okay(body.vector_field, fns, dfx.Tsit5(), controller, y0, np.zeros(300), times)
-        assert np.sum(~done) <= 1, (tol, y0[~np.asarray(done)][:5])
+        assert np.all(done), (tol, y0[~np.asarray(done)][:5])
 
 
 @eqx.filter_jit
@@ -114,55 +114,26 @@ def test_newton_does_not_leave_the_domain_of_a_function(name):
 def test_a_small_vibration_far_from_the_origin_is_solved(centre):
     """Its steps, which at first are much too long, are short beside the state."""
     rng = np.random.default_rng(5)
-    amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-4.5, 0, 200)
+    amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-10, 0, 200)
     y0 = np.stack([centre + amplitude, 0 * amplitude], axis=1)
     field = lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)])  # noqa: E731
     energy = lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2  # noqa: E731
-    given = dfx.Tsit5(), dfx.PIDController(rtol=1e-2, atol=1e-2), y0, jnp.zeros(200)
+    given = dfx.Tsit5(), dfx.PIDController(rtol=1e-2, atol=1e-5), y0, jnp.zeros(200)
     done = okay(field, energy, *given, jnp.asarray([60.0, 0.01]))
     assert np.all(done), amplitude[~np.asarray(done)][:5]
 
 
-def far(q, args):
-    return jnp.maximum(jnp.abs(q) - 1, 0)
-
-
-def wall(t, y, args):
-    return jnp.stack([y[1], -args * jnp.sign(y[0]) * far(y[0], args)])
-
-
-def wall_energy(t, y, args):
-    return y[1] ** 2 / 2 + args * far(y[0], args) ** 2 / 2
-
-
-def well(t, y, args):
-    return jnp.stack([y[1], y[0] - y[0] ** 3, 0 * y[2]])
-
-
-def well_energy(t, y, args):
-    return y[1] ** 2 / 2 + (y[0] ** 2 - 1) ** 2 / 4
-
-
 def test_steps_across_an_elastic_wall_are_tried_again():
-    """There a step is inaccurate, and the projection fails, until it is very short."""
+    """There a step is inaccurate, and its projection fails, until it is very short."""
+    far = lambda y: jnp.maximum(jnp.abs(y[0]) - 1, 0)  # noqa: E731
+    field = lambda t, y, args: jnp.stack([y[1], -args * jnp.sign(y[0]) * far(y)])  # noqa: E731
+    energy = lambda t, y, args: y[1] ** 2 / 2 + args * far(y) ** 2 / 2  # noqa: E731
     rng = np.random.default_rng(3)
-    y0, stiff = (
-        np.stack([rng.uniform(-1, 1, 200), rng.normal(size=200)]),
-        10 ** rng.uniform(1, 6, 200),
-    )
-    controller, times = dfx.PIDController(1e-5, 1e-8), jnp.asarray([6.0, 0.01], jnp.float32)
-    given = y0.T.astype(np.float32), stiff.astype(np.float32), times
-    done = okay(wall, wall_energy, dfx.Tsit5(), controller, *given)
-    assert np.sum(~done) <= 3, (np.sum(~done), y0.T[~np.asarray(done)][:5])
-
-
-def test_an_amplitude_below_the_tolerance_beside_what_rests_is_solved():
-    """Its steps are short beside the state, and too long for it."""
-    y0 = np.stack([1 + 10 ** np.linspace(-10, -6, 200), np.zeros(200), np.full(200, 10.0)], axis=1)
-    for tol in (1e-2, 1e-5):
-        given = dfx.Tsit5(), dfx.PIDController(tol, 1e-3 * tol), y0, jnp.zeros(200)
-        done = okay(well, well_energy, *given, jnp.asarray([20.0, 0.01]))
-        assert np.all(done), (tol, y0[~np.asarray(done)][:5])
+    y0 = np.stack([rng.uniform(-1, 1, 200), rng.normal(size=200)], axis=1, dtype=np.float32)
+    stiffness, times = 10 ** rng.uniform(1, 6, 200), jnp.asarray([6.0, 0.01], jnp.float32)
+    given = dfx.PIDController(1e-5, 1e-8), y0, stiffness.astype(np.float32), times
+    done = okay(field, energy, dfx.Tsit5(), *given)
+    assert np.sum(~done) <= 3, y0[~np.asarray(done)][:5]
 
 
 def kepler(t, y, args):

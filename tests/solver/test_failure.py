@@ -34,8 +34,6 @@ def out_of_reach(t, y, args):
 
 
 OUT_OF_REACH = {"square": dfc.FirstIntegral(square), "jump": dfc.FirstIntegral(out_of_reach)}
-
-
 NOT_FINITE, TOO_FAR, NOT_REACHED = "is not finite, or", "`max_correction`", "was not reached"
 CANNOT_START = "the solve cannot start"
 
@@ -51,13 +49,9 @@ def test_statistics_name_the_entry_that_failed():
     """The other entry holds two integrals."""
     kept = dfc.FirstIntegral(lambda t, y, args: y[:2])
     jump = dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y[2:], args))
-    sol = run(
-        {"first": jump, "kept": kept},
-        y0=jnp.array([0.5, 0.25, 1.0, 0.0]),
-        vector_field=lambda t, y, args: jnp.concatenate([jnp.zeros(2), rotation(t, y[2:], args)]),
-        throw=False,
-        saveat=dfx.SaveAt(t1=True, solver_state=True),
-    )
+    field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), rotation(t, y[2:], args)])  # noqa: E731
+    y0, saveat = jnp.array([0.5, 0.25, 1.0, 0.0]), dfx.SaveAt(t1=True, solver_state=True)
+    sol = run({"first": jump, "kept": kept}, None, y0, field, throw=False, saveat=saveat)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
     worst = int(dfc.statistics(sol).worst)
     assert dfc.entry_name({"first": jump, "kept": kept}, worst) == "manifold['first']"
@@ -101,7 +95,7 @@ def test_an_adaptive_solve_without_hope_ends(after):
     sol = run(dfc.FirstIntegral(spoilt), dfx.Tsit5(), args=jnp.asarray(after), **options)
     assert (NOT_FINITE if np.isnan(after) else NOT_REACHED) in dfx.RESULTS[sol.result]
     plain = run(dfc.FirstIntegral(square), dfx.Tsit5(), **options)
-    assert sol.stats["num_steps"] <= plain.stats["num_steps"] + 60
+    assert sol.stats["num_steps"] <= plain.stats["num_steps"] + 40
 
 
 def test_what_failed_is_nan_and_takes_no_iterations():
@@ -110,7 +104,7 @@ def test_what_failed_is_nan_and_takes_no_iterations():
     assert NOT_REACHED in dfx.RESULTS[sol.result]
     assert np.all(np.isnan(sol.ys[-1]))
     sol = run(dfc.FirstIntegral(lambda t, y, args: y[1]), throw=False)
-    assert "`max_correction`" in dfx.RESULTS[sol.result]
+    assert TOO_FAR in dfx.RESULTS[sol.result]
     assert np.all(np.isnan(sol.ys[-1]))
     for projection in (dfc.SimplifiedNewton(), dfc.Newton()):
         unit = dfc.FirstIntegral(square, value=1.0)
@@ -128,7 +122,7 @@ def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     options = span | dict(stepsize_controller=dfx.PIDController(1e-4, 1e-4), max_steps=None)
     sol = run(jump, dfx.Tsit5(), Y0.astype(dtype), slow, throw=False, **options)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
-    assert sol.stats["num_steps"] <= 60
+    assert sol.stats["num_steps"] <= 40
 
 
 def double_well(t, y, args):
@@ -150,14 +144,11 @@ def in_the_well(solver, controller, max_correction):
     return sol, ~jnp.any(sol.ys[:, 0] < 0)
 
 
-@pytest.mark.parametrize(
-    ("solver", "controller", "limit"),
-    [
-        (dfx.Euler(), dfx.ConstantStepSize(), 0.3),
-        (dfx.Heun(), dfx.PIDController(rtol=1e3, atol=1e3, factormax=1.2), 0.1),
-    ],
-    ids=["fixed", "adaptive"],
-)
+FIXED = dfx.Euler(), dfx.ConstantStepSize(), 0.3
+ADAPTIVE = dfx.Heun(), dfx.PIDController(rtol=1e3, atol=1e3, factormax=1.2), 0.1
+
+
+@pytest.mark.parametrize(("solver", "controller", "limit"), [FIXED, ADAPTIVE])
 def test_max_correction_guards_against_another_component(solver, controller, limit):
     """Fixed steps fail, adaptive ones become smaller."""
     sol, right = in_the_well(solver, controller, jnp.array(1e9))
@@ -166,7 +157,7 @@ def test_max_correction_guards_against_another_component(solver, controller, lim
     sol, right = in_the_well(solver, controller, jnp.array(limit))
     assert right
     if limit == 0.3:
-        assert "max_correction" in dfx.RESULTS[sol.result]
+        assert TOO_FAR in dfx.RESULTS[sol.result]
     else:
         assert sol.result == dfx.RESULTS.successful
         assert sol.stats["num_rejected_steps"] > 0
@@ -176,19 +167,8 @@ def swing(t, y, args):
     return jnp.stack([y[1], -jnp.sin(y[0])])
 
 
-@pytest.mark.parametrize("solver", [dfc.RK4(), dfx.Tsit5()], ids=["fixed", "adaptive"])
-def test_a_pendulum_that_keeps_its_squared_angle_or_momentum_is_told_within_100_steps(solver):
-    fixed, tol = isinstance(solver, dfc.RK4), 1e-6
-    controller = dfx.ConstantStepSize() if fixed else dfx.PIDController(tol, tol)
-    options = dict(vector_field=swing, t1=10.0, stepsize_controller=controller, throw=False)
-    either = dfc.FirstIntegral(lambda t, y, square: jnp.where(square, y[0] ** 2, y[1]))
-    for square_is_kept in (True, False):
-        sol = run(either, solver, args=jnp.array(square_is_kept), **options)
-        assert TOO_FAR in dfx.RESULTS[sol.result]
-        assert sol.stats["num_steps"] <= 100
-
-
 WRONG = {
+    "the squared angle": (swing, lambda t, y, args: y[0] ** 2),
     "the momentum": (swing, lambda t, y, args: y[1]),
     "kinetic minus potential energy": (swing, lambda t, y, args: y[1] ** 2 / 2 + jnp.cos(y[0])),
     "another pendulum": (swing, lambda t, y, args: y[1] ** 2 / 2 - 9 * jnp.cos(y[0])),
@@ -213,8 +193,9 @@ def test_no_wrong_integral_keeps_an_adaptive_solve_from_its_end(name):
     rng = np.random.default_rng(3)
     field, fn = WRONG[name]
     y0, tol = 1.2 * rng.normal(size=(200, 2)), 10 ** rng.uniform(-9, -3, 200)
-    _, ends, passed = attempted(field, fn, y0, tol)
+    counts, ends, passed = attempted(field, fn, y0, tol)
     assert np.all(ends), (y0[~np.asarray(ends)][:3], tol[~np.asarray(ends)][:3])
+    assert np.quantile(counts, 0.9) <= 100
     # Not all are noticed: see `check_invariance`.
     assert np.mean(passed) < (0.5 if field is swing else 0.005)
 
@@ -226,7 +207,7 @@ def test_a_species_that_is_kept_ends_a_solve_in_single_precision():
     y0 = np.array([1.0, 0.0, 0.0]) * rng.uniform(0.1, 3, (200, 1))
     y0, tol = y0.astype(np.float32), (10 ** rng.uniform(-6, -3, 200)).astype(np.float32)
     counts, _, passed = attempted(field, lambda t, y, args: y[2], y0, tol)
-    assert np.max(counts) < 300
+    assert np.max(counts) <= 100
     assert not np.any(passed)
 
 
