@@ -51,10 +51,9 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     terms: find a consistent state by [`diffrax_conserve.project`][].
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
-    an adaptive solve tries a smaller step, until the candidate is close to the last state, and far
-    closer to the solution as its error estimate tells; then it ends. A solve with fixed steps ends
-    at once. The last state is NaN; the `diffrax.RESULTS` tells the cause,
-    [`diffrax_conserve.statistics`][] the entry of the manifold.
+    an adaptive solve tries smaller steps until one is short beside the state, and accurate by its
+    error estimate; then it ends. A solve with fixed steps ends at once. The last state is NaN; the
+    `diffrax.RESULTS` tells the cause, [`diffrax_conserve.statistics`][] the entry of the manifold.
 
     !!! example
 

@@ -206,9 +206,9 @@ def verdict(
     cause = jnp.where(lost, _START, cause)
     t0, t1 = times
     instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    # A shorter step helps where this one is long, or its error a part of it that is resolved. What
-    # a short and accurate step loses was not conserved.
+    # A shorter step is not better where this one is short, and accurate in each component.
     errors = jnp.zeros_like(moved) if error is None else jnp.abs(ravel(error))
-    accurate = jnp.sum(moved - 256 * errors) > 0
-    least = jnp.where(accurate, 1e-2, 64 * float(info.eps))
-    return cause, (jnp.sum(moved - least * size) <= 0) | instant | lost
+    allowed = jnp.where(256 * errors <= moved, 1e-2 * size, -jnp.inf)
+    short = jnp.where(cause == _TOO_FAR, jnp.sum(moved - allowed) <= 0, jnp.all(moved <= allowed))
+    roundoff = jnp.sum(moved - 64 * float(info.eps) * size) <= 0
+    return cause, short | roundoff | instant | lost

@@ -1,6 +1,6 @@
 """Attack: adaptive solves whose projection becomes hopeless, with `max_steps=None` too.
 
-They are to end in a failure whose entry is `alpha`, at most 40 steps after the hopeless time. A
+They are to end in a failure whose entry is `alpha`, at most 60 steps after the hopeless time. A
 solve that never ends is killed by the runner, and found wrong.
 """
 
@@ -18,7 +18,7 @@ import diffrax_conserve as dfc
 from .oracle import Tally, is_told, log_uniform
 
 LANES, TIMEOUT = 10, 60
-T1, MORE = 6.0, 40
+T1, MORE = 6.0, 60
 
 
 def energy(t: Any, y: Any, args: Any) -> Any:
