@@ -237,7 +237,7 @@ def never_give_up(package):
     package.function("verdict", mutate)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "no_wrong_integral or single_precision")
+@noticed_by("tests/solver/test_failure.py", "-k", "no_wrong_integral")
 def forget_that_a_short_and_accurate_step_is_as_good_as_any(package):
     package.function("verdict", lambda verdict: lambda *xs: verdict(*xs[:4], jnp.inf, xs[5]))
 
