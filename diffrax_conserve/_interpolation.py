@@ -19,12 +19,15 @@ import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.base import Step, Target
+from ._projection.base import Target, has_bounds
 from ._projection.equations import any_lane
+from ._projection.loop import solve
 from ._tree import ravel, tree_sub, tree_tangents
 
 # The first share of the way to the end of a step, which is multiplied by eight until it is one.
 _CLOSER = 2.0**-30
+# The largest number of damped steps: in mixed units they zigzag.
+_FAR_STEPS = 1000
 
 
 @final
@@ -61,6 +64,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     target: PackedTarget
     due: Bool[Array, ""] | None
 
+    @eqx.filter_jit
     def evaluate(
         self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
     ) -> PyTree[Array]:
@@ -78,15 +82,25 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         apart = (jnp.linalg.norm(ravel(tree_sub(end, candidate))) for end in self.ends)
         limit = jnp.inf if target.projection.metric is not None else sum(apart)
 
+        problem = target.problem(t0, candidate, step)
+
         def by(far: bool) -> Callable[..., Any]:
-            def project(t: Array, candidate: Y, step: Step | None) -> tuple[Y, Array]:
-                y, info = target.project(t, candidate, step, far)
-                return y, info.ok & (info.correction <= lax.stop_gradient(limit))
+            def project(candidate: Y) -> tuple[Y, Array]:
+                vector = ravel(candidate)
+                if far:
+                    given = problem.equations, vector
+                    y, ok, _ = solve(*given, max_steps=_FAR_STEPS, fresh=True, damped=True)
+                else:
+                    y, info = target.projection.solve(problem, vector)
+                    ok = info.ok
+                near = jnp.linalg.norm(y - vector) <= lax.stop_gradient(limit)
+                return problem.state(y), ok & near
 
             # Arrays over which the functions of the manifold close become leaves.
-            return eqx.filter_closure_convert(project, t0, candidate, step)
+            return eqx.filter_closure_convert(project, candidate)
 
-        y, _ = _projected(by(False), by(True), t0, candidate, step, end)
+        far = not has_bounds(target.projection)
+        y, _ = _projected(by(False), by(far), candidate, end)
         due = self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
@@ -95,14 +109,12 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 def _projected(
     project: Callable[..., Any],
     far: Callable[..., Any],
-    t: Array,
     candidate: Y,
-    step: Step | None,
     end: Y,
 ) -> tuple[Y, Bool[Array, ""]]:
     """The projection of the interpolant, or by `far` of a state closer to the end; and whether it
     is the first."""
-    y, direct = project(t, candidate, step)
+    y, direct = project(candidate)
 
     def body(carry: tuple[Array, Array, Y]) -> tuple[Array, Array, Y]:
         share, going, y = carry
@@ -112,7 +124,7 @@ def _projected(
             # The end is taken as it is, where the interpolant may not be finite.
             return jnp.where(part < 1, (1 - part) * start + part * end, end)
 
-        found, ok = far(t, jtu.tree_map(closer, candidate, end), step)
+        found, ok = far(jtu.tree_map(closer, candidate, end))
         found = jtu.tree_map(lambda x: jnp.where(ok, x, jnp.nan), found)
         y = jtu.tree_map(ft.partial(jnp.where, going), found, y)
         return 8 * share, going & ~ok & (share < 1), y
@@ -125,8 +137,8 @@ def _projected(
 def _projected_jvp(primals: Any, tangents: Any) -> Any:
     """Only the projection of the interpolant itself has a derivative."""
     y, direct = _projected(*primals)
-    given = (primals[0], *primals[2:-1]), (tangents[0], *tangents[2:-1])
-    _, t_y = eqx.filter_jvp(lambda project, *args: project(*args)[0], *given)
+    given = (primals[0], primals[2]), (tangents[0], tangents[2])
+    _, t_y = eqx.filter_jvp(lambda project, candidate: project(candidate)[0], *given)
     factor = jnp.where(direct, 1, jnp.nan)
     t_y = jtu.tree_map(lambda x: factor.astype(x.dtype) * x, tree_tangents(y, t_y))
     return (y, direct), (t_y, None)

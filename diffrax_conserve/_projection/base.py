@@ -20,11 +20,7 @@ from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 from .equations import Equations, equations_of, relative
-from .loop import solve
 from .options import inverse_metric
-
-# The largest number of damped steps: in mixed units they zigzag.
-_FAR_STEPS = 1000
 
 
 @final
@@ -264,26 +260,20 @@ class Target(eqx.Module):
         error = None if error is None else ravel(error)
         return Step(start * self.direction, end * self.direction, ravel(y0), error)
 
-    @eqx.filter_jit  # diffrax traces a step three times; a jitted function is traced only once
-    def project(
-        self, t: RealScalarLike, candidate: Y, step: Step | None = None, far: bool = False
-    ) -> tuple[Y, ProjectionInfo]:
-        """With `far` by damped steps along fresh gradients, which nothing differentiates, unless
-        there are bounds."""
+    def problem(self, t: RealScalarLike, candidate: Y, step: Step | None = None) -> Problem:
         equations, like = self.equations(t, candidate), jax.eval_shape(lambda: candidate)
         manifold, t, args = self.manifold, t * self.direction, self.args
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(_key(path[0]) if path else None for path, _ in flat)
         values = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
-        values = unflatten(self.value, values)
-        problem = Problem(equations, t, args, values, like, keys, step)
-        vector = ravel(candidate)
-        if far and not has_bounds(self.projection):
-            y, ok, count = solve(equations, vector, max_steps=_FAR_STEPS, fresh=True, damped=True)
-            info = problem.judge(vector, y, count, ok=ok)
-        else:
-            y, info = self.projection.solve(problem, vector)
-        return unravel(y, problem.like), info
+        return Problem(equations, t, args, unflatten(self.value, values), like, keys, step)
+
+    def project(
+        self, t: RealScalarLike, candidate: Y, step: Step | None = None
+    ) -> tuple[Y, ProjectionInfo]:
+        problem = self.problem(t, candidate, step)
+        y, info = self.projection.solve(problem, ravel(candidate))
+        return problem.state(y), info
 
     def project_if(
         self, due: Bool[Array, ""] | None, t: RealScalarLike, candidate: Y, step: Step | None = None

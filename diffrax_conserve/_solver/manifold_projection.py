@@ -4,6 +4,7 @@ import functools as ft
 from typing import Any, final
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import PyTree
@@ -151,6 +152,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             statistics=ProjectionStatistics.zero(values.dtype),
         )
 
+    @eqx.filter_jit
     def step(
         self,
         terms: PyTree[dfx.AbstractTerm],
