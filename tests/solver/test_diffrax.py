@@ -165,15 +165,16 @@ def test_strict_promotion_rank_promotion_and_nan_debugging():
 
 
 def test_nothing_is_compiled_twice():
-    energy = Counted(lambda t, y, args: jnp.sum(y**2))
-    solver = dfc.ManifoldProjection(dfc.RK4(), dfc.FirstIntegral(energy))
+    field, energy = Counted(rotation), Counted(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(energy))
 
     def run(y0):
-        sol = solve(rotation, solver, y0, saveat=dfx.SaveAt(dense=True))
+        sol = solve(field, solver, y0, saveat=dfx.SaveAt(dense=True))
         return sol.evaluate(0.123)
 
     run(jnp.array([1.0, 0.0]))
     traced = energy.calls
     assert traced > 0
+    assert field.calls <= 3  # diffrax traces each step three times, this one only once
     run(jnp.array([0.3, 0.4]))
     assert energy.calls == traced
