@@ -64,7 +64,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     target: PackedTarget
     due: Bool[Array, ""] | None
 
-    @eqx.filter_jit
+    @eqx.filter_jit  # traced once for all saved times
     def evaluate(
         self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
     ) -> PyTree[Array]:
@@ -81,7 +81,6 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # As far from the interpolant as both ends together nothing is nearest to it.
         apart = (jnp.linalg.norm(ravel(tree_sub(end, candidate))) for end in self.ends)
         limit = jnp.inf if target.projection.metric is not None else sum(apart)
-
         problem = target.problem(t0, candidate, step)
 
         def by(far: bool) -> Callable[..., Any]:
@@ -99,8 +98,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             # Arrays over which the functions of the manifold close become leaves.
             return eqx.filter_closure_convert(project, candidate)
 
-        far = not has_bounds(target.projection)
-        y, _ = _projected(by(False), by(far), candidate, end)
+        unbounded = not has_bounds(target.projection)  # damped steps keep no bounds
+        y, _ = _projected(by(False), by(unbounded), candidate, end)
         due = self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 

@@ -152,7 +152,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             statistics=ProjectionStatistics.zero(values.dtype),
         )
 
-    @eqx.filter_jit
+    @eqx.filter_jit  # traced once; diffrax alone traces a step three times
     def step(
         self,
         terms: PyTree[dfx.AbstractTerm],
