@@ -268,6 +268,7 @@ class Target(eqx.Module):
         values = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
         return Problem(equations, t, args, unflatten(self.value, values), like, keys, step)
 
+    @eqx.filter_jit  # traced once, though `project_if` asks for its shapes too
     def project(
         self, t: RealScalarLike, candidate: Y, step: Step | None = None
     ) -> tuple[Y, ProjectionInfo]:

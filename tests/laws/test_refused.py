@@ -110,13 +110,13 @@ def test_newton_does_not_leave_the_domain_of_a_function(name):
     assert np.all(off <= 1e-13 * (1 + np.abs(value(y)))), np.max(off)
 
 
-@pytest.mark.parametrize("centre", [0.0, 1.0, -30.0])
-def test_a_small_vibration_far_from_the_origin_is_solved(centre):
+@pytest.mark.parametrize(("centre", "rests"), [(0.0, 0.0), (1.0, 0.0), (-30.0, 0.0), (1.0, 10.0)])
+def test_a_small_vibration_far_from_the_origin_is_solved(centre, rests):
     """Its steps, which at first are much too long, are short beside the state."""
     rng = np.random.default_rng(5)
     amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-10, 0, 200)
-    y0 = np.stack([centre + amplitude, 0 * amplitude], axis=1)
-    field = lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre)])  # noqa: E731
+    y0 = np.stack([centre + amplitude, 0 * amplitude, rests + 0 * amplitude], axis=1)
+    field = lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre), 0 * y[2]])  # noqa: E731
     energy = lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2  # noqa: E731
     given = dfx.Tsit5(), dfx.PIDController(rtol=1e-2, atol=1e-2), y0, jnp.zeros(200)
     done = okay(field, energy, *given, jnp.asarray([60.0, 0.01]))
