@@ -254,13 +254,8 @@ def conserved_values(
             check_numbers("value", value)
             _check_shapes(f"The conserved value of `{name}` has the structure", value, output)
         found.append(jtu.tree_map(jnp.asarray, value))
-    count, unknowns = tree_size(found), tree_size(y)
-    if count == 0:
+    if tree_size(found) == 0:
         raise ValueError("The functions in `manifold` return no array: there is nothing to keep.")
-    if count > unknowns:
-        raise ValueError(
-            f"`manifold` has {count} scalar constraints for {unknowns} unknowns. Remove some."
-        )
     return treedef.unflatten(found)
 
 

@@ -42,7 +42,9 @@ class InvarianceEntry:
 
     `kind` is "first integral", "balance" or "constraint"; `defect` is the largest relative defect,
     at the state with the index `state`. `is_constant` tells that the gradient is zero at every
-    state: such a function is conserved by any field.
+    state: such a function is conserved by any field. `is_tested` is false where the gradient is not
+    zero, but all terms of the derivative are, at every state: then nothing is known, and `ok` is
+    false.
     """
 
     name: str
@@ -51,6 +53,7 @@ class InvarianceEntry:
     state: int
     ok: bool
     is_constant: bool
+    is_tested: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,12 +70,15 @@ class InvarianceReport:
         return all(entry.ok for entry in self.entries)
 
     def __str__(self) -> str:
-        title = "conserved" if self.ok else "NOT CONSERVED"
+        tested = all(entry.is_tested for entry in self.entries)
+        title = "conserved" if self.ok else "NOT CONSERVED" if tested else "NOT TESTED"
         title += f": derivatives along the flow at {self.num_states} states"
         title += f", relative tolerance {self.rtol:.1e}"
         rows = {"": f"{'':14}  largest relative defect"}
         for entry in self.entries:
             result = "conserved" if entry.ok else f"NOT conserved, see state {entry.state}"
+            if not entry.is_tested:
+                result = "NOT TESTED: each term of its derivative is zero at every state"
             if entry.is_constant:
                 result += "; its gradient is zero at every state: nothing is kept"
             rows[entry.name] = f"{entry.kind:14}  {entry.defect:<8.1e}  {result}"
@@ -106,7 +112,9 @@ def check_invariance(
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `states`: a sampler `key -> y` such as `system.sample`, or a PyTree like `y` with a leading
         axis over the states. At an equilibrium every function is conserved, so they must be in
-        general position; with a [`diffrax_conserve.Constraint`][], on the manifold.
+        general position: a sampler that multiplies a state leaves its zeros zero, and an entry
+        whose derivative has no other terms is not tested. With a [`diffrax_conserve.Constraint`][]
+        they must be on the manifold.
     - `t`: the time, or one for each state. Give several for integrals that depend on time.
     - `args`: passed to `vector_field` and to the functions of the manifold.
     - `key`, `num_states`: the seed (default: `jax.random.key(0)`) and the number of sampled states.
@@ -181,14 +189,15 @@ def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
 @ft.partial(eqx.filter_vmap, in_axes=(None, None, 0, 0, None))
 def _measure(
     vector_field: Callable, manifold: Manifold, t: Float[Array, ""], y: Any, args: Args
-) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]]:
-    """The largest relative defect and residual of each entry, and whether its gradient is zero."""
+) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""], Bool[Array, " m"]]]:
+    """The largest relative defect and residual of each entry, whether its gradient is zero, and of
+    each of its elements whether all terms of the derivative are."""
     return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
 
 
 def _relative_sizes(
     entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     vector = ravel(y)
     dtype = vector.dtype
     t = t.astype(dtype)
@@ -214,11 +223,12 @@ def _relative_sizes(
     if isinstance(entry, Constraint):
         violation = relative(residual, equations.scale(jacobian, vector))
     defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
-    return defect, violation, jnp.all(jacobian == 0) & jnp.all(partial == 0)
+    constant = jnp.all(jacobian == 0, axis=1) & (partial == 0)
+    return defect, violation, jnp.all(constant), (terms == 0) & ~constant
 
 
 def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:
-    defects, residuals, constant = found
+    defects, residuals, constant, idle = found
     # The first NaN, or the largest.
     state, worst = int(np.argmax(defects)), int(np.argmax(residuals))
     if not residuals[worst] <= rtol:
@@ -230,4 +240,6 @@ def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> Invari
     kind = "first integral" if rate_of(entry) is None else "balance"
     kind = "constraint" if isinstance(entry, Constraint) else kind
     defect, is_constant = float(defects[state]), bool(np.all(constant))
-    return InvarianceEntry(name, kind, defect, state, defect <= rtol, is_constant)
+    is_tested = not np.any(np.all(idle, axis=0))
+    ok = defect <= rtol and is_tested
+    return InvarianceEntry(name, kind, defect, state, ok, is_constant, is_tested)

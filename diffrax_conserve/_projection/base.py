@@ -19,8 +19,8 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
-from .equations import Equations, equations_of, relative
-from .options import inverse_metric
+from .equations import Equations, equations_of, length, relative
+from .options import units_of
 
 
 @final
@@ -55,7 +55,8 @@ class ProjectionInfo(eqx.Module):
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, relative to the scale of its constraint at the latter,
         $|I_0| + \\sum_k |y_k \\partial g/\\partial y_k|$ plus the terms that cancel inside `fn`.
-    - `correction`: the Euclidean norm of the projected state minus the candidate.
+    - `correction`: the length of the projected state minus the candidate in the metric of the
+        projection. In the metric of motion it is a share of the longest step so far.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
     - `worst`: the position of the entry with the largest relative residual (before or after, the
@@ -150,7 +151,7 @@ class Problem(eqx.Module):
             num_steps=jnp.asarray(num_steps),
             residual_before=before,
             residual_after=after,
-            correction=jnp.linalg.norm(y - candidate),
+            correction=length(y - candidate, equations.units),
             roundoff=jnp.max(relative(equations.hidden, scale)),
             # The smaller of both, so that none is blamed for an iteration that diverged.
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
@@ -181,9 +182,11 @@ class AbstractProjection(eqx.Module):
 
 
 def adapted(equations: Equations, projection: AbstractProjection, like: Any) -> Equations:
-    """The equations with the metric and the tolerances of a projection."""
-    within = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
-    return dataclasses.replace(equations, weights=inverse_metric(projection.metric, like), **within)
+    """The equations with the metric, if it has one, and the tolerances of a projection."""
+    changed = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
+    if projection.metric is not None:
+        changed["units"] = units_of(projection.metric, like)
+    return dataclasses.replace(equations, **changed)
 
 
 def has_bounds(projection: AbstractProjection) -> bool:
@@ -203,6 +206,8 @@ class Target(eqx.Module):
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
+    - `motion`: how far each component moves in a step, its unit in the metric of motion; `None`
+      where that is not the metric, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
     - `gained`: the integrals of the rates since the start, and what rounding added to them.
     """
@@ -211,6 +216,7 @@ class Target(eqx.Module):
     manifold: Manifold
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
+    motion: Float[Array, " n"] | None
     args: Args
     direction: Real[Array, ""]
     gained: Float[Array, "2 m"] | None = None
@@ -249,7 +255,13 @@ class Target(eqx.Module):
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
+        equations = dataclasses.replace(equations, units=self.motion, motion=self.motion)
         return adapted(equations, self.projection, like)
+
+    def units(self, y: Y) -> Float[Array, " n"] | None:
+        """The units of the components of a state like `y` in the metric of the projection."""
+        metric = self.projection.metric
+        return self.motion if metric is None else units_of(metric, y)
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None

@@ -50,18 +50,11 @@ def _clipped(box: Box, part: Callable[[Array], Array], z: Array) -> Array:
     return part(box.clip(z))
 
 
-def _bound(name: str, bound: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
-    if jtu.treedef_is_leaf(jtu.tree_structure(bound)) and jnp.ndim(bound) == 0:
-        bound = jtu.tree_map(lambda _: bound, like)
-    remedy = "Give one number, or one bound (or an array) for each leaf of the state."
-    return spread(name, bound, like, remedy)
-
-
 def project_within(
     box: Box, equations: Equations, candidate: Float[Array, " n"], *, max_steps: int
 ) -> Solved:
     """`loop.project_along` the gradients at the candidate, within bounds."""
-    rows = equations.weighted(equations.linearise(candidate)[1])
+    rows = equations.scaled(equations.linearise(candidate)[1])
     bounded = box.compose(equations)
     z, ok, count = project_along(bounded, candidate, rows, max_steps=2 * max_steps)
     return box.clip(z), ok, count
@@ -86,7 +79,7 @@ class AbstractNewton(AbstractProjection):
             return None
         low = -np.inf if self.lower is None else self.lower
         high = np.inf if self.upper is None else self.upper
-        return Box(_bound("lower", low, like), _bound("upper", high, like))
+        return Box(spread("lower", low, like), spread("upper", high, like))
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

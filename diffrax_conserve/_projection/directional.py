@@ -1,5 +1,6 @@
 """Projection along the embedded error estimate, which conserves every linear integral."""
 
+import dataclasses
 from typing import ClassVar, final
 
 import equinox as eqx
@@ -71,11 +72,10 @@ class Directional(AbstractProjection):
                 "`ManifoldProjection` wrap a solver with an embedded method, such as "
                 "`diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
-        # Normalised, so that products with the gradient do not overflow or underflow.
-        length = lax.stop_gradient(jnp.max(jnp.abs(error)))
-        direction = error[None] / jnp.where(length > 0, length, 1)
-        equations = problem.equations
-        y, ok, count = project_along(equations, candidate, direction, max_steps=self.max_steps)
+        # The estimate is the unit of each component, and its signs are the direction.
+        equations = dataclasses.replace(problem.equations, units=jnp.abs(error))
+        signs = lax.stop_gradient(jnp.sign(error))[None]
+        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
         return y, problem.judge(candidate, y, count, ok=ok)
 
 

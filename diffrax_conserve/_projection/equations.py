@@ -36,7 +36,11 @@ class Equations(eqx.Module):
     - `parts`: the residual of each entry.
     - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
     - `hidden`: the part of it that the gradients do not show.
-    - `weights`: `M⁻¹`; `None` if it is one.
+    - `units`: the unit `s` of each component in which a correction is measured, `M⁻¹ = diag(s²)`;
+      `None` if all are one. A component whose unit is zero is never moved. All linear algebra works
+      with `G diag(s)`, whose columns no longer know the units of the user: so nothing is squared
+      before it is scaled, and a change of units by powers of two changes no bit of the result.
+    - `motion`: how far each component moves in a step, where that is known; see `Target`.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `may_vanish`: whether all terms of a residual may be zero, as those of a `Constraint`.
     - `clip`: within bounds the map to the state from a vector without bounds, then the argument of
@@ -47,7 +51,8 @@ class Equations(eqx.Module):
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    weights: Float[Array, " n"] | None = None
+    units: Float[Array, " n"] | None = None
+    motion: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
     may_vanish: bool = eqx.field(default=False, static=True)
@@ -102,9 +107,34 @@ class Equations(eqx.Module):
         g, jacobian = self.linearise(y)
         return self.verdict(g, jacobian, y)[0] > 0
 
-    def weighted(self, rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        """The rows of `G M⁻¹`."""
-        return rows if self.weights is None else rows * self.weights[None]
+    def scaled(self, x: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        """Each component times its unit: `G diag(s)` of a Jacobian, and the correction `s Uᵀ λ` of
+        a combination `Uᵀ λ` of its rows `U`."""
+        return x if self.units is None else x * self.units
+
+
+def in_units(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, " n"]:
+    """A change of the state, each component in its unit; zero where the unit is zero, because such
+    a component is never moved."""
+    if units is None:
+        return change
+    moves = units != 0
+    return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
+
+
+def length(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, ""]:
+    """The length of a change of the state in the metric `diag(1/units²)`."""
+    return jnp.linalg.norm(in_units(change, units))
+
+
+def reach(
+    start: Float[Array, " n"], end: Float[Array, " n"], units: Float[Array, " n"] | None
+) -> Float[Array, ""]:
+    """The length of a step in the metric, the yardstick of corrections. Each component counts at
+    least by the root of roundoff of itself, by which roundoff alone moves a state where gradients
+    are nearly parallel: otherwise no correction would be short in a step at rest."""
+    least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
+    return length(jnp.maximum(jnp.abs(end - start), least), units)
 
 
 def shown_terms(jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:

@@ -26,6 +26,7 @@ from .equations import (
     eliminated,
     gram_matrix,
     gram_solve,
+    in_units,
     inverse_factor,
     relative,
     scaled_rows,
@@ -67,9 +68,10 @@ def solve(
     fresh: bool = False,
     damped: bool = False,
 ) -> Solved:
-    """The state `y = ŷ + Dᵀ λ` on the manifold. The directions `D` are by default `G M⁻¹` at the
-    candidate, with `fresh` at the last state. With `damped` a step that increases the largest
-    residual, or leaves the domain of a function, is shortened until it does not."""
+    """The state `y = ŷ + s Uᵀ λ` on the manifold, for the units `s` of the components. The
+    directions `U` are by default `G diag(s)` at the candidate, with `fresh` at the last state. With
+    `damped` a step that increases the largest residual, or leaves the domain of a function, is
+    shortened until it does not."""
     arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
     small = equations.magnitude.size <= WRITTEN_OUT_MAX
 
@@ -108,13 +110,12 @@ def _solve(
         if fresh:
             return _Kept(), None
         g, jacobian = equations.linearise(y)
-        sizes, unit = scaled_rows(jacobian)
-        rows = equations.weighted(unit)
-        if len(rows) <= WRITTEN_OUT_MAX:
-            return _Kept(rows), None
+        scaled = equations.scaled(jacobian)
+        sizes, unit = scaled_rows(scaled)
+        if len(unit) <= WRITTEN_OUT_MAX:
+            return _Kept(unit), None
         # A large Jacobian is carried, so that none is computed twice.
-        inverse = inverse_factor(gram_matrix(unit, rows), sizes)
-        return _Kept(equations.weighted(jacobian), inverse), (g, jacobian)
+        return _Kept(scaled, inverse_factor(gram_matrix(unit, unit), sizes)), (g, jacobian)
 
     def judge(seen: _Seen, y: Any, left: Array) -> tuple[Array, _Seen]:
         """The iterations that are left, at first `max_steps + 1`; in the end 0, success, or -1."""
@@ -187,7 +188,7 @@ def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[A
 
 
 def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Array:
-    """`y - Dᵀ (G Dᵀ)⁻¹ g`."""
+    """`y - s Uᵀ (G diag(s) Uᵀ)⁻¹ g`."""
     g, jacobian, noise = seen
     if kept.inverse is not None:
         g = jnp.where(jnp.abs(g) <= noise, 0, g)
@@ -195,14 +196,15 @@ def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Arra
         rows, multiplier = kept.rows, combined(x, kept.inverse).astype(g.dtype)
         change = combined(multiplier, rows)
     else:
-        sizes, unit = scaled_rows(jacobian)
-        rows = equations.weighted(unit) if kept.rows is None else kept.rows
+        sizes, unit = scaled_rows(equations.scaled(jacobian))
+        rows = unit if kept.rows is None else kept.rows
         # With bounds what is noise for one constraint may be needed for another.
         noise = noise / sizes if equations.clip is None else None
         gram, right = gram_matrix(unit, rows), g / sizes
         change = combined(*eliminated(gram, right, rows, noise))
         used = equations.clip is not None or equations.may_vanish
         multiplier = gram_solve(gram, right, noise) if used else right
+    change = equations.scaled(change)
     if equations.clip is not None:
         change = _length(equations, equations.clip, y, multiplier, change) * change
     # A component that nearly vanishes does so: a true zero is never small relative to itself.
@@ -210,7 +212,8 @@ def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Arra
     if equations.clip is not None:
         least = _VANISHES
     elif equations.may_vanish:  # the terms of several constraints cancel in it
-        size, least = size + combined(jnp.abs(multiplier), jnp.abs(rows)), 4 * least
+        terms = equations.scaled(combined(jnp.abs(multiplier), jnp.abs(rows)))
+        size, least = size + terms, 4 * least
     return jnp.where(jnp.abs(rest) <= least * size, 0, rest)
 
 
@@ -251,37 +254,38 @@ def project_along(
 
 @project_along.def_jvp
 def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
-    """Let `ẏ` and `ġ` be the tangents of `y = ŷ + Dᵀ λ` and of its residual at constant `λ`. Then
-    `λ̇ = -(G(y) Dᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + Dᵀ λ̇`."""
+    """Let `ẏ` and `ġ` be the tangents of `y = ŷ + s Uᵀ λ` and of its residual at constant `λ`. Then
+    `λ̇ = -(G(y) diag(s) Uᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + s Uᵀ λ̇`. The units depend
+    on the solution too, so `ẏ` includes their tangent."""
     equations, candidate, directions = primals
-    y, ok, count = project_along(*primals, max_steps=max_steps)
-
-    if directions is None:
-        _, dual = equations.linearise(candidate)
-        rows = equations.weighted(dual)
-    else:
-        dual = rows = directions
-    sizes, dual = scaled_rows(dual)
-    rows = rows / sizes[:, None]
-    along = combined(y - candidate, dual.T)
-    multiplier = gram_solve(gram_matrix(dual, rows), along) / sizes
+    solved = y, ok, _ = project_along(*primals, max_steps=max_steps)
+    # What failed is not used. Its tangent is that of the candidate, which is finite: reverse mode
+    # multiplies it by zero.
+    y = jnp.where(ok, y, candidate)
+    rows = directions
+    if rows is None:
+        rows = equations.scaled(equations.linearise(candidate)[1])
+    sizes, rows = scaled_rows(rows)
+    along = combined(in_units(y - candidate, equations.units), rows.T)
+    multiplier = gram_solve(gram_matrix(rows, rows), along) / sizes
 
     def displaced(equations: Equations, candidate: Array, directions: Array | None) -> Any:
         if directions is not None:
             moved = combined(multiplier, directions)
         else:  # by one reverse pass, not row by row
             _, vjp = jax.vjp(equations.residual, candidate)
-            moved = equations.weighted(vjp(multiplier)[0][None])[0]
+            moved = equations.scaled(vjp(multiplier)[0])
+        moved = equations.scaled(moved)
         return candidate + moved, equations.residual(candidate + moved)
 
     tangent = eqx.filter_jvp(displaced, primals, tangents)[1]
     t_y, t_g = tree_tangents((y, multiplier), tangent)
     _, jacobian = equations.linearise(y)
-    heights, unit = scaled_rows(jacobian)
-    t_y = t_y - combined(*eliminated(gram_matrix(unit, rows), t_g / heights, rows))
-    # The derivative of a failed projection is not used: its step is rejected, or ends the solve.
+    heights, unit = scaled_rows(equations.scaled(jacobian))
+    change = combined(*eliminated(gram_matrix(unit, rows), t_g / heights, rows))
+    t_y = t_y - equations.scaled(change)
     factor = jnp.where(ok, certain(equations, candidate, y, jacobian, directions), 1)
-    return (y, ok, count), (lax.stop_gradient(factor) * t_y, None, None)
+    return solved, (lax.stop_gradient(factor) * t_y, None, None)
 
 
 def certain(
@@ -298,25 +302,30 @@ def certain(
     if len(jacobian) == 1:
         if directions is None:
             return one
-        lengths = jnp.linalg.norm(jacobian) * jnp.linalg.norm(directions)
-        crosses = jnp.abs(jnp.sum(jacobian * directions)) > eps ** (1 / 3) * lengths
+        gradient = equations.scaled(jacobian)
+        lengths = jnp.linalg.norm(gradient) * jnp.linalg.norm(directions)
+        crosses = jnp.abs(jnp.sum(gradient * directions)) > eps ** (1 / 3) * lengths
         return jnp.where(crosses | (lengths == 0), one, jnp.nan)
     sines = _sines(equations, jacobian)
-    size = jnp.max(jnp.abs(y), initial=0)
+    # The size of each component: where it crosses zero, how far it moves in a step, or, where that
+    # is not known, a share of the largest component.
+    motion = equations.motion
+    sizes = jnp.abs(y) + (0.1 * jnp.max(jnp.abs(y), initial=0) if motion is None else motion)
     phases = jnp.sin(jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2)
-    beside = y + _OFFSET * (jnp.abs(y) + 0.1 * size) * phases
+    beside = y + _OFFSET * sizes * phases
     dependent = _sines(equations, equations.linearise(beside)[1]) <= 64 * eps
-    amplified = jnp.linalg.norm(y - candidate) > _SHORT_CORRECTION * sines * jnp.linalg.norm(y)
+    relative_change = jnp.abs(y - candidate) / jnp.where(sizes > 0, sizes, 1)
+    amplified = jnp.max(relative_change, initial=0) > _SHORT_CORRECTION * sines
     doubtful = (sines <= eps ** (1 / 3)) | ((sines <= _SMALL_ANGLE) & amplified)
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, one)
 
 
 def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, " m"]:
     """The sine of the angle between each gradient and the span of those before, in the metric."""
-    _, unit = scaled_rows(jacobian)
-    if equations.weights is not None:
-        unit = unit * jnp.sqrt(equations.weights)[None]
+    _, unit = scaled_rows(equations.scaled(jacobian))
     columns = unit.astype(jnp.float32 if jnp.finfo(unit.dtype).bits < 32 else unit.dtype).T
     norms = jnp.linalg.norm(columns, axis=0)
     lengths = jnp.abs(jnp.diagonal(jnp.linalg.qr(columns, mode="r")))
+    # Of more constraints than unknowns those that are left over depend on the others.
+    lengths = jnp.pad(lengths, (0, norms.size - lengths.size))
     return jnp.where(norms > 0, lengths / jnp.where(norms > 0, norms, 1), 1).astype(unit.dtype)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .base import Problem, ProjectionInfo
 from .bounded import AbstractNewton, Box, project_within
-from .equations import Equations, combined, gram_matrix, gram_solve, scaled_rows
+from .equations import Equations, combined, gram_matrix, gram_solve, in_units, scaled_rows
 from .loop import certain, solve
 from .options import NEWTON_OPTIONS, option
 
@@ -83,7 +83,8 @@ class _Optimality(eqx.Module):
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         y, multiplier = jnp.split(unknowns, [self.candidate.size])
         g, vjp = jax.vjp(self.equations.residual, y)  # by one reverse pass, not row by row
-        z = self.candidate + self.equations.weighted(vjp(multiplier / self.sizes)[0][None])[0]
+        scaled = self.equations.scaled
+        z = self.candidate + scaled(scaled(vjp(multiplier / self.sizes)[0]))
         return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
 
 
@@ -100,13 +101,14 @@ def _nearest(
     n, (sizes, unit, gram, units) = y.size, _scaled(equations, y)
     if n + equations.magnitude.size > _NEAREST_MAX:
         return jnp.concatenate([y, 0 * equations.magnitude]), sizes, jnp.asarray(False), count
-    start = jnp.concatenate([y, gram_solve(gram, combined(y - candidate, unit.T))])
+    along = combined(in_units(y - candidate, equations.units), unit.T)
+    start = jnp.concatenate([y, gram_solve(gram, along)])
     optimality = dataclasses.replace(
         equations,
         parts=(_Optimality(equations, candidate, box, sizes),),
         magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-        weights=units,
+        units=units,
     )
     end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
     if box is not None:
@@ -116,13 +118,13 @@ def _nearest(
 
 
 def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, Array, Array]:
-    """The sizes of the rows of the Jacobian, the rows divided by them, their Gram matrix, and the
-    squared units of `y` and the multipliers in which no condition number depends on the user's."""
-    sizes, unit = scaled_rows(equations.linearise(y)[1])
-    gram = gram_matrix(unit, equations.weighted(unit))
-    weights = jnp.ones_like(y) if equations.weights is None else equations.weights
+    """The sizes of the rows of `G diag(s)`, the rows divided by them, their Gram matrix, and the
+    units of `y` and the multipliers in which no condition number depends on the user's."""
+    sizes, unit = scaled_rows(equations.scaled(equations.linearise(y)[1]))
+    gram = gram_matrix(unit, unit)
     lengths = jnp.diagonal(gram)
-    units = jnp.concatenate([weights, 1 / jnp.where(lengths > 0, lengths, 1)])
+    units = lax.rsqrt(jnp.where(lengths > 0, lengths, 1))
+    units = jnp.concatenate([equations.scaled(jnp.ones_like(y)), units])
     return sizes, unit, gram, units
 
 
@@ -135,15 +137,16 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     if unknowns.size > _NEAREST_MAX:
         return solved, (jnp.full_like(unknowns, jnp.nan), None, None, None)
     y = unknowns[: candidate.size]
-    _, unit, _, units = _scaled(equations, y)
+    _, _, _, units = _scaled(equations, y)
     _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right
-    columns = jnp.sqrt(jnp.where(units > 0, units, 1))
+    columns = jnp.where(units > 0, units, 1)
     rows = jnp.concatenate([columns[: y.size], sizes / columns[y.size :]])
     matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns) / rows[:, None] * columns
     tangent = -columns * _shortest(matrix, right / rows)
     # Only the nearest point has a derivative; that of a failed projection is not used.
-    doubt = jnp.where(found, certain(equations, candidate, y, unit), jnp.nan)
+    sure = certain(equations, candidate, y, equations.linearise(y)[1])
+    doubt = jnp.where(found, sure, jnp.nan)
     doubt = lax.stop_gradient(jnp.where(equations.judged(y), doubt, 1))
     return solved, (doubt * tangent, None, None, None)
 

@@ -37,11 +37,14 @@ NEWTON_OPTIONS = r"""**Arguments:**
     state, to which roundoff is proportional. Default: 16 units of roundoff of the dtype.
 - `atol`: an absolute tolerance, added to the relative one. Default: 0.
 - `max_steps`: the largest number of iterations; twice as many with bounds, or in all by `Newton`.
-- `metric`: a PyTree like the state of positive weights (masses, or $1/\text{scale}^2$), scalars or
-    arrays shaped like the leaves: distances are $\sum_k M_k (y_k - \hat y_k)^2$. An infinite weight
-    freezes its component. Default: Euclidean.
-- `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, or
-    PyTrees like the state of scalars or arrays. The result, always within the bounds, is
+- `metric`: positive weights $M_k$ (masses, or $1/\text{scale}^2$): distances are
+    $\sum_k M_k (y_k - \hat y_k)^2$. One number or array, or a PyTree of them for the parts of the
+    state, which broadcast against their leaves. An infinite weight freezes its component;
+    `metric=1.0` is the Euclidean distance in the numbers of the state. Default: in the steps of an
+    ordinary differential equation the *metric of motion*, see `ManifoldProjection`; elsewhere, as
+    in [`diffrax_conserve.project`][] and with noise, Euclidean.
+- `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, arrays
+    or PyTrees that broadcast like `metric`. The result, always within the bounds, is
     $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest such point
     of the manifold. If there is none, the projection fails. In derivatives, components at a bound
     are constant. Of a complex component both parts are bounded. Default: none.
@@ -69,29 +72,40 @@ def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | No
     return jtu.tree_map(check, metric)
 
 
-def inverse_metric(metric: PyTree[ArrayLike] | None, like: Any) -> Float[Array, " n"] | None:
-    """`M⁻¹` as a vector; an infinite weight freezes its component."""
-    remedy = "Give one weight (or an array of weights) for each leaf of the state."
-    return None if metric is None else 1 / spread("metric", metric, like, remedy)
+def units_of(metric: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
+    """The units `M^(-1/2)` of a metric, as a vector; that of an infinite weight is zero."""
+    return 1 / jnp.sqrt(spread("metric", metric, like))
 
 
-def spread(name: str, option: PyTree[ArrayLike], like: Any, remedy: str) -> Float[Array, " n"]:
-    """An option of scalars or arrays for the leaves of a state, as a vector like the state."""
-    if jtu.tree_structure(option) != jtu.tree_structure(like):
-        raise ValueError(
-            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
-            f"{jtu.tree_structure(like)}. {remedy}"
-        )
+def spread(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
+    """An option of numbers or arrays for the parts of a state, as a vector like the state."""
 
-    def spread_leaf(given: ArrayLike, leaf: Any, view: Any) -> Array:
-        if jnp.shape(given) not in ((), leaf.shape):
+    def spread_leaf(given: ArrayLike, leaf: Any) -> Any:
+        shape = jnp.shape(given)
+        try:
+            fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
+        except ValueError:
+            fits = False
+        if not fits:
             raise ValueError(
-                f"`{name}` has a leaf of shape {jnp.shape(given)} for one of shape {leaf.shape} of "
-                "the state. Give a scalar or an array of the same shape."
+                f"`{name}` has a leaf of shape {shape} for one of shape {leaf.shape} of the state. "
+                "Give a number or an array that broadcasts against it."
             )
+        view = jax.eval_shape(real_view, leaf)  # both parts of a complex component are alike
         return jnp.broadcast_to(jnp.asarray(given, view.dtype), view.shape)
 
-    return ravel(jtu.tree_map(spread_leaf, option, like, jax.eval_shape(real_view, like)))
+    def spread_part(given: ArrayLike, part: Any) -> Any:
+        return jtu.tree_map(lambda leaf: spread_leaf(given, leaf), part)
+
+    try:
+        jtu.tree_map(lambda given, part: None, option, like)
+    except ValueError as error:
+        raise ValueError(
+            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
+            f"{jtu.tree_structure(like)}. Give one number, or one number or array for each part of "
+            "the state."
+        ) from error
+    return ravel(jtu.tree_map(spread_part, option, like))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:

@@ -3,15 +3,17 @@
 import dataclasses
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
+from jaxtyping import Array
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
 from .._tree import ravel
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
-from .equations import shown_terms
+from .equations import any_lane, shown_terms
 from .newton import Newton
 from .options import check_state
 from .roundoff import hidden_scale
@@ -27,6 +29,9 @@ def project(
     projection: AbstractProjection | None = None,
 ) -> tuple[State, ProjectionInfo]:
     r"""Projects one state to the manifold $\{y : g(t, y, args) = 0\}$.
+
+    Distances are Euclidean in the numbers of the state. If its parts have different units, give
+    their scales: `project(manifold, y, projection=Newton(metric=(1 / metres**2, 1 / speed**2)))`.
 
     Use it to make an initial state consistent, or to change the values of its integrals.
 
@@ -65,26 +70,32 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    target = Target(projection, manifold, values, jnp.zeros_like(values), args, jnp.asarray(1))
-    return _projected(target, t, y)
+    hidden, direction = jnp.zeros_like(values), jnp.asarray(1)
+    return _projected(Target(projection, manifold, values, hidden, None, args, direction), t, y)
 
 
 @eqx.filter_jit
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
-    """The roundoff of a function at the candidate may be far from that at the result. So a first
-    projection finds where it is measured. If it is less at the result, success by it is none."""
-    measured = lambda y: hidden_scale(target.manifold, t, y, target.args)  # noqa: E731
-    target = dataclasses.replace(target, hidden=measured(candidate)[2])
-    near, _ = target.project(t, candidate)
-    near = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), near, candidate)
-    target = dataclasses.replace(target, hidden=measured(near)[2])
-    y, info = target.project(t, candidate)
-    value, jacobian, found = measured(y)
-    shown = jnp.abs(value) + shown_terms(jacobian, ravel(y))
-    ok = info.ok & jnp.all(target.hidden <= 2 * (shown + found))
+    """The tolerance follows the roundoff of the functions, which is measured at the candidate. At a
+    result far away it may be another: then the projection is made again with that of the result."""
+
+    def by(hidden: Array) -> tuple[Y, ProjectionInfo, Array, Array]:
+        """The projection with this roundoff, that at its result, and whether it is as large."""
+        y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
+        usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
+        value, jacobian, found = hidden_scale(target.manifold, t, usable, target.args)
+        shown = jnp.abs(value) + shown_terms(jacobian, ravel(usable))
+        return y, info, found, jnp.all(hidden <= 2 * (shown + found))
+
+    hidden = hidden_scale(target.manifold, t, candidate, target.args)[2]
+    y, info, found, measured = first = by(hidden)
+    done = info.ok & measured
+    again = lax.cond(any_lane(~done), lambda: by(found), lambda: first)
+    y, info, _, measured = jtu.tree_map(lambda a, b: jnp.where(done, a, b), first, again)
+    # Success by a roundoff that is larger than that at the result is none.
     missed = optx.RESULTS.nonlinear_max_steps_reached
-    result = optx.RESULTS.where(info.ok & ~ok, missed, info.result)
-    return y, dataclasses.replace(info, ok=ok, result=result)
+    result = optx.RESULTS.where(info.ok & ~measured, missed, info.result)
+    return y, dataclasses.replace(info, ok=info.ok & measured, result=result)
 
 
 def given_values(

@@ -104,6 +104,8 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
         tuple(it.compress(problem.equations.parts, wanted)),
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
+        units=problem.equations.units,
+        motion=problem.equations.motion,
         may_vanish=problem.equations.may_vanish,
     )
     return dataclasses.replace(problem, equations=adapted(equations, projection, problem.like))

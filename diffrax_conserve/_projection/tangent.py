@@ -26,7 +26,7 @@ from .._manifold import (
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
 from .equations import combined, eliminated, equations_of, gram_matrix, gram_solve, scaled_rows
-from .options import check_state, inverse_metric, positive_weights
+from .options import check_state, positive_weights, units_of
 from .scalars import written_out
 
 
@@ -58,8 +58,8 @@ def tangent(
 
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
     - `manifold`: a PyTree of `FirstIntegral`s, which change at their `rate`, and `Constraint`s.
-    - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][]; an infinite weight leaves its
-        component of the field unchanged.
+    - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][], but Euclidean by default; an
+        infinite weight leaves its component of the field unchanged.
     - `gain`: the decay rate, in one over time; negative for a solve backward in time.
 
     **Returns:**
@@ -139,7 +139,8 @@ class TangentField(eqx.Module):
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
-        equations = dataclasses.replace(equations, weights=inverse_metric(self.metric, y))
+        if self.metric is not None:
+            equations = dataclasses.replace(equations, units=units_of(self.metric, y))
         evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
@@ -149,10 +150,10 @@ class TangentField(eqx.Module):
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             vector, wrong = given
             _, jacobian = equations.linearise(vector)
-            sizes, unit = scaled_rows(jacobian)
-            rows = equations.weighted(unit)
-            gram, right = gram_matrix(unit, rows), wrong / sizes
-            return combined(*eliminated(gram, right, rows)), gram_solve(gram, right) / sizes
+            sizes, rows = scaled_rows(equations.scaled(jacobian))
+            gram, right = gram_matrix(rows, rows), wrong / sizes
+            change = equations.scaled(combined(*eliminated(gram, right, rows)))
+            return change, gram_solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)

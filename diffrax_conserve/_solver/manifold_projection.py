@@ -5,20 +5,32 @@ from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._balance import has_rates
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
-from .._manifold import FirstIntegral, check_manifold, conserved_values, named_entries
+from .._manifold import Constraint, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
 from .._projection.base import AbstractProjection, Target, check_projection, has_bounds
+from .._projection.equations import any_lane, length
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
+from .._tree import ravel, tree_sub
 from .diffrax_private import member
-from .state import FIRST, ProjectionStatistics, State, started, verdict
+from .state import (
+    FIRST,
+    ProjectionStatistics,
+    State,
+    cause_of_failure,
+    is_final,
+    moved,
+    started,
+    violated,
+)
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 
 
@@ -39,6 +51,16 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     carried in the solver state: the drift does not grow with the number of steps, and a solve that
     continues from a `solver_state` keeps the original values.
 
+    **The metric of motion.** A candidate is moved to the manifold along the gradients of the
+    functions, and the metric shares out the correction among the components. By default the unit of
+    a component is its largest change in one step of this solve so far, $M = \mathrm{diag}(1/s^2)$,
+    $s_k = \max |\hat y_k - y_k|$: local errors are proportional to how fast a component moves, and
+    the correction is shared out as they are. So the result does not depend on the units of the
+    state. A component that never moves, such as a parameter, is never corrected. Stochastic
+    equations have the Euclidean metric in the numbers of the state, because there the metric
+    decides which equation is solved: for mixed units pass
+    `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`. `metric=1.0` is Euclidean.
+
     Conserving one integral is not always better than none: see "Choosing a projection". The
     projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
     the next step is evaluated again at the projected state; implicit methods keep it.
@@ -49,11 +71,13 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
-    terms: find a consistent state by [`diffrax_conserve.project`][].
+    terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise after a jump
+    that the step size controller declares, if the constraint jumps too: end the solve there,
+    `project`, and go on.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
-    an adaptive solve tries smaller steps until one is short beside the state, and accurate by its
-    error estimate; then it ends. A solve with fixed steps ends at once. The last state is NaN; the
+    an adaptive solve tries smaller steps until one moves the state by no more than roundoff, or no
+    time passes; then it ends. A solve with fixed steps ends at once. The last state is NaN; the
     `diffrax.RESULTS` tells the cause, [`diffrax_conserve.statistics`][] the entry of the manifold.
 
     !!! example
@@ -77,7 +101,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
     manifold: Manifold
     projection: AbstractProjection = option(SimplifiedNewton())
-    max_correction: RealScalarLike | None = option(0.5)
+    max_correction: RealScalarLike | None = option(None)
     every: int = option(1, static=True)
 
     def __check_init__(self):
@@ -140,15 +164,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         t = t0 * time_direction(terms, t0)
         check_state(y0, kind=jnp.inexact)
         values = conserved_values(self.manifold, t, y0, args)
-        values, hidden = started(self.manifold, values, t, y0, args)
-        given = any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold))
+        values, hidden = started(values, self.manifold, t, y0, args)
         return State(
             inner=self.solver.init(terms, t0, t1, y0, args),
             values=values,
             hidden=hidden,
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
+            motion=moved(y0, y0),
+            first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
-            is_first=jnp.asarray(True) if given and self._limit(terms) is not None else None,
             statistics=ProjectionStatistics.zero(values.dtype),
         )
 
@@ -167,49 +191,87 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         # the projected state amplifies the error of the root finder of an implicit method;
         # `QUICSORT` keeps none, and cannot be told of a jump.
         keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
-        made_jump = made_jump if keeps else True
         state = solver_state
         candidate, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, state.inner, made_jump
+            terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
         )
-        conserved = state.values, state.hidden, args, time_direction(terms, t1), state.gained
-        start = Target(self.projection, self.manifold, *conserved).following(t0, y0)
+        change = moved(y0, candidate)
+        motion = jnp.maximum(state.motion, change)
+        start = self._target(terms, t1, state, motion, candidate, args).following(t0, y0)
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
-        states, limit = (y0, candidate, y1), self._limit(terms)
-        failed, hopeless = verdict(info.ok, state, (t0, t1), states, error, limit)
+        units, cannot_start = start.units(y0), self._cannot_start(start, state, t0, y0, made_jump)
+        states = y0, candidate, y1
+        failed = cause_of_failure(info.ok, cannot_start, states, units, self.max_correction)
+        final = cannot_start | is_final(state, t0, t1, change, candidate)
+        statistics = state.statistics.add(
+            info, due, None if error is None else length(ravel(error), units)
+        )
         # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
         y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
             inner=dense_info,
-            ends=(y0, y1),
+            shift=tree_sub(y1, candidate),
             error=None if step is None else error,
             target=PackedTarget(start),
             due=due,
         )
-        # A huge error makes an adaptive solve try a smaller step; a step without hope is accepted,
-        # and its result ends the solve. The norm of an infinite complex number is NaN.
-        shown = jnp.where(hopeless, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
+        # A huge error makes an adaptive solve try a smaller step. A failure that is final is
+        # accepted, and its result ends the solve. The norm of an infinite complex number is NaN.
+        shown = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
         error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
-        state = state.next(info, due, inner=inner, gained=target.gained)
+        state = state.next(inner=inner, gained=target.gained, motion=motion, statistics=statistics)
         return y1, error, dense_info, state, result
 
-    def _limit(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
-        """`max_correction` for the steps since the last projection, where it applies: not to
-        constraints, whose correction may do all the work of a step, nor to noise or a network,
-        which may leave the manifold as fast as they move."""
-        integrals = all(isinstance(x, FirstIntegral) for _, x in named_entries(self.manifold))
-        evaluated = getattr(innermost(self.solver), "evaluates_vector_field", True)
-        if self.max_correction is None or not (integrals and evaluated and is_ode(terms)):
-            return None
-        return self.max_correction * self.every
+    def _target(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t: RealScalarLike,
+        state: State,
+        motion: Float[Array, " n"],
+        candidate: Y,
+        args: Args,
+    ) -> Target:
+        """The target of a step. Noise has no metric of motion: with noise the metric decides which
+        equation is solved, and that must not depend on the path."""
+        size = jnp.abs(ravel(candidate))
+        least = float(jnp.finfo(size.dtype).eps) ** 0.5 * size
+        return Target(
+            self.projection,
+            self.manifold,
+            state.values,
+            state.hidden,
+            jnp.maximum(motion, least) if is_ode(terms) else None,
+            args,
+            time_direction(terms, t),
+            state.gained,
+        )
+
+    def _cannot_start(
+        self, target: Target, state: State, t0: RealScalarLike, y0: Y, made_jump: BoolScalarLike
+    ) -> Bool[Array, ""]:
+        """Whether a conserved value is not finite, or a step starts off a `Constraint` where
+        nothing has projected its state: at the first step, and after a jump of the vector field,
+        with which the constraint may jump."""
+        lost = ~jnp.all(jnp.isfinite(state.values))
+        if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
+            return lost
+        first = jnp.all(state.motion == 0)
+        fresh = first if self.every > 1 else first | made_jump
+        equations = target.equations(t0, y0)
+        off = lax.cond(
+            any_lane(fresh),
+            lambda: violated(equations, self.manifold, ravel(y0)),
+            lambda: jnp.asarray(False),
+        )
+        return lost | (fresh & off)
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
@@ -217,13 +279,11 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
 - `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Staged`, or your own.
-- `max_correction`: a projection to first integrals fails if it moves the candidate by as much as
-    this times the distance covered by the step, each the sum over the components. A component may
-    always change by $\sqrt\varepsilon$ of itself. Corrections are of the size of the local error:
-    one as long as half a step tells that the quantity is not conserved, or that the state jumped to
-    another part of the manifold. `every` multiplies the limit. It does not apply with a
-    `Constraint`, whose correction may do all the work of a step, to stochastic equations, to
-    learned solvers, and to the first projection to a given `value`. `None` is no limit.
+- `max_correction`: a projection fails if its correction is longer than this share of its step, both
+    in the metric of the projection. A component that hardly moves counts as moving by
+    $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
+    manifold; whether a quantity is conserved at all is told by
+    [`diffrax_conserve.check_invariance`][]. Default: no limit.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 

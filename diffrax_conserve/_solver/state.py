@@ -1,11 +1,12 @@
-"""The solver state of a `ManifoldProjection`, how it starts, and the verdict on a step: whether its
-projection failed, why, and whether it can be saved."""
+"""The solver state of a `ManifoldProjection`, and how a step fails: why, and whether a shorter step
+could be better."""
 
 import dataclasses
 from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -16,8 +17,9 @@ from .._manifold import Constraint, is_entry
 from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
+from .._projection.equations import Equations, length, reach
 from .._projection.roundoff import hidden_scale
-from .._tree import ravel, tree_size
+from .._tree import ravel
 from .diffrax_private import register
 
 _SMALLER = (
@@ -28,23 +30,30 @@ _ENTRY = (
     "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
 )
 FIRST = register(
-    "the solve cannot start: the initial state violates a `Constraint`, or a function of the "
-    "manifold is not finite there. Start on the manifold: "
-    "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`. " + _ENTRY,
+    "a step cannot start: its state violates a `Constraint`, or a function of the manifold is not "
+    "finite there. At the start of a solve, start on the manifold: "
+    "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`; a quantity that keeps "
+    "the value that it has at the start is a `FirstIntegral`. After a jump of the vector field end "
+    "the solve there, `project`, and go on. " + _ENTRY,
     "the projection of a step failed: the state that the wrapped solver proposed is not finite, or "
     "a function of the manifold there, or the iteration diverged. Check the vector field and `fn`. "
     + _SMALLER
     + _ENTRY,
-    "the projection of a step failed: the correction moved the state further than `max_correction` "
-    "allows. Perhaps the quantity is not conserved at all, which `check_invariance` tells, or the "
-    "state jumped to another part of the manifold. Take smaller steps, or pass another "
-    "`max_correction`.",
+    "the projection of a step failed: the correction is a larger share of the step than "
+    "`max_correction` allows. Check by `check_invariance` that the quantity is conserved at all, "
+    "take smaller steps, or pass another `max_correction`.",
     "the projection of a step failed: the manifold was not reached. " + _SMALLER + "If it is, the "
     "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
     "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
 )
 # The causes of a failure, in the order of their messages.
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
+# By fewer units of roundoff a component moves by the rounding of a few stages, and a time by that
+# of a few additions.
+_AT_ROUNDOFF, _INSTANT = 64, 8
+# Corrections are shorter than the error estimate of their step, which is that of a method of lower
+# order. Where they are this many times as long, the quantity is probably not conserved.
+_SUSPICIOUS = 10
 
 
 @final
@@ -57,6 +66,8 @@ class ProjectionStatistics(eqx.Module):
     - `num_iterations`, `max_iterations`: the number of iterations of all, and the largest of one.
     - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in
         [`diffrax_conserve.ProjectionInfo`][].
+    - `error`: the largest error estimate of the wrapped solver, in the metric of `correction`; NaN
+        if it has none. Corrections that are much longer tell that a quantity is not conserved.
     - `worst`: the position of the entry of the manifold that failed last, as
         [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
     """
@@ -68,12 +79,13 @@ class ProjectionStatistics(eqx.Module):
     residual_after: Float[Array, "..."]
     correction: Float[Array, "..."]
     roundoff: Float[Array, "..."]
+    error: Float[Array, "..."]
     worst: Int[Array, "..."]
 
     @classmethod
     def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
         count, size = jnp.asarray(0), jnp.zeros((), dtype)
-        return cls(count, count, count, size, size, size, size, jnp.asarray(-1))
+        return cls(count, count, count, size, size, size, size, size * jnp.nan, jnp.asarray(-1))
 
     def __str__(self) -> str:
         if is_traced(self):
@@ -81,9 +93,17 @@ class ProjectionStatistics(eqx.Module):
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         if np.all(np.asarray(self.worst) < 0):
             del rows["worst"]
-        return printed("projections of the accepted steps", rows)
+        text = printed("projections of the accepted steps", rows)
+        if np.any(np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)):
+            text += (
+                "\nCorrections are far longer than the error estimates of the steps explain:"
+                "\ncheck by `check_invariance` that the quantities are conserved."
+            )
+        return text
 
-    def add(self, info: ProjectionInfo, due: Array | None) -> "ProjectionStatistics":
+    def add(
+        self, info: ProjectionInfo, due: Array | None, error: Array | None
+    ) -> "ProjectionStatistics":
         return ProjectionStatistics(
             self.num_projections + (1 if due is None else due.astype(int)),
             self.num_iterations + info.num_steps,
@@ -92,6 +112,7 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.residual_after, info.residual_after),
             jnp.maximum(self.correction, info.correction),
             jnp.maximum(self.roundoff, info.roundoff),
+            self.error if error is None else jnp.fmax(self.error, error),
             jnp.where(info.ok, self.worst, info.worst),
         )
 
@@ -137,78 +158,88 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 class State(eqx.Module):
     """What later steps need.
 
-    - `values`, `hidden`, `gained`: as in a `Target`; a value is NaN if the solve cannot start.
+    - `values`, `hidden`, `gained`: as in a `Target`.
+    - `motion`: the largest change of each component in one step so far, zero before the first.
+    - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
-    - `is_first`: whether no step was made yet, if the first one may have to reach a given `value`.
     """
 
     inner: Any
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
     gained: Float[Array, "2 m"] | None
+    motion: Float[Array, " n"]
+    first_step: RealScalarLike
     num_steps: Int[Array, ""] | None
-    is_first: Bool[Array, ""] | None
     statistics: ProjectionStatistics
 
-    def next(self, info: ProjectionInfo, due: Array | None, **fields: Any) -> "State":
+    def next(self, **fields: Any) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
-        idle = False if due is None else ~due
-        is_first = None if self.is_first is None else self.is_first & idle
-        fields |= dict(num_steps=num_steps, is_first=is_first)
-        return dataclasses.replace(self, statistics=self.statistics.add(info, due), **fields)
+        return dataclasses.replace(self, num_steps=num_steps, **fields)
+
+
+def moved(start: Y, end: Y) -> Float[Array, " n"]:
+    """How far each component moves; both parts of a complex one as far as that does."""
+
+    def distance(a: Array, b: Array) -> Array:
+        length = jnp.abs(b - a)
+        return lax.complex(length, length) if jnp.iscomplexobj(a) else length
+
+    return ravel(jtu.tree_map(distance, start, end))
 
 
 def started(
-    manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
+    values: Values, manifold: Manifold, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """The conserved values, NaN for a `Constraint` that the initial state violates, and the part of
-    their scales that the gradients do not show."""
-    g, jacobian, hidden = hidden_scale(manifold, t, y, args)
-    numbers = ravel(values).astype(g.dtype)
-    entries, treedef = jtu.tree_flatten(manifold, is_leaf=is_entry)
-    sizes = [tree_size(part) for part in treedef.flatten_up_to(values)]
-    must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], sizes)
-    if must_hold.any():
-        # A constraint on a component that is zero up to roundoff has a scale too.
-        terms = jnp.sum(jnp.abs(jacobian), axis=1) * jnp.max(jnp.abs(ravel(y)), initial=0)
-        limit = float(jnp.finfo(g.dtype).eps) ** 0.5 * (hidden + terms)
-        numbers = jnp.where(must_hold & ~(jnp.abs(g) <= limit), jnp.nan, numbers)
-    return numbers, hidden
+    """The conserved values, and the part of their scales that the gradients do not show."""
+    _, _, hidden = hidden_scale(manifold, t, y, args)
+    return ravel(values).astype(hidden.dtype), hidden
 
 
-def verdict(
+def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
+    """Whether a state violates a `Constraint` by more than the root of roundoff, relative to its
+    terms and to their changes in a step. The changes count because all terms may be roundoff, as
+    those of `q v = 0` where a pendulum passes a horizontal position."""
+    g, jacobian = equations.linearise(y)
+    sizes = jnp.abs(y) if equations.motion is None else jnp.abs(y) + equations.motion
+    limit = jnp.sum(jnp.abs(jacobian) * sizes, axis=1) + equations.hidden
+    limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * limit
+    entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
+    counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
+    must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], counts)
+    return jnp.any(must_hold & ~(jnp.abs(g) <= limit))
+
+
+def cause_of_failure(
     ok: Bool[Array, ""],
-    state: State,
-    times: tuple[RealScalarLike, RealScalarLike],
+    cannot_start: Bool[Array, ""],
     states: tuple[Y, Y, Y],
-    error: Y | None,
+    units: Float[Array, " n"] | None,
     max_correction: RealScalarLike | None,
-) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """The cause of the failure of a step, 0 if it succeeded, and whether a failure is final. The
-    `states` are the last one, the candidate, of which there may be an estimate of its `error`, and
-    the result."""
+) -> Int[Array, ""]:
+    """Why a step failed, 0 if it did not. The `states` are the last one, the candidate and the
+    result of its projection."""
     last, candidate, result = (ravel(y) for y in states)
-    info = jnp.finfo(candidate.dtype)
-    moved, correction = jnp.abs(candidate - last), jnp.abs(result - candidate)
-    size = jnp.abs(candidate)
-    # A little less, so that a correction of exactly this share is too long, whatever is rounded.
-    share = 0 if max_correction is None else jnp.asarray(0.999 * max_correction, info.dtype)
-    share = jnp.minimum(share, float(info.max))  # infinity times zero is NaN
-    # One sum is one kernel. In any step a component may change by the root of roundoff, as roundoff
-    # alone moves the state where gradients are nearly parallel.
-    excess = jnp.sum(correction - jnp.maximum(share * moved, float(info.eps) ** 0.5 * size))
-    cause = jnp.where(ok, 0, jnp.where(excess < jnp.inf, _NOT_REACHED, _NOT_FINITE))
+    correction = result - candidate
+    finite = jnp.abs(jnp.sum(correction)) < jnp.inf  # one sum is one kernel
+    cause = jnp.where(ok, 0, jnp.where(finite, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
-        too_far = ok & ~(excess <= 0)
-        too_far = too_far if state.is_first is None else too_far & ~state.is_first
-        cause = jnp.where(too_far, _TOO_FAR, cause)
-    lost = jnp.any(jnp.isnan(state.values))
-    cause = jnp.where(lost, _START, cause)
-    t0, t1 = times
-    instant = jnp.abs(t1 - t0) <= 8 * jnp.finfo(jnp.result_type(t1)).eps * jnp.abs(t1)
-    # A shorter step is not better where this one is short, and accurate in each component.
-    errors = jnp.zeros_like(moved) if error is None else jnp.abs(ravel(error))
-    allowed = jnp.where(256 * errors <= moved, 1e-2 * size, -jnp.inf)
-    short = jnp.where(cause == _TOO_FAR, jnp.sum(moved - allowed) <= 0, jnp.all(moved <= allowed))
-    roundoff = jnp.sum(moved - 64 * float(info.eps) * size) <= 0
-    return cause, short | roundoff | instant | lost
+        limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, units)
+        cause = jnp.where(ok & (length(correction, units) > limit), _TOO_FAR, cause)
+    return jnp.where(cannot_start, _START, cause)
+
+
+def is_final(
+    state: State, t0: RealScalarLike, t1: RealScalarLike, moved: Array, candidate: Y
+) -> Bool[Array, ""]:
+    """Whether a step that failed is so short that no shorter one is better.
+
+    diffrax forgets the solver state of a step that it rejects. So nothing can count attempts, and
+    that a solve is hopeless must be seen from the step alone: it moves each component by no more
+    than roundoff, or no time passes. Time is measured by the first step too, because many solves
+    start at zero, beside which every step is long.
+    """
+    size = jnp.abs(ravel(candidate))
+    still = jnp.all(moved <= _AT_ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size)
+    instant = _INSTANT * float(jnp.finfo(jnp.result_type(t1)).eps)
+    return still | (jnp.abs(t1 - t0) <= instant * jnp.maximum(jnp.abs(t1), state.first_step))
