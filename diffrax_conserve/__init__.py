@@ -9,7 +9,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
-What is conserved    FirstIntegral, Constraint, check_invariance, drift
+What is conserved    FirstIntegral, Constraint, check_invariance, drift, off_manifold
 Solvers              ManifoldProjection, RK4, Unrolled, statistics
 Projections          SimplifiedNewton, Newton, ClosedForm, Directional, Staged, project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
@@ -26,6 +26,7 @@ from ._diagnostics.check_invariance import InvarianceEntry as InvarianceEntry
 from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
+from ._diagnostics.drift import off_manifold as off_manifold
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name

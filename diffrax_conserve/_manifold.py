@@ -54,7 +54,10 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 - `fn`: a callable `fn(t, y, args)` (a function or an [`equinox.Module`][], whose arrays can then
     be differentiated) that returns a PyTree of real arrays. Every element is one first integral. It
     is differentiated in reverse mode, in which JAX has no `while_loop`.
-- `value`: the value of `fn` at the start of a solve. Default: that of the initial state.
+- `value`: the value of `fn` at the start of a solve. Default: that of the initial state. A state
+    that has another one is moved there by the first projection of the solve, with the smallest
+    relative change of its components unless the projection has a `metric`. To choose where it
+    lands, start from `diffrax_conserve.project(manifold, y0, projection=...)`.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt = \partial_t I + \nabla I \cdot f$ along
     the exact solution, like what `fn` returns. Default: zero.
 """

@@ -42,8 +42,8 @@ class InvarianceEntry:
 
     `kind` is "first integral", "balance" or "constraint"; `defect` is the largest relative defect,
     at the state with the index `state`. `is_constant` tells that the gradient is zero at every
-    state: such a function is conserved by any field. `is_tested` is false where the gradient is not
-    zero, but all terms of the derivative are, at every state: then nothing is known, and `ok` is
+    state: such a function is conserved by any field. `is_tested` is false if all terms of
+    the derivative are zero at every state, but not beside it: then nothing is known, and `ok` is
     false.
     """
 
@@ -212,8 +212,17 @@ def _relative_sizes(
         along = Along(entry.fn, vector_field)(t, unravel(vector, y), args)
         return ravel(along).astype(dtype) - rate
 
-    slope = ravel(slope_like(y, vector_field(t, y, args)))
-    terms = jnp.sum(jnp.abs(jacobian * slope), axis=1) + jnp.abs(partial) + jnp.abs(rate)
+    def terms_at(vector: Array, jacobian: Array) -> Array:
+        state = unravel(vector, y)
+        slope = ravel(slope_like(state, vector_field(t, state, args)))
+        return jnp.sum(jnp.abs(jacobian * slope), axis=1) + jnp.abs(partial) + jnp.abs(rate)
+
+    terms = terms_at(vector, jacobian)
+    # Where each term is zero nothing is tested, unless that is so beside the state too, as it is of
+    # a parameter among the components.
+    sizes = 0.1 * (jnp.abs(vector) + jnp.max(jnp.abs(vector), initial=0))
+    beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
+    idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field.
     _, _, hidden = hidden_terms(excess, vector)
     terms = jnp.where(hidden > 4 * terms, hidden, terms)
@@ -223,8 +232,7 @@ def _relative_sizes(
     if isinstance(entry, Constraint):
         violation = relative(residual, equations.scale(jacobian, vector))
     defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
-    constant = jnp.all(jacobian == 0, axis=1) & (partial == 0)
-    return defect, violation, jnp.all(constant), (terms == 0) & ~constant
+    return defect, violation, jnp.all(jacobian == 0) & jnp.all(partial == 0), idle
 
 
 def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:

@@ -1,4 +1,4 @@
-"""The drift of a solution from a manifold."""
+"""The drift of a solution from a manifold, and which of its states are off."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from .._balance import has_rates, integrated_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
@@ -21,8 +21,9 @@ from .._manifold import (
     named_entries,
 )
 from .._options import check_solution
-from .._projection.equations import measure, relative
-from .._tree import tree_add, tree_shapes, tree_sub
+from .._projection.equations import ROUNDOFF_MULTIPLE, measure, relative, shown_terms
+from .._projection.roundoff import hidden_scale
+from .._tree import ravel, tree_add, tree_shapes, tree_sub
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -74,28 +75,92 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         4e-08
         ```
     """
-    check_solution(sol, "drift")
+    values, residual = _residuals(sol, manifold, args, "drift")
+    t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
+    _, scale = measure(manifold, values, t0, y0, args)
+    return jax.vmap(lambda t, y: relative(residual(t, y), scale))(sol.ts, sol.ys)
+
+
+def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bool[Array, " times"]:
+    r"""Whether a saved state is not on the manifold, for each saved time.
+
+    At a saved time inside a very long step the interpolation of the wrapped solver may be so
+    inaccurate that it cannot be projected. Then the saved state is that of the interpolation, off
+    the manifold by its error, which [`diffrax_conserve.drift`][] shows. A state counts as on the
+    manifold if each residual is within 32 units of roundoff of the size of its terms there.
+
+    **Arguments:**
+
+    - `sol`, `manifold`, `args`: as of [`diffrax_conserve.drift`][].
+
+    **Returns:**
+
+    An array of booleans, one for each saved time; its sum is the number of such states.
+
+    **Raises:**
+
+    As [`diffrax_conserve.drift`][].
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+        saveat = diffrax.SaveAt(ts=jnp.linspace(0, 9, 100))
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, jnp.array([1.0, 0.0]), saveat=saveat)
+        print(jnp.sum(dfc.off_manifold(sol, square)))
+        ```
+
+        ```text
+        0
+        ```
+    """
+    values, residual = _residuals(sol, manifold, args, "off_manifold")
+    numbers = jnp.abs(ravel(values))
+
+    def at(t: Array, y: Y) -> Array:
+        g = ravel(residual(t, y))
+        _, jacobian, hidden = hidden_scale(manifold, t, y, args)
+        scale = numbers + shown_terms(jacobian, ravel(y)) + hidden
+        limit = 2 * ROUNDOFF_MULTIPLE * float(jnp.finfo(g.dtype).eps) * scale
+        return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
+
+    return jax.vmap(at)(sol.ts, sol.ys)
+
+
+def _residuals(
+    sol: dfx.Solution, manifold: Manifold, args: Args, user: str
+) -> tuple[Values, Callable[[Array, Y], Values]]:
+    """The conserved values at the start of a solve, and the residuals as a function of a saved time
+    and state, zero where diffrax padded them. Raises unless `sol` has what they need."""
+    check_solution(sol, user)
     check_manifold(manifold)
     if sol.ts is None or sol.ys is None:
         raise ValueError(
-            "`drift` needs saved states, but `sol` holds none. Save some, for example with "
+            f"`{user}` needs saved states, but `sol` holds none. Save some, for example with "
             "`saveat=SaveAt(t0=True, steps=True)`."
         )
     if not eqx.is_array(sol.ts):
         raise ValueError(
-            "`sol` was saved by `SaveAt(subs=...)`, but `drift` takes the times and states of one "
-            "of them: write `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
+            f"`sol` was saved by `SaveAt(subs=...)`, but `{user}` takes the times and states of "
+            "one of them: write `dataclasses.replace(sol, ts=sol.ts[0], ys=sol.ys[0])`."
         )
     if sol.ts.ndim != 1:
         raise ValueError(
-            f"`drift` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch write "
-            "`jax.vmap(lambda s: drift(s, manifold, args))(sol)`."
+            f"`{user}` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch "
+            f"write `jax.vmap(lambda s: {user}(s, manifold, args))(sol)`."
         )
     for name, entry in named_entries(manifold):
         if sol.ts.size == 1 and not has_value(entry):
             raise ValueError(
-                f"`sol` holds one saved state, so the drift of `{name}` is unknown. Save the first "
-                "one too, by `SaveAt(t0=True, t1=True)`, or write `FirstIntegral(fn, value=...)`."
+                f"`sol` holds one saved state, so the value that `{name}` had is unknown. Save the "
+                "first one too, by `SaveAt(t0=True, t1=True)`, or write "
+                "`FirstIntegral(fn, value=...)`."
             )
     t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
     if sol.interpolation is not None:
@@ -112,7 +177,6 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
             "`manifold` cannot be evaluated at the saved states. Pass the `args` of the solve, "
             "which a solution does not keep. Save the states themselves, without `SaveAt(fn=...)`."
         ) from error
-    _, scale = measure(manifold, values, t0, y0, args)
     gained = _gained(sol, manifold, args, values)
 
     # The rates are integrated from the start of the solve, at which a given `value` holds.
@@ -121,13 +185,13 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     values = jtu.tree_map(at_start, manifold, values, gained(t0), is_leaf=is_entry)
 
-    def at(t: Array, y: Y) -> Values:
+    def residual(t: Array, y: Y) -> Values:
         padded = jnp.isinf(t)
         t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), (t, y), (t0, y0))
-        residual = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
-        return relative(jtu.tree_map(lambda x: jnp.where(padded, 0, x), residual), scale)
+        found = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
+        return jtu.tree_map(lambda x: jnp.where(padded, 0, x), found)
 
-    return jax.vmap(at)(sol.ts, sol.ys)
+    return values, residual
 
 
 def _gained(

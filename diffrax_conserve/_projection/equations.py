@@ -110,7 +110,7 @@ class Equations(eqx.Module):
     def scaled(self, x: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         """Each component times its unit: `G diag(s)` of a Jacobian, and the correction `s Uᵀ λ` of
         a combination `Uᵀ λ` of its rows `U`."""
-        return x if self.units is None else x * self.units
+        return x if self.units is None else x * jnp.broadcast_to(self.units, x.shape)
 
 
 def in_units(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, " n"]:

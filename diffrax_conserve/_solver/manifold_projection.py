@@ -243,6 +243,11 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         equation is solved, and that must not depend on the path."""
         size = jnp.abs(ravel(candidate))
         least = float(jnp.finfo(size.dtype).eps) ** 0.5 * size
+        if any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold)):
+            # The first projection to a given value corrects no error of the step. So it does not
+            # follow the motion, which at a turning point depends on the length of the step, but
+            # makes the smallest relative change of the components.
+            least = jnp.where(state.statistics.num_projections == 0, size, least)
         return Target(
             self.projection,
             self.manifold,

@@ -6,7 +6,6 @@ from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -179,13 +178,8 @@ class State(eqx.Module):
 
 
 def moved(start: Y, end: Y) -> Float[Array, " n"]:
-    """How far each component moves; both parts of a complex one as far as that does."""
-
-    def distance(a: Array, b: Array) -> Array:
-        length = jnp.abs(b - a)
-        return lax.complex(length, length) if jnp.iscomplexobj(a) else length
-
-    return ravel(jtu.tree_map(distance, start, end))
+    """How far each component moves."""
+    return jnp.abs(ravel(end) - ravel(start))
 
 
 def started(

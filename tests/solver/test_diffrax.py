@@ -56,7 +56,8 @@ def test_backsolve_adjoint_explains():
 def test_gradient_with_respect_to_conserved_value_end_time_and_what_is_closed_over():
     def loss(value, t1, k):
         integral = dfc.FirstIntegral(lambda t, y, args: k * jnp.sum(y**2), value=k * value)
-        solver = dfc.ManifoldProjection(dfc.RK4(), integral)
+        nearest = dfc.SimplifiedNewton(metric=1.0)
+        solver = dfc.ManifoldProjection(dfc.RK4(), integral, projection=nearest)
         y0 = jnp.array([1.0, 0.0])
         sol = solve(lambda t, y, args: k * rotation(t, y, args), solver, y0, t1=t1, dt0=0.05)
         return sol.ys[-1, 0]
