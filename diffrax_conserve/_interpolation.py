@@ -17,16 +17,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.base import Target, has_bounds
-from ._projection.equations import any_lane, length, reach
-from ._projection.loop import solve
+from ._projection.base import Target
+from ._projection.equations import length
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
-
-# The largest number of damped steps.
-_DAMPED_STEPS = 100
 
 
 @final
@@ -51,8 +47,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     The interpolant `u` of the wrapped solver ends at the candidate `ŷ₁`. It is moved so that it
     meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
-    a step is. Where that fails, damped steps with fresh gradients are tried from the same state.
-    Where they fail too, or lead further away than the step is long, the value is the moved
+    a step is. Where that fails, or leads further away than the step is long, the value is the moved
     interpolant itself, which is off the manifold by the error of the interpolation.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
@@ -62,6 +57,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
     shift: Y
+    limit: Float[Array, ""]
     error: Y | None
     target: PackedTarget
     due: Bool[Array, ""] | None
@@ -72,7 +68,12 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        return _evaluated(t0, self, left=left)
+        # Arrays over which the functions of the manifold close become leaves.
+        projected, moved = (
+            eqx.filter_closure_convert(ft.partial(fn, left=left), t0)
+            for fn in (self.projected, self.moved)
+        )
+        return _evaluated(projected, moved, t0)
 
     def moved(self, t: RealScalarLike, left: bool) -> Y:
         """The interpolant of the wrapped solver, which meets the projected states at both ends."""
@@ -87,51 +88,42 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(move, self.inner.evaluate(t, left=left), self.shift)
 
     def projected(self, t: RealScalarLike, left: bool) -> Y:
-        start, end, candidate = (self.moved(t, left) for t in (self.t0, self.t1, t))
+        candidate = self.moved(t, left)
         target = self.target.unpack().advanced(self.t0, t, self.inner.evaluate)
+        start = lambda: self.inner.evaluate(self.t0)  # noqa: E731
         step = target.step(self.t0, self.t1, start, self.error)
         problem = target.problem(t, candidate, step)
-        units = problem.equations.units
-        limit = lax.stop_gradient(reach(ravel(start), ravel(end), units))
+        units, limit = problem.equations.units, lax.stop_gradient(self.limit)
 
-        def by(damped: bool) -> Callable[..., Any]:
-            def project(candidate: Array) -> tuple[Array, Array]:
-                if damped:
-                    given = problem.equations, candidate
-                    y, ok, _ = solve(*given, max_steps=_DAMPED_STEPS, fresh=True, damped=True)
-                else:
-                    y, info = target.projection.solve(problem, candidate)
-                    ok = info.ok
-                return y, ok & (length(y - candidate, units) <= limit)
+        def project(candidate: Array) -> tuple[Array, Array]:
+            y, info = target.projection.solve(problem, candidate)
+            return y, info.ok & (length(y - candidate, units) <= limit)
 
-            # Arrays over which the functions of the manifold close become leaves.
-            return eqx.filter_closure_convert(project, ravel(candidate))
-
-        bounded = has_bounds(target.projection)  # damped steps keep no bounds
-        y, _ = _nearby(by(False), None if bounded else by(True), ravel(candidate))
-        y = problem.state(y)
-        due = self.due
+        vector = ravel(candidate)
+        y, _ = _projected(eqx.filter_closure_convert(project, vector), vector)
+        y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
 
 @eqx.filter_custom_jvp
-def _evaluated(t: RealScalarLike, path: ManifoldInterpolation, *, left: bool) -> Y:
-    return path.projected(t, left)
+def _evaluated(
+    projected: Callable[[Array], Y], moved: Callable[[Array], Y], t: RealScalarLike
+) -> Y:
+    del moved
+    return projected(t)
 
 
 @_evaluated.def_jvp
-def _evaluated_jvp(primals: Any, tangents: Any, *, left: bool) -> Any:
+def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
     """The slope in time is that of the projected interpolant. Where this is not certain, as on a
-    circular orbit, it is that of the interpolant itself: the root finder of an event needs a slope,
+    circular orbit, it is that of the moved interpolant: the root finder of an event needs a slope,
     but not an exact one. A derivative in anything else is exact or NaN."""
-    (t, path), (t_t, t_path) = primals, tangents
-    y = _evaluated(t, path, left=left)
-    _, t_y = eqx.filter_jvp(lambda path: path.projected(t, left), (path,), (t_path,))
+    (projected, moved, t), (t_projected, _, t_t) = primals, tangents
+    y = projected(t)
+    _, t_y = eqx.filter_jvp(lambda fn: fn(t), (projected,), (t_projected,))
     t_y = tree_tangents(y, t_y)
     if t_t is not None:
-        one = (jnp.ones_like(t),)
-        _, slope = jax.jvp(lambda t: path.projected(t, left), (t,), one)
-        _, other = jax.jvp(lambda t: path.moved(t, left), (t,), one)
+        slope, other = (jax.jvp(fn, (t,), (jnp.ones_like(t),))[1] for fn in (projected, moved))
         certain = tree_all_finite(slope)
         slope = jtu.tree_map(ft.partial(jnp.where, certain), slope, other)
         t_y = jtu.tree_map(lambda x, s: x + s * t_t.astype(s.real.dtype), t_y, slope)
@@ -139,34 +131,20 @@ def _evaluated_jvp(primals: Any, tangents: Any, *, left: bool) -> Any:
 
 
 @eqx.filter_custom_jvp
-def _nearby(
-    project: Callable[..., Any], damped: Callable[..., Any] | None, candidate: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """The state, and the attempt that it comes from: 0 for the projection, 1 for damped steps, and
-    2 where both failed, so that it is the candidate."""
+def _projected(
+    project: Callable[..., Any], candidate: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """The projection of the candidate where that succeeds, otherwise the candidate, and which."""
     y, ok = project(candidate)
-    attempt = jnp.where(ok, 0, 2)
-    if damped is not None:
-
-        def again() -> tuple[Array, Array]:
-            found, better = damped(candidate)
-            better = better & ~ok
-            return jnp.where(better, found, y), jnp.where(better, 1, attempt)
-
-        y, attempt = lax.cond(any_lane(~ok), again, lambda: (y, attempt))
-    return jnp.where(attempt < 2, y, candidate), attempt
+    return jnp.where(ok, y, candidate), ok
 
 
-@_nearby.def_jvp
-def _nearby_jvp(primals: Any, tangents: Any) -> Any:
-    """Damped steps have no derivative; that of the candidate is its own."""
-    project, _, candidate = primals
-    y, attempt = _nearby(*primals)
-    t_candidate = tree_tangents(candidate, tangents[2])
-    given = (project, candidate), (tangents[0], tangents[2])
-    _, t_y = eqx.filter_jvp(lambda project, candidate: project(candidate)[0], *given)
-    t_y = jnp.where(attempt == 0, tree_tangents(y, t_y), t_candidate)
-    return (y, attempt), (jnp.where(attempt == 1, jnp.nan, 1) * t_y, None)
+@_projected.def_jvp
+def _projected_jvp(primals: Any, tangents: Any) -> Any:
+    y, ok = _projected(*primals)
+    _, t_y = eqx.filter_jvp(lambda *given: given[0](given[1])[0], primals, tangents)
+    t_candidate = tree_tangents(y, tangents[1])
+    return (y, ok), (jnp.where(ok, tree_tangents(y, t_y), t_candidate), None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,9 @@ import diffrax, diffrax_conserve
 modules, messages = list(sys.modules), len(diffrax.RESULTS._index_to_message)
 from tests.laws.test_refused import almost_circular_failures
 failures = {dtype: almost_circular_failures(dtype) for dtype in ("float64", "float32")}
-print(json.dumps({"modules": modules, "messages": messages, "failures": failures}))
+from tests.solver.test_sweeps import work_with_a_heavy_field
+found = {"modules": modules, "messages": messages, "failures": failures}
+print(json.dumps(found | {"flops": work_with_a_heavy_field()}))
 """
 
 

@@ -91,7 +91,8 @@ def test_the_field_is_that_of_lagrange():
 def test_projecting_the_free_field_is_not_enough():
     """diffrax issue 328: it succeeds, on the manifold, and is wrong however short the steps."""
     end = jax.tree.map(lambda y: y[-1], PENDULUM.reference(jnp.array([0.0, T1])))
-    solver = dfc.ManifoldProjection(dfc.RK4(), ROD_MANIFOLD["position"])
+    nearest = dfc.SimplifiedNewton(metric=1.0)
+    solver = dfc.ManifoldProjection(dfc.RK4(), ROD_MANIFOLD["position"], projection=nearest)
     assert all(distance(final(FALLING, solver, PENDULUM.y0, n), end) > 0.1 for n in (200, 400))
 
 
@@ -162,7 +163,7 @@ GROWING = dfc.FirstIntegral(lambda t, y, args: y, value=0.0, rate=lambda t, y, a
         (lambda: dfc.tangent(FALLING, ROW, gain=1.0), ValueError, "no value that it could return"),
         (lambda: dfc.tangent(FALLING, GROWING, gain=1.0), ValueError, "changes at its `rate`"),
         (
-            lambda: dfc.tangent(FALLING, ROW, metric=1.0)(0.0, PENDULUM.y0, None),
+            lambda: dfc.tangent(FALLING, ROW, metric=(1.0,))(0.0, PENDULUM.y0, None),
             ValueError,
             "`metric` has the structure",
         ),

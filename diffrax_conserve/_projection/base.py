@@ -264,13 +264,13 @@ class Target(eqx.Module):
         return self.motion if metric is None else units_of(metric, y)
 
     def step(
-        self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None
+        self, start: RealScalarLike, end: RealScalarLike, y0: Callable[[], Y], error: Y | None
     ) -> Step | None:
         """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
         if not self.projection.sees_step:
             return None
         error = None if error is None else ravel(error)
-        return Step(start * self.direction, end * self.direction, ravel(y0), error)
+        return Step(start * self.direction, end * self.direction, ravel(y0()), error)
 
     def problem(self, t: RealScalarLike, candidate: Y, step: Step | None = None) -> Problem:
         equations, like = self.equations(t, candidate), jax.eval_shape(lambda: candidate)

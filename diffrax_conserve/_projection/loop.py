@@ -37,6 +37,10 @@ from .scalars import components, in_scalars, joined
 # or if it is below `_SMALL_ANGLE` and the correction, relative to the state and divided by the
 # sine, is above `_SHORT_CORRECTION`. Whether they are so everywhere is tested at this distance.
 _SMALL_ANGLE, _SHORT_CORRECTION, _OFFSET = 1e-2, 1e-5, 1e-3
+# Newton's method for the multipliers converges quadratically. If that of several constraints has
+# not after this many iterations, the plane of its corrections may miss the manifold, as on circular
+# orbits, whose states are a curve: from then on it follows the gradients at the last state.
+_FROZEN_STEPS = 4
 # The bisections of a step where it must be shortened.
 _HALVINGS = 30
 # With bounds, a component that an iteration reduces to this share of itself is zero.
@@ -132,7 +136,9 @@ def _solve(
         return now, (seen[0], seen[1], noise)
 
     def move(kept: _Kept, seen: _Seen, y: Any, left: Array) -> Any:
-        return jnp.where(left > 0, _corrected(equations, kept, seen, y), y)
+        refreshed = directions is None and not fresh and equations.magnitude.size > 1
+        frozen = left > max_steps - _FROZEN_STEPS if refreshed else None
+        return jnp.where(left > 0, _corrected(equations, kept, seen, y, frozen), y)
 
     def test(kept: _Kept, y: Any, left: Array) -> tuple[Any, Array]:
         seen = equations.linearise(y)
@@ -187,7 +193,9 @@ def _better(equations: Equations, seen: _Seen, y: Array, best: _Best) -> tuple[A
     return better, (jnp.where(better, y, state), jnp.where(better, jnp.max(sizes), least), scale)
 
 
-def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Array:
+def _corrected(
+    equations: Equations, kept: _Kept, seen: _Seen, y: Array, frozen: Array | None
+) -> Array:
     """`y - s Uᵀ (G diag(s) Uᵀ)⁻¹ g`."""
     g, jacobian, noise = seen
     if kept.inverse is not None:
@@ -198,6 +206,7 @@ def _corrected(equations: Equations, kept: _Kept, seen: _Seen, y: Array) -> Arra
     else:
         sizes, unit = scaled_rows(equations.scaled(jacobian))
         rows = unit if kept.rows is None else kept.rows
+        rows = rows if frozen is None else jnp.where(frozen, rows, unit)
         # With bounds what is noise for one constraint may be needed for another.
         noise = noise / sizes if equations.clip is None else None
         gram, right = gram_matrix(unit, rows), g / sizes
@@ -258,7 +267,7 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     `λ̇ = -(G(y) diag(s) Uᵀ)⁻¹ ġ`, and the tangent of the state is `ẏ + s Uᵀ λ̇`. The units depend
     on the solution too, so `ẏ` includes their tangent."""
     equations, candidate, directions = primals
-    solved = y, ok, _ = project_along(*primals, max_steps=max_steps)
+    solved = y, ok, count = project_along(*primals, max_steps=max_steps)
     # What failed is not used. Its tangent is that of the candidate, which is finite: reverse mode
     # multiplies it by zero.
     y = jnp.where(ok, y, candidate)
@@ -284,7 +293,10 @@ def _project_along_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     heights, unit = scaled_rows(equations.scaled(jacobian))
     change = combined(*eliminated(gram_matrix(unit, rows), t_g / heights, rows))
     t_y = t_y - equations.scaled(change)
-    factor = jnp.where(ok, certain(equations, candidate, y, jacobian, directions), 1)
+    factor = certain(equations, candidate, y, jacobian, directions)
+    if directions is None and 1 < len(rows) <= WRITTEN_OUT_MAX:
+        factor = jnp.where(count <= _FROZEN_STEPS, factor, jnp.nan)  # not of this form
+    factor = jnp.where(ok, factor, 1)
     return solved, (lax.stop_gradient(factor) * t_y, None, None)
 
 

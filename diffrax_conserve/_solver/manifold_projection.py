@@ -16,7 +16,7 @@ from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import Constraint, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
 from .._projection.base import AbstractProjection, Target, check_projection, has_bounds
-from .._projection.equations import any_lane, length
+from .._projection.equations import any_lane, length, reach
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._tree import ravel, tree_sub
@@ -196,12 +196,12 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
             terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
         )
         change = moved(y0, candidate)
-        motion = jnp.maximum(state.motion, change)
+        motion = state.moved_by(change, candidate)
         start = self._target(terms, t1, state, motion, candidate, args).following(t0, y0)
         # Evaluated only where it is needed.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
-        step = target.step(t0, t1, y0, error)
+        step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         units, cannot_start = start.units(y0), self._cannot_start(start, state, t0, y0, made_jump)
@@ -216,6 +216,7 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         dense_info = dict(
             inner=dense_info,
             shift=tree_sub(y1, candidate),
+            limit=reach(ravel(y0), ravel(y1), units),
             error=None if step is None else error,
             target=PackedTarget(start),
             due=due,
@@ -241,19 +242,18 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
     ) -> Target:
         """The target of a step. Noise has no metric of motion: with noise the metric decides which
         equation is solved, and that must not depend on the path."""
-        size = jnp.abs(ravel(candidate))
-        least = float(jnp.finfo(size.dtype).eps) ** 0.5 * size
         if any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold)):
             # The first projection to a given value corrects no error of the step. So it does not
             # follow the motion, which at a turning point depends on the length of the step, but
             # makes the smallest relative change of the components.
-            least = jnp.where(state.statistics.num_projections == 0, size, least)
+            size = jnp.maximum(motion, jnp.abs(ravel(candidate)))
+            motion = jnp.where(state.statistics.num_projections == 0, size, motion)
         return Target(
             self.projection,
             self.manifold,
             state.values,
             state.hidden,
-            jnp.maximum(motion, least) if is_ode(terms) else None,
+            motion if is_ode(terms) else None,
             args,
             time_direction(terms, t),
             state.gained,

@@ -158,7 +158,8 @@ class State(eqx.Module):
     """What later steps need.
 
     - `values`, `hidden`, `gained`: as in a `Target`.
-    - `motion`: the largest change of each component in one step so far, zero before the first.
+    - `motion`: the largest change of each component in one step so far, at least the root of
+      roundoff of the component itself; zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
     """
@@ -171,6 +172,12 @@ class State(eqx.Module):
     first_step: RealScalarLike
     num_steps: Int[Array, ""] | None
     statistics: ProjectionStatistics
+
+    def moved_by(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
+        """`motion` after a step. It is this maximum that is carried, floor included, because a
+        maximum outside would keep XLA from compiling the loop of a small solve as one function."""
+        least = float(jnp.finfo(change.dtype).eps) ** 0.5 * jnp.abs(ravel(end))
+        return jnp.maximum(self.motion, jnp.maximum(change, least))
 
     def next(self, **fields: Any) -> "State":
         num_steps = None if self.num_steps is None else self.num_steps + 1
