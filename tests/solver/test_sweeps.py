@@ -213,7 +213,7 @@ def work_with_a_heavy_field():
 
 
 def test_fixed_steps_do_not_compute_it():
-    """By default XLA removes what a loop carries and nobody reads; the flags of the tests do not."""
+    """XLA removes what a loop carries and nobody reads, but not by the flags of the tests."""
     plain, projected, adaptive = fresh.interpreter()["flops"]
     assert max(plain, projected) < 1e6
     assert adaptive > 1e9
