@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp

@@ -3,7 +3,7 @@
 XLA does not fuse across a sum or a stack of components: in a batch of small systems nearly every
 operation becomes a loop, whose overhead exceeds its arithmetic. Elementwise arithmetic of scalars
 it fuses. The functions call those of the user, so their jaxprs are rewritten: what only moves
-elements costs nothing, and what is neither elementwise nor a sum is computed in arrays in its place.
+elements costs nothing, and what is neither elementwise nor a sum stays in arrays in its place.
 """
 
 import functools as ft
