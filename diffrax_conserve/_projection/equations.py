@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
@@ -185,11 +186,35 @@ def equations_of(
             return (out := fn(y)) - values[start : start + out.size]
 
         # Arrays over which `fn` closes become leaves, and can be differentiated.
-        parts.append(eqx.filter_closure_convert(part, vector))
+        parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
         start += jax.eval_shape(part, vector).size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
     may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
     return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish)
+
+
+class _Known:
+    """An array that is not a leaf of arrays, so that no transformation makes it a tracer."""
+
+    def __init__(self, value: Array):
+        self.value = value
+
+
+class _Converted(eqx.Module):
+    """A converted function that still knows the integers over which it closes: `scalars` moves
+    elements only by indices that are known."""
+
+    fn: Any
+
+    def __init__(self, fn: Any):
+        def known(x: Any) -> Any:
+            constant = hasattr(x, "dtype") and not isinstance(x, jax.core.Tracer)
+            return _Known(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
+
+        self.fn = jtu.tree_map(known, fn)
+
+    def __call__(self, y: Array) -> Array:
+        return jtu.tree_map(lambda x: x.value if isinstance(x, _Known) else x, self.fn)(y)
 
 
 @jax.custom_batching.custom_vmap

@@ -2,12 +2,13 @@
 
 XLA does not fuse across a sum or a stack of components: in a batch of small systems nearly every
 operation becomes a loop, whose overhead exceeds its arithmetic. Elementwise arithmetic of scalars
-it fuses. The functions call those of the user, so their jaxprs are rewritten.
+it fuses. The functions call those of the user, so their jaxprs are rewritten: what only moves
+elements costs nothing, and what is neither elementwise nor a sum stays in arrays in its place.
 """
 
 import functools as ft
 import itertools as it
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from typing import Any
 
@@ -23,8 +24,10 @@ from jaxtyping import Array, PyTree
 # An array as a tuple of its elements.
 Scalars = tuple[Any, ...]
 
-# Compile time grows with the number of scalar operations.
-MAX_OPERATIONS = 512
+# Compile time grows with the number of scalar operations. With 512 the Cartesian pendulum, the
+# vortices and the Toda lattice of the catalogue stayed in arrays: they compiled up to two seconds
+# faster, and took two to five times as long (`benchmarks/cost/forms.py --only systems`).
+MAX_OPERATIONS = 2048
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
@@ -32,17 +35,21 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     XLA's tendency to repeat the whole computation for each element of the result."""
     out = jax.eval_shape(fn, y)
     size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
-    written = in_scalars(fn, y, limit=MAX_OPERATIONS // size)
+    written = in_scalars(fn, y, limit=MAX_OPERATIONS // size, differentiated=True)
     if written is None:
         return fn(y)
     return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
 
 
 def in_scalars(
-    fn: Callable[..., Any], *like: Any, limit: int = MAX_OPERATIONS
+    fn: Callable[..., Any],
+    *like: Any,
+    limit: int = MAX_OPERATIONS,
+    differentiated: bool = False,
 ) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements; `None`
-    if it is too large or uses a primitive that is not supported here."""
+    if it is too large, has an effect or uses random keys. With `differentiated` it has the
+    derivative of `fn`, also where a function inside has a rule of its own."""
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
     if sum(map(prod, shapes)) > limit:
@@ -53,7 +60,7 @@ def in_scalars(
     def write_out(*scalars: Any) -> list[Array]:
         rest = iter(scalars)
         given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
-        return _WriteOut(limit)(closed, shapes, given)
+        return _WriteOut(limit, differentiated)(closed, shapes, given)
 
     flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(x.size)]
     try:
@@ -113,24 +120,15 @@ def joined(like: Any, scalars: Any) -> Array:
 _Places = np.ndarray  # of integers
 
 
-def _broadcast(
-    places: _Places, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...]
-) -> _Places:
-    expanded = [1] * len(shape)
-    for axis, size in zip(broadcast_dimensions, places.shape, strict=True):
-        expanded[axis] = size
-    return np.broadcast_to(places.reshape(expanded), shape)
-
-
 class _NotWrittenOut(Exception):
-    """The function has an unsupported primitive or parameter, or too many operations."""
+    """The function has too many operations, an effect, or a random key."""
 
 
 _ELEMENTWISE_NAMES = """
-abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy
-cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log
-log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh
-sqrt square stop_gradient sub tan tanh xor
+abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj
+convert_element_type copy cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag
+integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or pow real
+rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
 """
 _ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 _REDUCTIONS = {
@@ -141,20 +139,70 @@ _REDUCTIONS = {
     "reduce_and": lax.bitwise_and,
     "reduce_or": lax.bitwise_or,
 }
-_STRUCTURAL: dict[str, Callable[..., _Places]] = {
+# A requested precision may be ignored: sums of products are computed in the type of the state.
+_DOT = {"dimension_numbers", "precision", "preferred_element_type"}
+# Calls of a function, which is looked into. Some have a rule of their own for the derivative, which
+# would be lost: they are looked into only where no derivative is taken afterwards.
+_CALLS = frozenset({"closed_call", "core_call", "checkpoint", "remat2"})
+_CALLS_WITH_A_RULE = frozenset({"custom_jvp_call", "custom_vjp_call"})
+
+
+def _broadcast(x: _Places, shape: Sequence[int], broadcast_dimensions: Sequence[int]) -> _Places:
+    expanded = [1] * len(shape)
+    for axis, size in zip(broadcast_dimensions, x.shape, strict=True):
+        expanded[axis] = size
+    return np.broadcast_to(x.reshape(expanded), shape)
+
+
+def _pad(x: _Places, value: _Places, padding_config: Sequence[tuple[int, int, int]]) -> _Places:
+    out_shape, inside, kept = [], [], []
+    for n, (low, high, interior) in zip(x.shape, padding_config, strict=True):
+        first, last = max(low, 0), max(low, 0) + n + max(n - 1, 0) * interior
+        out_shape.append(last + max(high, 0))
+        inside.append(slice(first, last, 1 + interior))
+        kept.append(slice(max(-low, 0), last + high if high < 0 else None))
+    out = np.full(out_shape, value.item())
+    out[tuple(inside)] = x
+    return out[tuple(kept)]
+
+
+# What only moves elements moves their places alike. By numpy, because jax would compile each of
+# these for each shape, which takes 15 to 50 ms.
+_MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+    "pad": _pad,
     "reshape": lambda x, new_sizes: x.reshape(new_sizes),
     "rev": lambda x, dimensions: np.flip(x, dimensions),
     "slice": lambda x, start_indices, limit_indices, strides=None: x[
         tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))
     ],
+    "split": lambda x, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
     "squeeze": lambda x, dimensions: x.squeeze(dimensions),
     "stack": lambda *xs, axis: np.stack(xs, axis),
     "transpose": lambda x, permutation: x.transpose(permutation),
+    "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
 }
-# A requested precision may be ignored: sums of products are computed in the type of the state.
-_DOT = {"dimension_numbers", "precision", "preferred_element_type"}
+# These do so by indices, which are the operands from the first to before the last number. Their
+# rules for indices are intricate: jax itself moves the places, if it knows the indices.
+_BY_INDICES = {
+    "dynamic_slice": (1, None),
+    "dynamic_update_slice": (2, None),
+    "gather": (1, 2),
+    "scatter": (1, 2),
+    "scatter-add": (1, 2),
+}
+# What jax does to indices before it uses them, -1 for the last element for example.
+_ON_INDICES: dict[str, Callable[..., np.ndarray]] = {
+    "add": np.add,
+    "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
+    "lt": np.less,
+    "max": np.maximum,
+    "min": np.minimum,
+    "mul": np.multiply,
+    "select_n": lambda which, *cases: np.choose(which, cases),
+    "sub": np.subtract,
+}
 
 
 def _once(fn: Callable[[Array], Array], x: Array) -> Array:
@@ -172,25 +220,23 @@ _INSTEAD: dict[str, Callable[..., Any]] = {
 class _WriteOut:
     """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
 
-    def __init__(self, limit: int):
-        self.limit = limit
+    def __init__(self, limit: int, differentiated: bool):
+        self.limit, self.differentiated = limit, differentiated
         self.scalars: list[Any] = []
         self.num_operations = 0
+        # The arrays whose elements are in the list, by the place of the first.
+        self.arrays: dict[int, Array] = {}
 
     def __call__(
         self, closed: Any, shapes: list[tuple[int, ...]], inputs: Iterable[Scalars]
     ) -> list[Array]:
         places = [self._add(x, shape) for x, shape in zip(inputs, shapes, strict=True)]
-        try:
-            outputs = walk(closed, places, self._constant, self._equation)
-        except (KeyError, TypeError) as error:
-            # In another version of jax a parameter may have been renamed or added.
-            raise _NotWrittenOut from error
+        outputs = walk(closed, places, self._constant, self._equation)
         return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
 
     def _equation(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params = eqn.primitive.name, eqn.params
-        if eqn.effects:
+        if eqn.effects or any(_is_key(var.aval) for var in eqn.outvars):
             raise _NotWrittenOut
         # Parameters that are `None` have no effect.
         given = {
@@ -198,25 +244,31 @@ class _WriteOut:
             for key, value in params.items()
             if value is not None and key not in ("sharding", "out_sharding")
         }
-        if name == "unstack" and given.keys() == {"axis"}:
-            return [np.asarray(x) for x in np.moveaxis(inputs[0], params["axis"], 0)]
-        if name in _STRUCTURAL:
-            return [_STRUCTURAL[name](*inputs, **given)]
-        if name == "pad" and all(low >= 0 <= high for low, high, _ in given["padding_config"]):
-            places, value = inputs
-            return [self._pad(places, value, given["padding_config"])]
+        if name in _MOVES:
+            moved = _MOVES[name](*inputs, **given)
+            return moved if isinstance(moved, list) else [moved]
+        if name in _BY_INDICES:
+            return self._by_indices(eqn, inputs)
         if name == "iota":
             indices = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
             return [self._constant(_broadcast(indices, params["shape"], (params["dimension"],)))]
         if name in _ELEMENTWISE:
+            known = self._known_integers(inputs) if name in _ON_INDICES else None
+            if known is not None:
+                computed = _ON_INDICES[name](*known, **given)
+                return [self._constant(computed.astype(eqn.outvars[0].aval.dtype))]
             fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
             return [self._elementwise(fn, inputs)]
-        if name in _REDUCTIONS and given.keys() == {"axes"}:
+        if name in _REDUCTIONS and given.keys() == {"axes"} and inputs[0].size:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
         same_type = eqn.invars[0].aval.dtype == eqn.outvars[0].aval.dtype
         if name == "dot_general" and given.keys() <= _DOT and same_type:
             return [self._dot(inputs, params["dimension_numbers"])]
-        raise _NotWrittenOut(name)
+        if name in _CALLS or (name in _CALLS_WITH_A_RULE and not self.differentiated):
+            inner = params.get("call_jaxpr", params.get("jaxpr"))
+            inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
+            return walk(inner, inputs, self._constant, self._equation)
+        return self._in_arrays(eqn, inputs)
 
     def _elementwise(self, fn: Callable[..., Array], inputs: list[_Places]) -> _Places:
         inputs = [*np.broadcast_arrays(*inputs)]
@@ -249,22 +301,78 @@ class _WriteOut:
         product = self._elementwise(lax.mul, [a, b])
         return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
 
-    def _pad(self, places: _Places, value: _Places, config: Any) -> _Places:
-        out_shape, inside = [], []
-        for n, (low, high, interior) in zip(places.shape, config, strict=True):
-            end = low + n + max(n - 1, 0) * interior
-            out_shape.append(end + high)
-            inside.append(slice(low, end, 1 + interior))
-        out = np.full(out_shape, value.item())
-        out[tuple(inside)] = places
-        return out
+    def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
+        name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
+        first, last = _BY_INDICES[name]
+        indices = self._known_integers(inputs[first:last])
+        if indices is None:
+            return self._in_arrays(eqn, inputs)
+
+        def moved(*others: np.ndarray, **given: Any) -> np.ndarray:
+            xs = [*others[:first], *indices, *others[first:]]
+            with jax.ensure_compile_time_eval():
+                return np.asarray(eqn.primitive.bind(*xs, **(params | given)))
+
+        if name == "scatter-add":
+            # Which of the updates are added to which elements.
+            dtype, updates = eqn.outvars[0].aval.dtype, inputs[2]
+            self._count(updates.size)
+            nothing, out = np.zeros(operand.shape, dtype), operand.copy()
+            for one, place in zip(np.eye(updates.size, dtype=dtype), updates.flat, strict=True):
+                for at in zip(*np.nonzero(moved(nothing, one.reshape(updates.shape))), strict=True):
+                    (out[at],) = self._add(
+                        [lax.add(self.scalars[out[at]], self.scalars[place])], (1,)
+                    )
+            return [out]
+        places = [x.astype(np.int32) for x in (*inputs[:first], *inputs[first:][len(indices) :])]
+        if name != "gather":
+            return [moved(*places)]
+        # Where an index is outside, the place would be that of a filling value.
+        out = moved(*places, fill_value=-1)
+        if np.any(out < 0):
+            filled = moved(np.zeros(operand.shape, eqn.outvars[0].aval.dtype))
+            out = np.where(out < 0, self._constant(filled), out)
+        return [out]
+
+    def _in_arrays(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
+        """A primitive that is not known here: its inputs are joined, its outputs taken apart."""
+        self._count(sum(prod(var.aval.shape) for var in (*eqn.invars, *eqn.outvars)))
+        given = [self._array(x, var.aval.dtype) for x, var in zip(inputs, eqn.invars, strict=True)]
+        outs = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
+        return [self._taken_apart(x) for x in (outs if eqn.primitive.multiple_results else [outs])]
+
+    def _array(self, places: _Places, dtype: Any) -> Any:
+        """The array of these elements; where it was taken apart, the array itself."""
+        whole = self.arrays.get(places.flat[0]) if places.size else None
+        if whole is not None and np.array_equal(
+            np.arange(whole.size), places.ravel() - places.flat[0]
+        ):
+            return whole.reshape(places.shape)
+        elements = [self.scalars[i] for i in places.flat]
+        if any(isinstance(x, jax.core.Tracer) for x in elements):
+            return jnp.stack(elements).reshape(places.shape)
+        return np.array(elements, dtype).reshape(places.shape)
+
+    def _taken_apart(self, x: Array) -> _Places:
+        self.arrays[len(self.scalars)] = x
+        return self._add(components(jnp.atleast_1d(x)), x.shape)
+
+    def _known_integers(self, inputs: list[_Places]) -> list[np.ndarray] | None:
+        """The values of integer or boolean arrays, as indices are; `None` if they are not known."""
+        if any(
+            isinstance(x := self.scalars[i], jax.core.Tracer) or x.dtype.kind not in "iub"
+            for places in inputs
+            for i in places.flat
+        ):
+            return None
+        return [np.array([self.scalars[i] for i in x.flat]).reshape(x.shape) for x in inputs]
 
     def _constant(self, x: Any) -> _Places:
         self._count(np.size(x))
-        if jnp.issubdtype(x.dtype, jax.dtypes.extended):  # a random key
+        if _is_key(x):
             raise _NotWrittenOut
         if isinstance(x, jax.core.Tracer):
-            return self._add(components(jnp.atleast_1d(x)), x.shape)
+            return self._taken_apart(x)
         return self._add(np.asarray(x).flat, np.shape(x))
 
     def _add(self, scalars: Iterable[Any], shape: tuple[int, ...]) -> _Places:
@@ -276,3 +384,7 @@ class _WriteOut:
         self.num_operations += operations
         if self.num_operations > self.limit:
             raise _NotWrittenOut
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.extended)
