@@ -111,11 +111,11 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := core overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
+COSTS := core overhead gradients work_precision scaling balance learned_solvers sweeps \
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
-  parameters defaults held_out
-STUDIES := max_correction claims long_run refusals
+  defaults
+STUDIES := claims long_run
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
@@ -136,7 +136,7 @@ comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/chemistry learned/equal_cost learned/defaults learned/held_out \
+	  learned/chemistry learned/equal_cost learned/defaults \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 
