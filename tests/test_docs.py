@@ -3,17 +3,31 @@
 import importlib
 import operator
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 import types
 
 import jax
+import nbformat
 import pytest
 
-from .pages import FIGURES, PACKAGE, PAGES, ROOT, agree, blocks, example_pages, roundoff, run
+from .pages import FIGURES, PACKAGE, PAGES, ROOT, Block, agree, blocks, example_pages, roundoff, run
 
 EXAMPLES = [page for page in example_pages() if page.blocks]
+NOTEBOOKS = runpy.run_path(str(ROOT / "docs" / "notebooks.py"))
+GALLERY = {f"docs/{name}" for name in NOTEBOOKS["NAMES"]}
+
+
+def from_notebook(page):
+    """The page with the code cells of its notebook as its blocks."""
+    made = NOTEBOOKS["notebook"](page.file.read_text(encoding="utf-8"))
+    nbformat.validate(made)
+    cells = [cell for cell in made["cells"] if cell["cell_type"] == "code"]
+    shown = ["".join(out.get("text", "") for out in cell["outputs"]) for cell in cells]
+    pairs = zip(page.blocks, cells, shown, strict=True)
+    return page._replace(blocks=[Block(b.line, c["source"], text) for b, c, text in pairs])
 
 
 @pytest.fixture
@@ -29,6 +43,8 @@ def new_interpreter(tmp_path, monkeypatch):
 @pytest.mark.examples
 @pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
 def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
+    if page.name in GALLERY:
+        page = from_notebook(page)
     write = f"`python -m tests.pages {page.file.relative_to(ROOT)}` writes it"
     for block, printed in run(page):
         assert agree(printed, block.shown, roundoff(page)), (
