@@ -13,7 +13,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
+.PHONY: help demo test lowest slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -66,6 +66,17 @@ test: $(TEST) ## run the tests, without the slow ones
 
 # ---- What a developer runs ----
 
+# uv can choose the lowest versions that `pyproject.toml` allows; pip cannot.
+LOWEST := $(VENV)/lowest
+PROMISED := tests/laws/test_projection.py tests/solver/test_diffrax.py tests/solver/test_learned.py \
+  tests/test_manifold.py tests/training/test_fit.py
+
+lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of jax, diffrax and the rest
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
+	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable '.[test]'
+	$(LOWEST)/bin/python -m pytest $(SHARED) -m "not slow and not examples" $(PROMISED)
+
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests
@@ -89,9 +100,10 @@ soak: $(TEST) ## attack the promises COUNT times, in search of a wrong success
 mutants: $(TEST) ## plant defects, and see that the tests notice each
 	$(BIN)/python tests/mutants.py
 
-lint: $(DEV) ## check style and formatting
+lint: $(DEV) ## check style, formatting and spelling
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 
 format: $(DEV) ## fix what `make lint` can fix by itself
 	$(BIN)/ruff check --fix .
@@ -111,11 +123,11 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := core forms overhead gradients work_precision scaling unlike_lanes devices balance learned_solvers sweeps \
+COSTS := core forms overhead gradients work_precision scaling balance learned_solvers sweeps \
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
-  parameters defaults held_out
-STUDIES := max_correction claims long_run refusals
+  defaults
+STUDIES := claims long_run
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
@@ -136,7 +148,7 @@ comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/chemistry learned/equal_cost learned/defaults learned/held_out \
+	  learned/chemistry learned/equal_cost learned/defaults \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 
@@ -144,6 +156,7 @@ bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tes
 build: $(DEV) ## build wheel and sdist, then try the wheel in an environment of its own
 	rm -rf dist
 	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
 	@root=$$PWD; tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; set -e; \
 	"$(BIN)/python" -m venv --without-pip "$$tmp/venv"; \
 	"$(BIN)/python" -m pip --python "$$tmp/venv/bin/python" install --quiet --no-compile "$$root"/dist/*.whl; \

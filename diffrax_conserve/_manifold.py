@@ -28,7 +28,8 @@ class FirstIntegral(eqx.Module):
 
     With `rate`, this is a *balance law*, such as that of energy and dissipated power: the conserved
     value at $t$ is larger by $\int_{t_0}^t \mathrm{rate}(s, y(s), args)\, ds$, by Gauss quadrature
-    with four nodes along the dense output of the wrapped solver. See "Balance laws" in the guide.
+    with four nodes along the dense output of the wrapped solver. See [Balances and
+    bounds][balances-and-bounds].
 
     !!! example
 

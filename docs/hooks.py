@@ -2,9 +2,6 @@
 
 The table of solvers in `api/solvers.md` is the one that the tests run.
 
-The link to the repository, at the foot of the pages, is the `place` of `pyproject.toml`, if there
-is one.
-
 A code block in a comment `<!-- check ... -->` runs with the page, and is not shown.
 
 Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
@@ -15,7 +12,6 @@ network; a name that is not in it fails the strict build, as a misspelt name of 
 
 import re
 import runpy
-import tomllib
 from pathlib import Path
 
 DIFFRAX = "https://docs.kidger.site/diffrax/api"
@@ -71,10 +67,6 @@ def on_config(config):
             autorefs.register_url(name, f"{page}#{name}")
     for name, page in MENTIONED.items():
         autorefs.register_url(name, page)
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    place = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["place"]
-    if place:
-        config.extra["social"] = [{"icon": "fontawesome/brands/git-alt", "link": place}]
 
 
 CHECK = re.compile(r"\n*^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)

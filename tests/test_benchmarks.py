@@ -94,7 +94,6 @@ SMOKE = {
         found["known"]["0.01"]["plain"]["solved"]["projected"]["drift"] < 1e-14
     ),
     "worth": lambda cheap, dear: dear["batches"]["4"]["ratio"] > cheap["batches"]["4"]["ratio"] > 0,
-    "parameters": lambda row: row["family"]["step_rms"] > 0 < row["fixed"]["step_rms"],
 }
 
 

@@ -1,6 +1,8 @@
 """The command line: what it prints and writes, and how it refuses what it cannot do."""
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.reproduce import _job, main
+from diffrax_conserve.reproduce import _command, _job, main
 
 from .problems import KEPLER0, kepler, solve
 
@@ -101,7 +103,30 @@ def test_an_output_that_ends_early(start, redirection):
 def test_list_names_every_system(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(dfc.systems.names())
+    stiff = dfc.systems.names(stiff=True)
+    assert [line.split()[0] for line in lines] == [*dfc.systems.names(), *stiff]
+
+
+@pytest.mark.parametrize("command", [(), ("list",), ("reproduce",)])
+def test_help_shows_examples_that_are_understood(command, capsys):
+    with pytest.raises(SystemExit):
+        main([*command, "--help"])
+    examples = re.findall(r"^  diffrax-conserve (.*)$", capsys.readouterr().out, re.MULTILINE)
+    assert examples
+    for example in examples:
+        assert _command._parser().parse_args(shlex.split(example)).command in example
+
+
+@pytest.mark.slow
+@pytest.mark.draws
+@pytest.mark.parametrize("name", dfc.systems.names(stiff=True))
+def test_every_stiff_system(name, tmp_path):
+    status, metrics = reproduce(tmp_path, name)
+    assert status == 0
+    plain, projected = (metrics["solvers"][k] for k in ("kvaerno5", "projected kvaerno5"))
+    assert projected["state_error"] < 1e-5
+    assert max(projected["drift"].values()) < 1e-15
+    assert projected["steps"] < 1.5 * plain["steps"]
 
 
 # Slow by their number, and for the learned solvers that they compile.

@@ -161,8 +161,9 @@ class Problem(eqx.Module):
 class AbstractProjection(eqx.Module):
     """A map from a candidate to a state on the manifold.
 
-    Write your own as a subclass with a field `metric` and the method `solve`; see "Your own
-    projection" in the guide. Residuals are judged by its fields `rtol` and `atol`, if it has them.
+    Write your own as a subclass with a field `metric` and the method `solve`; see [Your own
+    projection][your-own-projection]. Residuals are judged by its fields `rtol` and `atol`, if it
+    has them.
     Set `sees_step = False` in the class if it does not use `Problem.step`: then it needs no step,
     as in a stage of [`diffrax_conserve.Staged`][].
     """

@@ -52,7 +52,7 @@ def tangent(
     $f = (v, F/m)$, with the velocity constraint from [`diffrax_conserve.Constraint.derivative`][]
     and the metric $(\infty, m)$: then $m v' = F + G^\top \lambda$, the equations of motion, whose
     `multipliers` are the forces of the constraints. Projecting the solution of $f$ does not solve
-    these equations. See "Constrained mechanics" in the guide.
+    these equations. See [Constraints and mechanics][constraints-and-mechanics].
 
     **Arguments:**
 

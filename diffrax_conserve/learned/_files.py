@@ -154,7 +154,7 @@ def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
     if version != b"%d" % _VERSION:
         raise ValueError(
             f"The file {path} has format {version.decode()[:9]}, but this version reads "
-            f"{_VERSION}. Upgrade diffrax-conserve, or convert the file as the changelog says."
+            f"{_VERSION}. Upgrade diffrax-conserve, or read it with the version that wrote it."
         )
     if hashlib.sha256(rest).hexdigest().encode() != digest:
         raise ValueError(f"The file {path} is truncated or damaged: its checksum is another.")

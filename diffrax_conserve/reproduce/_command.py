@@ -5,12 +5,27 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from .. import __version__, systems
 from ._job import SetupError
 from ._job import reproduce as _reproduce
+
+_NAMES = (*systems.names(), *systems.names(stiff=True))
+_EXAMPLES = """examples:
+  diffrax-conserve list
+  diffrax-conserve reproduce kepler --out out/kepler
+"""
+_EXAMPLES_OF_LIST = """example:
+  diffrax-conserve list
+"""
+_EXAMPLES_OF_REPRODUCE = """examples:
+  diffrax-conserve reproduce kepler
+  diffrax-conserve reproduce kepler --t1 50 --dt 0.1 --out out/longer
+  diffrax-conserve reproduce rigid-body --train --epochs 500 --seed 1
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -21,8 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(argv)
     if options.command == "list":
-        width = max(map(len, systems.names()))
-        for name in systems.names():
+        width = max(map(len, _NAMES))
+        for name in _NAMES:
             print(f"{name:{width}}  {systems.get(name).title}")
         return 0
     # The references need float64, and drifts are compared with its roundoff.
@@ -64,20 +79,28 @@ def run() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     title = "Conservative solves of the systems in the catalogue."
-    parser = argparse.ArgumentParser(prog="diffrax-conserve", description=title)
+    raw: Any = dict(formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser("diffrax-conserve", description=title, epilog=_EXAMPLES, **raw)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    commands.add_parser("list", help="list the systems by name")
+    commands.add_parser("list", help="list the systems by name", epilog=_EXAMPLES_OF_LIST, **raw)
     reproduce = commands.add_parser(
         "reproduce",
-        help="compare RK4, and for the paper's systems learned solvers, with projected ones",
-        description="Prints a table of errors and drifts, and writes figures and metrics.json.",
+        help="compare solvers of a system, plain and projected",
+        description=(
+            "Compares RK4 with projected RK4, for stiff systems Kvaerno5 with projected Kvaerno5,\n"
+            "and for the paper's five systems learned solvers too. Prints a table of errors and\n"
+            "drifts, and writes figures and metrics.json."
+        ),
+        epilog=_EXAMPLES_OF_REPRODUCE,
+        **raw,
     )
-    names = (*systems.names(), *systems.names(stiff=True))
-    reproduce.add_argument("name", metavar="NAME", choices=names, help="a system, see `list`")
+    reproduce.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
     reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
     reproduce.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
-    reproduce.add_argument("--dt", type=float, metavar="H", help="length of a step")
+    reproduce.add_argument(
+        "--dt", type=float, metavar="H", help="length of a step, or of a saved one if stiff"
+    )
     reproduce.add_argument("--train", action="store_true", help="train the networks again")
     reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
     reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")

@@ -16,6 +16,7 @@ from .._tree import tree_size
 from ..learned._files import save
 from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
+from ..systems._chemistry import AbstractChemistry
 from ._solve import reason, run, state_errors
 from ._tables import metrics, table
 from ._trained import (
@@ -39,6 +40,10 @@ class SetupError(Exception):
 
 def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.AbstractSolver]:
     """The solvers to compare, in the order of the table and the legends."""
+    if isinstance(system, AbstractChemistry):
+        projection = system.mechanism.positive_projection()
+        kept = ManifoldProjection(dfx.Kvaerno5(), system.manifold, projection=projection)
+        return {"kvaerno5": dfx.Kvaerno5(), "projected kvaerno5": kept}
     # The paper projects whatever RK4 proposes, too long steps of the double pendulum as well.
     projected = ManifoldProjection(RK4(), system.manifold, max_correction=None)
     classical = {"rk4": RK4(), "projected rk4": projected}

@@ -21,6 +21,8 @@ from ._trained import Learned
 _LOOKS = {
     "rk4": ("RK4", "#D55E00", "o", 5.0),
     "projected rk4": ("projected RK4", "#0072B2", ".", 3.0),
+    "kvaerno5": ("Kvaerno5", "#D55E00", "o", 5.0),
+    "projected kvaerno5": ("projected Kvaerno5", "#0072B2", ".", 3.0),
     "standard": ("standard", "#CC79A7", "s", 5.0),
     "conservative": ("conservative", "#009E73", "x", 4.0),
     "standard projected": ("standard projected", "#E69F00", "^", 4.0),
@@ -75,7 +77,7 @@ def draw(
             exact = system.trajectories(system.reference(times))
             # The initial state has neither error nor drift.
             medians = {k: (ts[1:], np.median(v, axis=0)[1:]) for k, v in errors.items()}
-            figures["state_error"] = _one_panel(medians, "$t$", "state error")
+            figures["state_error"] = _one_panel(medians, "t", "state error")
         figures["trajectory"] = _trajectory(paths, exact, system.axes)
         figures["drift"] = _drift(ts, list(system.manifold), succeeded)
     for name, figure in figures.items():
@@ -97,10 +99,10 @@ def _drift(ts: np.ndarray, integrals: list[str], runs: dict[str, Run]) -> Figure
         ax.axhline(_EPS, **_ROUNDOFF)
         drifts = {k: np.maximum(v.drift[integral], _FLOOR) for k, v in runs.items()}
         _lines(ax, {k: (ts[1:], drift[1:]) for k, drift in drifts.items()})
-        ax.set(title=integral, xlabel="$t$")
+        ax.set(title=integral, xlabel="t")
     panels[0].set_ylabel("relative drift")
     _legend(figure, panels[0])
-    note = "roundoff $\\epsilon$; an exact 0 is drawn at $\\epsilon/10$"
+    note = "roundoff ε; an exact 0 is drawn at ε/10"
     figure.legend([Line2D([], [], **_ROUNDOFF)], [note], loc="outside lower center")
     return figure
 

@@ -10,14 +10,15 @@ import numpy as np
 
 from .. import __version__
 from ..systems import AbstractSystem
-from ._solve import Run
+from ._solve import Run, is_stiff
 
 _FOOTER = """\
 state error: Euclidean norm of the solution minus the reference, over all components of the state.
 drift: the largest over all steps of |I(t, y) - I(t0, y0)|, relative to the scale of I at (t0, y0),
     |I| + sum_i |y_i dI/dy_i|; for a constraint g, of |g| relative to sum_i |y_i dg/dy_i|; for an
     array the largest of its components. Roundoff is 2.2e-16.
-run, compile: wall time of the second run of the compiled solve, and of its compilation."""
+run, compile: processor time of the fastest of up to five runs of the compiled solve, and of its
+    compilation."""
 
 _MANY = """
 State errors are medians over {states} initial states, drifts the largest over all of them; the
@@ -84,7 +85,8 @@ def table(system: AbstractSystem, metrics: dict[str, Any]) -> str:
         for x in lines
     ]
     failures = [f"{name} FAILED {r['failure']}" for name, r in rows.items() if "failure" in r]
-    heading = f"{system.title}: 0 <= t <= {metrics['t1']:g}, steps of {metrics['dt']:g}"
+    steps = "adaptive steps, saved every" if is_stiff(system) else "steps of"
+    heading = f"{system.title}: 0 <= t <= {metrics['t1']:g}, {steps} {metrics['dt']:g}"
     footer = _FOOTER + (_MANY.format(states=states) if states > 1 else "")
     paragraphs = [heading, "\n".join(text), "\n".join(failures), footer]
     return "\n\n".join(filter(None, paragraphs))

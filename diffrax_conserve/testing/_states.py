@@ -195,11 +195,16 @@ def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[A
 
     **Arguments:**
 
-    - `names`: the names to draw from. Default: all of `diffrax_conserve.systems.names()`.
+    - `names`: the names to draw from, at least one. Default: all of
+        `diffrax_conserve.systems.names()`.
 
     **Returns:**
 
     A strategy of [`diffrax_conserve.systems.AbstractSystem`][]s. It shrinks to the first name.
+
+    **Raises:**
+
+    `ValueError` if `names` is empty or has a name that is not in the catalogue.
 
     Solves are compiled again for every system: prefer `pytest.mark.parametrize` for them.
 
@@ -217,4 +222,9 @@ def catalogue_systems(names: Sequence[str] | None = None) -> st.SearchStrategy[A
         ```
     """
     names = catalogue.names() if names is None else names
+    if not names:
+        raise ValueError(
+            "`names` of `catalogue_systems` is empty. Give at least one name, such as "
+            '("kepler",), or leave `names` out to draw from the whole catalogue.'
+        )
     return st.sampled_from([catalogue.get(name) for name in names])
