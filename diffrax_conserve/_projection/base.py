@@ -19,7 +19,7 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
-from .equations import Equations, equations_of, length, relative
+from .equations import ON, Equations, equations_of, length, relative
 from .options import units_of
 
 
@@ -137,7 +137,7 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
         # A maximum can lose NaN on a CPU.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        success = equations.verdict(after, jacobian, y)[0] > 0 if ok is None else ok
+        success = equations.level(after, jacobian, y)[0] >= ON if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence

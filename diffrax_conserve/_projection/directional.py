@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .loop import project_along
+from .implicit import project_along
 from .options import check_options, option
 
 

@@ -14,7 +14,6 @@ import jax.core
 import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -26,8 +25,11 @@ from .._tree import ravel, unflatten, unravel
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
 # residual contribute about one unit each.
 ROUNDOFF_MULTIPLE = 16
-# Up to this many constraints a solve is written out, so that XLA fuses it with what is around it.
-WRITTEN_OUT_MAX = 4
+# What a state is, in this order, so that a minimum over the residuals tells it.
+NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
+# The noise of a residual as a share of its tolerance, and the tolerance as a share of what the
+# gradient shows from which a state counts as near rest.
+_NOISE, _NEAR_REST = 1 / 8, 64
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 
 
@@ -86,27 +88,31 @@ class Equations(eqx.Module):
         limit = jnp.asarray(rtol, scale.dtype) * scale
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
 
-    def verdict(
+    def level(
         self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """-1 if a residual is not finite; 0 if `y` is off the manifold; 1 if it is on it; 2 if all
-        are within twice the noise. And the noise, an eighth of the tolerance, which only chance
-        could reduce, or half of it where the tolerance is more than a 64th of what the gradient
-        shows, as near rest. A residual within a tolerance that underflows says nothing."""
-        info = jnp.finfo(y.dtype)
+        """What a state is, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the residuals.
+
+        The noise is what only chance could reduce: an eighth of the tolerance, or half of it where
+        the tolerance is a large part of what the gradient shows, as near rest, where a correction
+        within it would move the state by much. A state is settled if each residual is within twice
+        the noise. A residual within a tolerance that underflows says nothing.
+        """
         scale = self.scale(jacobian, y)
         limit = self.tolerance(scale)
-        valid = ((limit >= float(info.tiny)) | (scale == 0)) & (limit < jnp.inf)
-        noise = jnp.where(64 * limit < scale - self.magnitude, 0.125, 0.5) * limit
-        reached = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(2), jnp.int8(1))
-        missed = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(0), jnp.int8(-1))
+        valid = (limit >= float(jnp.finfo(y.dtype).tiny)) | (scale == 0)
+        valid = valid & (limit < jnp.inf)
+        near_rest = _NEAR_REST * limit >= scale - self.magnitude
+        noise = jnp.where(near_rest, 1 / 2, _NOISE) * limit
+        on = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(SETTLED), jnp.int8(ON))
+        off = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(OFF), jnp.int8(NOT_FINITE))
         # Not by a maximum of residuals, which can lose NaN on a CPU.
-        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), reached, missed)), noise
+        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), on, off)), noise
 
-    def judged(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
+    def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.verdict(g, jacobian, y)[0] > 0
+        return self.level(g, jacobian, y)[0] >= ON
 
     def scaled(self, x: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         """Each component times its unit: `G diag(s)` of a Jacobian, and the correction `s Uᵀ λ` of
@@ -227,90 +233,3 @@ def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
 def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
     del size, axes
     return any_lane(jnp.any(flags)), False
-
-
-# ---- Gram matrices `G M⁻¹ Hᵀ`, which are singular where constraints depend on each other.
-#
-# A pivot at the level of roundoff belongs to a constraint whose gradient depends linearly on the
-# earlier ones; its multiplier is zero, which is exact for consistent constraints. Of gradients that
-# are only nearly parallel all are kept: the correction needs the direction in which they differ.
-
-
-def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
-    """`rows othersᵀ`."""
-    if len(rows) > WRITTEN_OUT_MAX:
-        return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)
-    return jnp.sum(rows[:, None, :] * others[None], axis=2)
-
-
-def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """`rowsᵀ multiplier`."""
-    if len(rows) > WRITTEN_OUT_MAX:
-        return jnp.matmul(multiplier, rows, precision=lax.Precision.HIGHEST)
-    return jnp.sum(multiplier[:, None] * rows, axis=0)
-
-
-def gram_solve(gram: Float[Array, "m m"], b: Array, noise: Array | None = None) -> Array:
-    """`gram⁻¹ b`, for a matrix not symmetric in general."""
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), noise))
-
-
-def eliminated(
-    gram: Float[Array, "m m"], b: Array, rows: Float[Array, "m n"], noise: Array | None = None
-) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-    """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
-    `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
-    in the sum, which is wrong if XLA evaluates `b` once for each. If a small matrix is written out,
-    what is within the `noise` of `b` is zero in `L⁻¹ b`: a small pivot would amplify it."""
-    m, dtype = len(gram), gram.dtype
-    if m > WRITTEN_OUT_MAX:
-        added, diagonal = _added(gram), jnp.abs(jnp.diagonal(gram))
-        unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-        scaled = gram * unit[:, None] * unit
-        right = (b * unit).astype(added.dtype)
-        lu, x = jsp.linalg.lu_factor(scaled + added), jnp.zeros_like(right)
-        for _ in range(3):  # which removes what is added
-            x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
-        return x.astype(dtype) * unit, rows
-    least = 4 * m * float(jnp.finfo(dtype).eps)
-    u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
-    small = [] if noise is None else list(noise)
-    for k in range(m):
-        regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
-        pivot = jnp.where(regular, u[k][k], jnp.inf)
-        if noise is not None:
-            x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
-        for i in range(k + 1, m):
-            below, right = u[i][k] / pivot, u[k][i] / pivot
-            x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
-            if noise is not None:  # what is not corrected is within half of the tolerance
-                small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * noise[i])
-            for j in range(k + 1, m):
-                u[i][j] = u[i][j] - below * u[k][j]
-        x[k] = x[k] / pivot
-    return jnp.stack(x), jnp.stack(d)
-
-
-def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
-    """`L⁻¹ S⁻¹` for `gram = L Lᵀ` and the diagonal matrix `S` of `sizes`. With the inverse of a
-    triangle each solve is two products."""
-    added = _added(gram) * jnp.where(gram > 0, gram, 1)
-    lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
-    one = jnp.eye(len(gram), dtype=added.dtype)
-    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
-
-
-def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-    """The largest element of each row, or one if all are zero, and the rows divided by it. In
-    float64 one: products of elements neither overflow nor underflow in usual units."""
-    if rows.dtype == jnp.float64:
-        return jnp.ones(len(rows)), rows
-    sizes = jnp.max(jnp.abs(rows), axis=1)
-    sizes = jnp.where(sizes > 0, sizes, 1)
-    return sizes, rows / sizes[:, None]
-
-
-def _added(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Roundoff that is added to a unit diagonal: dependent constraints have small multipliers."""
-    roundoff = 16 * len(gram) ** 0.5 * float(jnp.finfo(gram.dtype).eps)
-    return roundoff * jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .base import Problem, ProjectionInfo
-from .bounded import AbstractNewton, Box, project_within
-from .equations import Equations, combined, gram_matrix, gram_solve, in_units, scaled_rows
-from .loop import certain, solve
+from .descent import descend
+from .elimination import combined, gram_matrix, gram_solve, scaled_rows
+from .equations import Equations, in_units
+from .implicit import certain
 from .options import NEWTON_OPTIONS, option
+from .within_bounds import AbstractNewton, Box, project_within
 
 # The largest number of unknowns and constraints for which the nearest point is sought.
 _NEAREST_MAX = 512
@@ -95,7 +97,7 @@ def _nearest(
     """State and scaled multipliers, the sizes by which they are scaled, whether they are of the
     nearest point, and a count of iterations."""
     if box is None:
-        y, _, count = solve(equations, candidate, max_steps=max_steps, fresh=True, damped=True)
+        y, _, count = descend(equations, candidate, max_steps=max_steps)
     else:
         y, _, count = project_within(box, equations, candidate, max_steps=max_steps)
     n, (sizes, unit, gram, units) = y.size, _scaled(equations, y)
@@ -110,10 +112,10 @@ def _nearest(
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
         units=units,
     )
-    end, found, more = solve(optimality, start, max_steps=max_steps, fresh=True)
+    end, found, more = descend(optimality, start, max_steps=max_steps)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
-        found = found & equations.judged(end[:n])
+        found = found & equations.holds(end[:n])
     return jnp.where(found, end, start), sizes, found, count + more
 
 
@@ -147,7 +149,7 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     # Only the nearest point has a derivative; that of a failed projection is not used.
     sure = certain(equations, candidate, y, equations.linearise(y)[1])
     doubt = jnp.where(found, sure, jnp.nan)
-    doubt = lax.stop_gradient(jnp.where(equations.judged(y), doubt, 1))
+    doubt = lax.stop_gradient(jnp.where(equations.holds(y), doubt, 1))
     return solved, (doubt * tangent, None, None, None)
 
 

@@ -6,9 +6,9 @@ from typing import final
 from jaxtyping import Array, Float
 
 from .base import Problem, ProjectionInfo
-from .bounded import AbstractNewton, project_within
-from .loop import project_along
+from .implicit import project_along
 from .options import NEWTON_OPTIONS, option
+from .within_bounds import AbstractNewton, project_within
 
 
 @final

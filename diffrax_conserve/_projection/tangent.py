@@ -25,7 +25,8 @@ from .._manifold import (
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
-from .equations import combined, eliminated, equations_of, gram_matrix, gram_solve, scaled_rows
+from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
+from .equations import equations_of
 from .options import check_state, positive_weights, units_of
 from .scalars import written_out
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._projection.closed_form import ClosedForm
-from .._projection.equations import gram_solve
+from .._projection.elimination import gram_solve
 from ._base import real
 
 State = Float[Array, " species"]

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, Real
 
 from ..._custom_types import RealScalarLike, Y
-from ..._projection.bounded import check_bounds
+from ..._projection.within_bounds import check_bounds
 from ..._tree import tree_shapes
 from .flat import as_state, as_states, flatten
 

@@ -14,7 +14,8 @@ from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._options import check_counts
-from ..._projection.equations import combined, equations_of, gram_matrix, gram_solve, relative
+from ..._projection.elimination import combined, gram_matrix, gram_solve
+from ..._projection.equations import equations_of, relative
 from ..._projection.scalars import written_out
 from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
 

@@ -1,0 +1,217 @@
+"""The undamped iteration, for candidates as near as the local error of a step.
+
+It is Newton's method for the multipliers `λ` in `y = ŷ + s Uᵀ λ` (Hairer, Lubich and Wanner, IV.4).
+The directions `U` are the gradients at the candidate in the units `s`, so the result depends on the
+candidate and the multipliers alone, and has a derivative by the implicit function theorem.
+
+A single trajectory is fastest in arrays. In a batch of small systems the same iteration is written
+out in scalars; in every batch, lanes iterate together until none goes on. What matters for speed is
+how little the loop carries: a state and a count.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.custom_batching
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int
+
+from .elimination import (
+    WRITTEN_OUT_MAX,
+    combined,
+    eliminated,
+    gram_matrix,
+    gram_solve,
+    inverse_factor,
+    scaled_rows,
+)
+from .equations import NOT_FINITE, ON, SETTLED, Equations, any_lane
+from .scalars import components, in_scalars, joined
+
+# Newton's method for the multipliers converges quadratically. If that of several constraints has
+# not after this many iterations, the plane of its corrections may miss the manifold, as on circular
+# orbits, whose states are a curve: from then on it follows the gradients at the last state.
+FROZEN_STEPS = 6
+# A component that a correction reduces to as many units of roundoff of itself is zero, or, where
+# the terms of several constraints cancel in it, of these terms.
+_CANCELLED, _CANCELLED_TERMS = 2, 8
+
+
+class Solved(NamedTuple):
+    """The state, whether it is on the manifold, and the number of iterations."""
+
+    y: Float[Array, " n"]
+    ok: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
+def chord(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None = None,
+    *,
+    max_steps: int,
+) -> Solved:
+    """The state `y = ŷ + s Uᵀ λ` on the manifold. The `directions` are by default the gradients
+    `G diag(s)` at the candidate; see `FROZEN_STEPS`."""
+    arrays, static = eqx.partition((equations, candidate, directions), eqx.is_array)
+    few = directions is not None or equations.magnitude.size <= WRITTEN_OUT_MAX
+
+    def run(iterate: Callable[..., Solved], arrays: Any) -> Solved:
+        return iterate(*eqx.combine(arrays, static), max_steps)
+
+    if not few:
+        return jax.jit(ft.partial(run, _of_many))(arrays)
+    # Jitted, because jax batches the loop over the steps several times.
+    alone = jax.custom_batching.custom_vmap(jax.jit(ft.partial(run, _of_few)))
+    lane = jax.jit(ft.partial(run, ft.partial(_of_few, written_out=True)))
+
+    @alone.def_vmap
+    def batched(size: int, axes: Any, arrays: Any) -> Any:
+        del size
+        (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
+        return jax.vmap(lane, (axes,))(arrays), Solved(True, True, True)
+
+    return alone(arrays)
+
+
+def counter(max_steps: int) -> Int[Array, ""]:
+    """The number of tests that are left: one more than iterations, because the last state is
+    tested too. In the end it is 0, or -1 if the manifold was not reached. It fits into a byte."""
+    return jnp.asarray(max_steps + 1, jnp.int8 if max_steps < 126 else jnp.int32)
+
+
+def after_test(level: Array, left: Array, *, extra: int, gives_up: Array) -> Array:
+    """What is left after the test of a state.
+
+    A state whose residuals are noise is done. One that is merely within the tolerance is improved
+    by `extra` more iterations, which bring it to roundoff. A residual that is not finite cannot
+    recover, unless steps are shortened: where the iteration `gives_up`, it makes one more, so that
+    the NaN reaches the state, and stops.
+    """
+    more = jnp.minimum(left - 1, extra)
+    now = jnp.where(level >= ON, more, jnp.where(left == 1, -1, left - 1))
+    now = jnp.where((level == NOT_FINITE) & gives_up, jnp.minimum(now, 1), now)
+    now = jnp.where(level == SETTLED, 0, now)
+    return jnp.where(left > 0, now, left).astype(left.dtype)
+
+
+def _of_few(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None,
+    max_steps: int,
+    written_out: bool = False,
+) -> Solved:
+    """For up to four constraints: each iteration has a Jacobian and an elimination of its own."""
+    several = equations.magnitude.size > 1
+
+    def start(y: Any) -> Any:
+        if directions is not None:
+            return directions
+        return scaled_rows(equations.scaled(equations.linearise(y)[1]))[1]
+
+    def iterate(frozen: Any, y: Any, left: Array) -> tuple[Any, Array]:
+        seen = equations.linearise(y)
+        if not written_out:  # otherwise XLA evaluates residuals for each use
+            seen = lax.optimization_barrier(seen)
+        g, jacobian = seen
+        level, noise = equations.level(g, jacobian, y)
+        left = after_test(level, left, extra=1, gives_up=left > 0)
+        sizes, rows = scaled_rows(equations.scaled(jacobian))
+        along = frozen
+        if directions is None and several:
+            along = jnp.where(left > max_steps - FROZEN_STEPS, frozen, rows)
+        moved = corrected(equations, y, g / sizes, noise / sizes, rows, along)
+        return jnp.where(left > 0, moved, y), left
+
+    y: Any = candidate
+    left = counter(max_steps)
+    if written_out:
+        like = jax.eval_shape(start, y)
+        written: tuple[Any, ...] = in_scalars(start, y), in_scalars(iterate, like, y, left)
+        if None not in written:
+            # From here on arrays are tuples of scalars.
+            start, iterate = written
+            y = components(y)
+    if not isinstance(y, tuple):
+        y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
+    frozen = start(y)
+
+    def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+        y, left, count = carry
+        y, left = iterate(frozen, y, left)
+        return y, left, count + (left > 0).astype(int)
+
+    y, left, count = lax.while_loop(lambda x: any_lane(x[1] > 0), body, (y, left, jnp.asarray(0)))
+    return Solved(joined(candidate, y), left != -1, count)
+
+
+class _Seen(NamedTuple):
+    """The residuals at a state, and what is noise in them. With many constraints the loop carries
+    them, so that none is computed twice."""
+
+    g: Float[Array, " m"]
+    noise: Float[Array, " m"]
+
+
+def _of_many(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    directions: None,
+    max_steps: int,
+) -> Solved:
+    """For more constraints: the Gram matrix at the candidate is factored once."""
+    del directions
+    y = lax.optimization_barrier(candidate)
+
+    def test(g: Array, jacobian: Array, y: Array, left: Array) -> tuple[_Seen, Float[Array, ""]]:
+        level, noise = equations.level(g, jacobian, y)
+        return _Seen(g, noise), after_test(level, left, extra=1, gives_up=left > 0)
+
+    g, jacobian = equations.linearise(y)
+    scaled = equations.scaled(jacobian)
+    sizes, rows = scaled_rows(scaled)
+    inverse = inverse_factor(gram_matrix(rows, rows), sizes)
+    seen, left = test(g, jacobian, y, counter(max_steps))
+
+    def body(carry: tuple[Array, _Seen, Array, Array]) -> tuple[Array, _Seen, Array, Array]:
+        y, (g, noise), left, count = carry
+        g = jnp.where(jnp.abs(g) <= noise, 0, g)
+        half = combined(g.astype(inverse.dtype), inverse.T)
+        multiplier = combined(half, inverse).astype(g.dtype)
+        terms = combined(jnp.abs(multiplier), jnp.abs(scaled)) if equations.may_vanish else None
+        moved = _moved(equations, y, combined(multiplier, scaled), terms)
+        y = jnp.where(left > 0, moved, y)
+        seen, left = test(*equations.linearise(y), y, left)
+        return y, seen, left, count + (left > 0).astype(int)
+
+    start = y, seen, left, (left > 0).astype(int)
+    y, _, left, count = lax.while_loop(lambda x: any_lane(x[2] > 0), body, start)
+    return Solved(y, left != -1, count)
+
+
+def corrected(
+    equations: Equations, y: Array, g: Array, noise: Array, rows: Array, along: Array
+) -> Array:
+    """`y - s Vᵀ (U Vᵀ)⁻¹ g` for the rows `U`, which are scaled as the residuals `g` and their noise
+    are, and the directions `V`."""
+    gram, terms = gram_matrix(rows, along), None
+    if equations.may_vanish:
+        terms = combined(jnp.abs(gram_solve(gram, g, noise)), jnp.abs(along))
+    return _moved(equations, y, combined(*eliminated(gram, g, along, noise)), terms)
+
+
+def _moved(equations: Equations, y: Array, change: Array, terms: Array | None) -> Array:
+    """`y - s change`. If a correction cancels a component down to roundoff, that is set to zero: a
+    tolerance that is relative to the component could never be met by what is left."""
+    rest = y - equations.scaled(change)
+    size, units = jnp.abs(y), _CANCELLED
+    if terms is not None:
+        size, units = size + equations.scaled(terms), _CANCELLED_TERMS
+    return jnp.where(jnp.abs(rest) <= units * float(jnp.finfo(y.dtype).eps) * size, 0, rest)
