@@ -261,8 +261,8 @@ class _WriteOut:
             return [self._elementwise(fn, inputs)]
         if name in _REDUCTIONS and given.keys() == {"axes"} and inputs[0].size:
             return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
-        same_type = eqn.invars[0].aval.dtype == eqn.outvars[0].aval.dtype
-        if name == "dot_general" and given.keys() <= _DOT and same_type:
+        types = {var.aval.dtype for var in (*eqn.invars, *eqn.outvars)}
+        if name == "dot_general" and given.keys() <= _DOT and len(types) == 1:
             return [self._dot(inputs, params["dimension_numbers"])]
         if name in _CALLS or (name in _CALLS_WITH_A_RULE and not self.differentiated):
             inner = params.get("call_jaxpr", params.get("jaxpr"))
