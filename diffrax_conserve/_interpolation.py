@@ -100,7 +100,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             return y, info.ok & (length(y - candidate, units) <= limit)
 
         vector = ravel(candidate)
-        y, _ = _projected(eqx.filter_closure_convert(project, vector), vector)
+        y, _ = _or_candidate(eqx.filter_closure_convert(project, vector), vector)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
@@ -131,7 +131,7 @@ def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
 
 
 @eqx.filter_custom_jvp
-def _projected(
+def _or_candidate(
     project: Callable[..., Any], candidate: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """The projection of the candidate where that succeeds, otherwise the candidate, and which."""
@@ -139,9 +139,9 @@ def _projected(
     return jnp.where(ok, y, candidate), ok
 
 
-@_projected.def_jvp
-def _projected_jvp(primals: Any, tangents: Any) -> Any:
-    y, ok = _projected(*primals)
+@_or_candidate.def_jvp
+def _or_candidate_jvp(primals: Any, tangents: Any) -> Any:
+    y, ok = _or_candidate(*primals)
     _, t_y = eqx.filter_jvp(lambda *given: given[0](given[1])[0], primals, tangents)
     t_candidate = tree_tangents(y, tangents[1])
     return (y, ok), (jnp.where(ok, tree_tangents(y, t_y), t_candidate), None)

@@ -52,9 +52,7 @@ REAL_QUANTA = dfc.FirstIntegral(lambda t, y, args: quanta(t, join(y), args))
 @eqx.filter_jit
 def solve(projection, y0, vf, manifold):
     # The simplest of all solvers: what is compared is the projection. It starts out of bounds.
-    solver = dfc.ManifoldProjection(
-        dfx.Euler(), {"q": manifold}, projection=projection, max_correction=None
-    )
+    solver = dfc.ManifoldProjection(dfx.Euler(), {"q": manifold}, projection=projection)
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 0.6, 9))
     return dfx.diffeqsolve(dfx.ODETerm(vf), solver, 0.0, 0.6, 0.1, y0, ARGS, saveat=saveat)
 

@@ -1,6 +1,6 @@
 """Attack: adaptive solves whose projection becomes hopeless, with `max_steps=None` too.
 
-They are to end in a failure whose entry is `alpha`, at most 60 steps after the hopeless time. A
+They are to end in a failure whose entry is `alpha`, at most 150 steps after the hopeless time. A
 solve that never ends is killed by the runner, and found wrong.
 """
 
@@ -18,7 +18,7 @@ import diffrax_conserve as dfc
 from .oracle import Tally, is_told, log_uniform
 
 LANES, TIMEOUT = 10, 60
-T1, MORE = 6.0, 60
+T1, MORE = 6.0, 150
 
 
 def energy(t: Any, y: Any, args: Any) -> Any:
@@ -43,12 +43,8 @@ ALPHAS = {
     "jump of a constant": dfc.FirstIntegral(lambda t, y, a: later(t, a, 0.0, 1.0) + 0 * y[0]),
     "jump of a constraint": dfc.Constraint(lambda t, y, a: later(t, a, 0.0, 1.0) + 0 * y[0]),
     "runs away": dfc.FirstIntegral(lambda t, y, a: energy(t, y, a) + 10 * jnp.maximum(t - a[0], 0)),
-    "keeps q²": dfc.FirstIntegral(lambda t, y, args: y[0] ** 2),
-    "keeps p": dfc.FirstIntegral(lambda t, y, args: y[1]),
 }
 AT_START = {k for k in ALPHAS if "start" in k or "unreachable" in k}
-# Which correction is as long as half a step, if it is so at the start; then it must not succeed.
-NEVER_CONSERVED = {"keeps q²": 1, "keeps p": 0}
 # The state first shrinks to the equilibrium like a square root, in many steps that succeed: here
 # "steps" are those that are rejected.
 SINGULAR = {"runs away"}
@@ -95,25 +91,16 @@ def run(seed: int, number: int, lanes: int) -> Tally:
     cases = list(ALPHAS)
     case, solver = cases[(seed + number) % len(cases)], str(rng.choice(list(SOLVERS)))
     newton, endless, beside = rng.random(3) < (0.25, 0.5, 0.3)
-    # Two constraints would determine a pendulum.
-    beside = bool(beside and case not in NEVER_CONSERVED)
     y0 = rng.uniform(0.3, 1.5, (lanes, 2))
     args = rng.uniform(0.5, 4, (lanes, 1))
     rtol = log_uniform(rng, 1e-8, 1e-3, lanes)
-    solve = compiled(case, solver, bool(newton), bool(endless), beside)
+    solve = compiled(case, solver, bool(newton), bool(endless), bool(beside))
     result, *rest = solve(*map(jnp.asarray, (y0, args, rtol)))
     worst, steps, before, ended, y = map(np.asarray, rest)
     okay = np.asarray(result == dfx.RESULTS.successful)
     messages = [dfx.RESULTS[jax.tree.map(lambda x, i=i: x[i], result)] for i in range(lanes)]
-    unnamed = np.array([not is_told(message) for message in messages]) & ~okay
-    # Of a correction that was too far no entry failed.
-    failed = np.array(["max_correction" not in message for message in messages]) & ~okay
-    unnamed |= failed & (worst != 0)
-    told = np.ones(lanes, bool)
-    if case in NEVER_CONSERVED:
-        corrections = np.abs([np.sin(y0[:, 0]), y0[:, 1]])
-        told = corrections[NEVER_CONSERVED[case]] > 0.55 * np.sum(corrections, axis=0)
-    if case not in AT_START | NEVER_CONSERVED.keys():
+    unnamed = ~okay & (np.array([not is_told(message) for message in messages]) | (worst != 0))
+    if case not in AT_START:
         unnamed &= ended  # otherwise all steps were taken before
     allowed = np.where(case in AT_START, 0, np.where(ended, before, np.inf)) + MORE
     tally = Tally(lanes, int(okay.sum()))
@@ -122,8 +109,7 @@ def run(seed: int, number: int, lanes: int) -> Tally:
         what = f"{case}, {solver}, {newton=}, {endless=}, {beside=}, y0 = {y0[i]}, {args[i]}"
         return f"{what}, {rtol[i]=}: {steps[i]} steps ({before[i]}), y = {y[i]}, {messages[i]!r}"
 
-    tally.blame(f"{case}: success", okay & told, show)
+    tally.blame(f"{case}: success", okay, show)
     tally.blame(f"{case}: no name", unnamed, show)
-    if case not in NEVER_CONSERVED:
-        tally.blame(f"{case}: more than {MORE} more steps", ~okay & (steps > allowed), show)
+    tally.blame(f"{case}: more than {MORE} more steps", ~okay & (steps > allowed), show)
     return tally

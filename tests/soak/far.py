@@ -50,9 +50,7 @@ def compiled(name: str, mode: str) -> Any:
 
     def step(start: Any, candidate: Any, a: Any, value: Any, answer: Any) -> Any:
         # The field leads to the candidate, and conserves nothing.
-        solver = dfc.ManifoldProjection(
-            dfx.Euler(), manifold, projection=projection, max_correction=jnp.inf
-        )
+        solver = dfc.ManifoldProjection(dfx.Euler(), manifold, projection=projection)
         args, options = (a, 2 * (candidate - start)), dict(max_steps=2, throw=False)
         sol = solve(
             lambda t, y, args: args[1], solver, start, t1=0.5, dt0=0.5, args=args, **options
