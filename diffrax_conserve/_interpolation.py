@@ -17,12 +17,16 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.base import Target
-from ._projection.equations import length
+from ._projection.base import Target, has_bounds
+from ._projection.descent import descend
+from ._projection.equations import any_lane, length
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
+
+# The largest number of damped steps.
+_DAMPED_STEPS = 100
 
 
 @final
@@ -47,7 +51,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     The interpolant `u` of the wrapped solver ends at the candidate `ŷ₁`. It is moved so that it
     meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
-    a step is. Where that fails, or leads further away than the step is long, the value is the moved
+    a step is. Where that fails, damped steps with fresh gradients are tried from the same state.
+    Where they fail too, or lead further away than the step is long, the value is the moved
     interpolant itself, which is off the manifold by the error of the interpolation.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
@@ -95,12 +100,23 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         problem = target.problem(t, candidate, step)
         units, limit = problem.equations.units, lax.stop_gradient(self.limit)
 
+        def near(candidate: Array, y: Array, ok: Array) -> tuple[Array, Array]:
+            return y, ok & (length(y - candidate, units) <= limit)
+
         def project(candidate: Array) -> tuple[Array, Array]:
             y, info = target.projection.solve(problem, candidate)
-            return y, info.ok & (length(y - candidate, units) <= limit)
+            return near(candidate, y, info.ok)
+
+        def damped(candidate: Array) -> tuple[Array, Array]:
+            y, ok, _ = descend(problem.equations, candidate, max_steps=_DAMPED_STEPS)
+            return near(candidate, y, ok)
 
         vector = ravel(candidate)
-        y, _ = _or_candidate(eqx.filter_closure_convert(project, vector), vector)
+        # Damped steps keep no bounds.
+        attempts = [project] if has_bounds(target.projection) else [project, damped]
+        # Arrays over which the functions of the manifold close become leaves.
+        attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
+        y, _ = _first_of(attempts, vector)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
@@ -131,20 +147,33 @@ def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
 
 
 @eqx.filter_custom_jvp
-def _or_candidate(
-    project: Callable[..., Any], candidate: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-    """The projection of the candidate where that succeeds, otherwise the candidate, and which."""
+def _first_of(
+    attempts: list[Callable[..., Any]], candidate: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Int[Array, ""]]:
+    """The state of the first attempt that succeeds, or the candidate; and the number of attempts
+    that failed."""
+    project, *others = attempts
     y, ok = project(candidate)
-    return jnp.where(ok, y, candidate), ok
+    failed = jnp.where(ok, 0, 1)
+    for attempt in others:  # not evaluated where no lane needs it
+        found, better = lax.cond(
+            any_lane(~ok), lambda fn=attempt: fn(candidate), lambda y=y: (y, ~ok)
+        )
+        y, failed = jnp.where(ok, y, found), failed + jnp.where(ok | better, 0, 1)
+    return jnp.where(failed < len(attempts), y, candidate), failed
 
 
-@_or_candidate.def_jvp
-def _or_candidate_jvp(primals: Any, tangents: Any) -> Any:
-    y, ok = _or_candidate(*primals)
-    _, t_y = eqx.filter_jvp(lambda *given: given[0](given[1])[0], primals, tangents)
-    t_candidate = tree_tangents(y, tangents[1])
-    return (y, ok), (jnp.where(ok, tree_tangents(y, t_y), t_candidate), None)
+@_first_of.def_jvp
+def _first_of_jvp(primals: Any, tangents: Any) -> Any:
+    """Damped steps have no derivative, and the candidate has its own."""
+    attempts, candidate = primals
+    y, failed = _first_of(*primals)
+    given = (attempts[0], candidate), (tangents[0][0], tangents[1])
+    _, t_y = eqx.filter_jvp(lambda project, candidate: project(candidate)[0], *given)
+    t_candidate = tree_tangents(candidate, tangents[1])
+    t_y = jnp.where(failed == 0, tree_tangents(y, t_y), t_candidate)
+    by_damped_steps = (failed > 0) & (failed < len(attempts))
+    return (y, failed), (jnp.where(by_damped_steps, jnp.nan, 1) * t_y, None)
 
 
 @dataclasses.dataclass(frozen=True)

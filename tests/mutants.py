@@ -219,14 +219,14 @@ def trust_every_derivative(package):
 
 @noticed_by("tests/laws/test_never_silent.py", "-k", "no_nan")
 def return_a_state_that_was_not_projected_as_nan(package):
-    def mutate(projected):
-        def mutated(*arguments):
-            y, ok = projected(*arguments)
-            return jnp.where(ok, y, jnp.nan), ok
+    def mutate(first_of):
+        def mutated(attempts, candidate):
+            y, failed = first_of(attempts[:1], candidate)
+            return jnp.where(failed == 0, y, jnp.nan), failed
 
         return mutated
 
-    package.function("_or_candidate", mutate)
+    package.function("_first_of", mutate)
 
 
 @noticed_by("tests/laws/test_units.py", "-k", "units")
