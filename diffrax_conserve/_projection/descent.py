@@ -27,14 +27,23 @@ class _Best(NamedTuple):
     scale: Float[Array, " m"]
 
 
-def descend(equations: Equations, start: Float[Array, " n"], *, max_steps: int) -> Solved:
-    """A state on the manifold, near the start if that is near. Its derivative is unknown."""
+def descend(
+    equations: Equations,
+    start: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None = None,
+    *,
+    max_steps: int,
+    extra: int = 0,
+) -> Solved:
+    """A state on the manifold, near the start if that is near, along given `directions` or along
+    the gradients at each state; then its derivative is unknown. Once it is within the tolerance,
+    `extra` more iterations are made."""
 
     def body(carry: tuple[Array, _Best, Array, Array]) -> tuple[Array, _Best, Array, Array]:
         y, best, left, count = carry
         g, jacobian = lax.optimization_barrier(equations.linearise(y))
         level, noise = equations.level(g, jacobian, y)
-        left = after_test(level, left, extra=0, gives_up=left == max_steps + 1)
+        left = after_test(level, left, extra=extra, gives_up=left == max_steps + 1)
         first = best.largest == jnp.inf
         scale = jnp.where(first, equations.scale(jacobian, y), best.scale)
         sizes = jnp.abs(relative(g, scale))
@@ -42,7 +51,8 @@ def descend(equations: Equations, start: Float[Array, " n"], *, max_steps: int) 
         largest = jnp.where(better, jnp.max(sizes), best.largest)
         best = _Best(jnp.where(better, y, best.y), largest, scale)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
-        further = corrected(equations, y, g / sizes, noise / sizes, rows, rows)
+        along = rows if directions is None else directions
+        further = corrected(equations, y, g / sizes, noise / sizes, rows, along)
         further = jnp.where(left > 0, further, y)
         shorter = best.y + _SHORTER * (y - best.y)
         y = jnp.where(better | (left <= 0), further, shorter)

@@ -19,6 +19,8 @@ from .within_bounds import AbstractNewton, Box, project_within
 
 # The largest number of unknowns and constraints for which the nearest point is sought.
 _NEAREST_MAX = 512
+# Singular values below this many units of roundoff of the largest belong to dependent constraints.
+_SINGULAR = 64
 
 
 @final
@@ -112,7 +114,7 @@ def _nearest(
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
         units=units,
     )
-    end, found, more = descend(optimality, start, max_steps=max_steps)
+    end, found, more = descend(optimality, start, max_steps=max_steps, extra=1)
     if box is not None:
         end = jnp.concatenate([box.clip(end[:n]), end[n:]])
         found = found & equations.holds(end[:n])
@@ -158,7 +160,7 @@ def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array
     singular but consistent. NaN if `matrix` is not finite: LAPACK never returns from infinity."""
     fixed = lax.stop_gradient(jnp.where(jnp.isfinite(matrix), matrix, jnp.nan))
     u, s, vt = jnp.linalg.svd(fixed)
-    inverse = jnp.where(s > 64 * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)
+    inverse = jnp.where(s > _SINGULAR * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)
     return lax.custom_linear_solve(
         lambda x: combined(x, matrix.T),
         b,

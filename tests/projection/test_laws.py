@@ -150,7 +150,9 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, seed, share):
         if size[i] < 0.05:
             assert succeeds[i] == np.all(np.isfinite(ys[i]))
         if succeeds[i]:
-            np.testing.assert_allclose(batched[i], alone, rtol=1e-14, atol=1e-14)
+            # A path along fresh gradients, after six along frozen ones, amplifies roundoff.
+            tol = 1e-14 if alone_info.num_steps <= 6 else 1e-9
+            np.testing.assert_allclose(batched[i], alone, rtol=tol, atol=tol)
 
 
 @each_projection
