@@ -124,8 +124,8 @@ class DeepONet(AbstractFlowMap):
         candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate
-        values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
-        return self.layer(candidate, values, step[-1], self.scale, schedule)
+        start = 0.0, jtu.tree_map(jnp.asarray, y0)
+        return self.layer(candidate, step[-1], start, self.scale, schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
         *args, h = step

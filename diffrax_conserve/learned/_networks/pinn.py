@@ -34,8 +34,7 @@ class Window(AbstractTrainable):
         candidate = self.candidate(t)
         if self.layer is None:
             return candidate
-        values = self.layer.values(self.start, self.y0)
-        return self.layer(candidate, values, t, self.scale, schedule)
+        return self.layer(candidate, t, (self.start, self.y0), self.scale, schedule)
 
     def candidate(self, t: RealScalarLike) -> Y:
         t = jnp.asarray(t).astype(self.scale.dtype)

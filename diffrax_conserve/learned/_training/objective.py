@@ -51,7 +51,7 @@ class Problem(eqx.Module):
         return model.draw(times, self.sample, count, key)._replace(pairs=pairs)
 
     def defects(
-        self, model: AbstractTrainable, points: Points, schedule: LayerSchedule
+        self, model: AbstractTrainable, points: Points, schedule: LayerSchedule | None
     ) -> Float[Array, "points n"]:
         """`du/dt - f(t, u)` at every point, as vectors in the units of the model."""
         ts, ones = points.ts, jnp.ones_like(points.ts)
@@ -90,7 +90,7 @@ class Objective(eqx.Module):
     key: PRNGKeyArray
 
     def defects(
-        self, weights: Any, points: Points, schedule: LayerSchedule
+        self, weights: Any, points: Points, schedule: LayerSchedule | None
     ) -> Float[Array, "points n"]:
         model, problem, rows = eqx.combine(weights, self.static), self.problem, []
         if problem.vector_field is not None:
@@ -101,21 +101,21 @@ class Objective(eqx.Module):
             rows.append(problem.data.mismatch(model, points.pairs, schedule))
         return rows[0] if len(rows) == 1 else jnp.concatenate(rows, axis=1)
 
-    def loss(self, weights: Any, points: Points, schedule: LayerSchedule) -> Float[Array, ""]:
+    def loss(
+        self, weights: Any, points: Points, schedule: LayerSchedule | None
+    ) -> Float[Array, ""]:
         squares = squared_norms(self.defects(weights, points, schedule))
         return self.problem.recipe.loss(squares, self.typical)
 
     def criterion(self, weights: Any) -> Float[Array, ""]:
-        """The loss with all iterations of the layer, as the trained model is used."""
-        layer = self.static.layer
-        complete = jnp.asarray(0 if layer is None else layer.steps), jnp.ones(())
-        loss = self.loss(weights, self.first_points, complete)
+        """The loss with all of the layer, as the trained model is used."""
+        loss = self.loss(weights, self.first_points, None)
         return jnp.where(jnp.isfinite(loss), loss, jnp.inf)
 
-    def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule:
+    def schedule(self, epoch: Int[Array, ""]) -> LayerSchedule | None:
         layer, recipe = self.static.layer, self.problem.recipe
-        if layer is None:
-            return jnp.asarray(0), jnp.ones(())
+        if layer is None or recipe.schedule is None:
+            return None
         p, s = recipe.schedule(epoch, recipe.epochs, layer.steps)
         return p, jnp.asarray(s, float)
 
