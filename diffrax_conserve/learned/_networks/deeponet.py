@@ -185,9 +185,6 @@ class DeepONet(AbstractFlowMap):
         return self.core
 
     def linear_weights(self) -> tuple[Any, ...]:
-        # With a conservative layer the output is not linear in any weights.
-        if self.layer is not None:
-            return ()
         net = self.core.output_layer()
         return net.weights[-1], net.biases[-1]
 

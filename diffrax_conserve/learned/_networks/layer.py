@@ -76,27 +76,21 @@ class ConservativeLayer(eqx.Module):
     ) -> Y:
         """The state at time `t` on the manifold through the time and state of `start`. With
         `steps` the move of an iteration is at most the norm of `scale`."""
+        equations, vector = self.equations(candidate, t, start)
         if self.steps is None:
-            return self.projected(candidate, t, start)[0]
-        equations, vector = self._equations(candidate, t, start)
-        y = iterated(equations, vector, jnp.linalg.norm(scale), self.steps, schedule)
+            y, _, _ = _projected(equations, vector, ravel(start[1]).astype(vector.dtype))
+        else:
+            y = iterated(equations, vector, jnp.linalg.norm(scale), self.steps, schedule)
         return unravel(y, candidate)
-
-    def projected(
-        self, candidate: Y, t: RealScalarLike, start: tuple[RealScalarLike, Y]
-    ) -> tuple[Y, Bool[Array, ""]]:
-        """The state on the manifold, or the candidate, and whether it is the former."""
-        equations, vector = self._equations(candidate, t, start)
-        y, _, ok = _projected(equations, vector, ravel(start[1]).astype(vector.dtype))
-        return unravel(y, candidate), ok
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
         """The conserved values of the solution through `y0`."""
         return conserved_values(self.manifold, t0, y0, self.args)
 
-    def _equations(
+    def equations(
         self, candidate: Y, t: RealScalarLike, start: tuple[RealScalarLike, Y]
     ) -> tuple[Equations, Float[Array, " n"]]:
+        """Those of the manifold through `start`, and the candidate as a vector."""
         vector = ravel(candidate)
         values = ravel(self.values(*start)).astype(vector.dtype)
         return equations_of(self.manifold, values, t, candidate, self.args), vector

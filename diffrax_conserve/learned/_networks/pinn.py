@@ -67,7 +67,7 @@ class Window(AbstractTrainable):
 
     def linear_weights(self) -> tuple[Any, ...]:
         # With a conservative layer the output is not linear in any weights.
-        return () if self.layer is not None else (self.net.weights[-1], self.net.biases[-1])
+        return self.net.weights[-1], self.net.biases[-1]
 
 
 @final

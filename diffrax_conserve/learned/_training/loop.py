@@ -33,7 +33,7 @@ class FitLog(eqx.Module):
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        what was compared: the loss on the first collocation points with all iterations of a layer.
+        what was compared: the loss on the first collocation points, with the complete layer.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
     - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
