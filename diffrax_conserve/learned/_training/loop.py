@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .objective import Carry, Objective, Problem, advance, start
+from .second_order import SecondOrder
 from .state import FitState
 
 # Called with the number of epochs done, the total number, the last loss and the best criterion.
@@ -119,12 +120,20 @@ class Loop:
             ended = "interrupt"
         skipped = int(state.carry.skipped)
         if skipped and skipped == state.done:
-            raise FloatingPointError(
-                f"None of the {skipped} updates was finite. The vector field may not be finite "
-                "where the network leads, or the updates are too long: lower the learning rate."
-            )
+            raise FloatingPointError(self._none_finite(skipped))
         shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
         return state, shown.carry, ended
+
+    def _none_finite(self, count: int) -> str:
+        problem, parts = self.problem, []
+        if problem.vector_field is not None:
+            parts.append("the vector field may not be finite where the network leads")
+        if problem.data is not None:
+            parts.append("`data` may hold a state at which the loss has no derivative")
+        if not isinstance(problem.recipe.optimiser, SecondOrder):
+            parts.append("the updates may be too long: lower the learning rate")
+        reasons = "; ".join(parts)
+        return f"None of the {count} updates was finite: {reasons}."
 
     def _affordable(self, done: int, goal: int) -> int:
         """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
