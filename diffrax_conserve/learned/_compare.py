@@ -145,8 +145,7 @@ def compare(
     term = dfx.ODETerm(vector_field)
     with one_of(states):
         exact = _exact(term, states, h, args)
-    example, leaves = jtu.tree_map(lambda x: x[0], states), jtu.tree_leaves(exact)
-    sizes = [jnp.full(x[0].size, jnp.max(jnp.abs(x))) for x in leaves]
+    sizes = [jnp.full(x[0].size, jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(exact)]
     unit = jnp.maximum(jnp.concatenate(sizes), float(jnp.finfo(h.dtype).tiny))
 
     def errors(solver: dfx.AbstractSolver, count: int) -> np.ndarray:
@@ -160,24 +159,21 @@ def compare(
         "Tsit5": dfx.Tsit5(),
         "Dopri8": dfx.Dopri8(),
     }
-    rows = []
+    goal, rows = float(np.median(errors(methods["network"], 1))), []
     for name, solver in methods.items():
-        found, count = errors(solver, 1), 1
-        if name == "network":
-            goal = np.median(found)
-        else:
-            for count in _SUBSTEPS:
-                found = errors(solver, count)
-                if np.median(found) <= goal:
-                    break
-        reached = np.median(found) <= goal
-        times = []
-        for kind in (solver, None if manifold is None else ManifoldProjection(solver, manifold)):
-            for batch in (jtu.tree_map(lambda x: x[None], example), states):
-                size = jtu.tree_leaves(batch)[0].shape[0]
-                run = lambda y, k=kind, n=count: _solved(k, term, y, _STEPS * h, h / n, args)  # noqa: E731
-                times.append(np.nan if kind is None else _seconds(run, batch) / (_STEPS * size))
-        shown = count if reached else 0
+        count, found = 1, errors(solver, 1)
+        for count in _SUBSTEPS:
+            found = errors(solver, count)
+            if name == "network" or np.median(found) <= goal:
+                break
+        kinds = [solver] if manifold is None else [solver, ManifoldProjection(solver, manifold)]
+        times = [
+            _seconds(lambda y, k=k, n=count: _solved(k, term, y, _STEPS * h, h / n, args), batch)
+            for k in kinds
+            for batch in (jtu.tree_map(lambda x: x[:1], states), states)
+        ]
+        times = [*times, *[np.nan] * (4 - len(times))]
+        shown = count if np.median(found) <= goal else 0
         rows.append((name, shown, np.median(found), np.quantile(found, 0.99), *times))
     names, *columns = zip(*rows, strict=True)
     substeps, error, error_99, alone, batch, alone_projected, batch_projected = map(
@@ -250,10 +246,11 @@ def _derivatives(
 
 
 def _seconds(run: Callable[[Any], Any], batch: Any) -> float:
+    """The time for a step of one state, the shortest of some."""
     jax.block_until_ready(run(batch))
     spent = []
     for _ in range(_REPEATS):
         begun = time.perf_counter()
         jax.block_until_ready(run(batch))
         spent.append(time.perf_counter() - begun)
-    return min(spent)
+    return min(spent) / (_STEPS * jtu.tree_leaves(batch)[0].shape[0])

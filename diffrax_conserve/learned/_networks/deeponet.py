@@ -14,7 +14,15 @@ from ..._options import check_counts
 from ..._tree import unflatten
 from .cores import AbstractCore, Activation, Gated, Sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
-from .flat import as_states, check_key, check_scalars, flatten, stacked_vectors, working_dtype
+from .flat import (
+    as_states,
+    check_key,
+    check_scalars,
+    check_within,
+    flatten,
+    stacked_vectors,
+    working_dtype,
+)
 from .flow_map import AbstractFlowMap, checked_args
 from .layer import ConservativeLayer
 from .taylor import Taylor
@@ -121,6 +129,7 @@ class DeepONet(AbstractFlowMap):
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
             raise TypeError(f"This `DeepONet` is called as `{expected}`.")
+        check_within("h", step[-1], 0.0, self.max_step)
         candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate

@@ -114,8 +114,9 @@ def _projected(
     """`y = ŷ + G(ŷ)ᵀ λ` on the manifold, `λ`, and whether it was found."""
     del start
     _, rows = equations.linearise(candidate)
-    options = dict(max_steps=_MAX_STEPS, fresh=True, damped=True)
-    y, ok, _ = solve(equations, candidate, directions=rows, **options)
+    y, ok, _ = solve(
+        equations, candidate, max_steps=_MAX_STEPS, directions=rows, fresh=True, damped=True
+    )
     multipliers = gram_solve(gram_matrix(rows, rows), combined(y - candidate, rows.T))
     ok = ok & jnp.all(jnp.isfinite(multipliers))
     return jnp.where(ok, y, candidate), jnp.where(ok, multipliers, 0), ok

@@ -14,7 +14,15 @@ from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._options import check_counts
 from ..._tree import unflatten
 from .cores import MLP, Activation
-from .flat import as_state, check_key, check_scalars, flatten, stacked_vectors, working_dtype
+from .flat import (
+    as_state,
+    check_key,
+    check_scalars,
+    check_within,
+    flatten,
+    stacked_vectors,
+    working_dtype,
+)
 from .layer import ConservativeLayer
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times, checked_part
 
@@ -141,7 +149,9 @@ class PINN(eqx.Module):
         self.scale = flatten(jtu.tree_map(_magnitude, y0))
 
     def __call__(self, t: RealScalarLike) -> Y:
-        """The state at time `t`."""
+        """The state at time `t`. Outside the interval, which is known outside of `jit`, a
+        `ValueError`."""
+        check_within("t", t, self.t0, self.t1)
         return self.window(self._index(t))(t)
 
     @property

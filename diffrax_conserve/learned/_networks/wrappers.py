@@ -133,7 +133,8 @@ class BoxCox(eqx.Module):
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
     of zero is finite; 0 is the logarithm. At zero, where its derivative is infinite, that of this
-    class is zero, so that states with exact zeros can be learned. Powers of 1/2 are ten times as fast as others.
+    class is zero, so that states with exact zeros can be learned. Powers of 1/2 are ten times as
+    fast as others.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)

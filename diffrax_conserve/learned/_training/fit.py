@@ -86,7 +86,8 @@ def fit(
         cut until it is about 1e-7 (1e-4 in single precision), and above 1e-4 the solution is wrong.
     - `seconds`: ends the training after this wall time, without the compilation.
     - `progress`: whether to print lines on standard error, or a function of the number of epochs
-        done, the total number, the last loss and the best criterion.
+        done, the total number, the last loss and the best criterion, which may return `True` to
+        end the training.
 
     **Returns:**
 

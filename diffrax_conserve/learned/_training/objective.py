@@ -13,6 +13,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -209,7 +210,11 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     weights, points, state = carry.weights, objective.points(epoch), carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)
-        updates, state = optimiser.update(gradient, state, weights)
+        extra: dict[str, Any] = {}
+        if isinstance(optimiser, optax.GradientTransformationExtraArgs):  # such as `optax.lbfgs`
+            value_fn = lambda weights: objective.loss(weights, points, schedule)  # noqa: E731
+            extra = dict(value=loss, grad=gradient, value_fn=value_fn)
+        updates, state = optimiser.update(gradient, state, weights, **extra)
         return eqx.apply_updates(weights, updates), state, loss
     # For a second-order method the weights are one vector.
     vector, restore = ravel_pytree(weights)

@@ -57,7 +57,7 @@ def train_windows(
                 windows.own_error,
             )
             shown = windows.judged(state, objective.best(carry))
-            if ended in ("seconds", "interrupt"):
+            if ended in ("seconds", "interrupt", "progress"):
                 # A continued training judges the window at its end.
                 break
             state, ended = windows.next(shown), "epochs"
