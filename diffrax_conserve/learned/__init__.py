@@ -1,6 +1,8 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
 from . import paper as paper
+from ._compare import Comparison as Comparison
+from ._compare import compare as compare
 from ._files import read_info as read_info
 from ._networks.cores import Concatenated as Concatenated
 from ._networks.cores import Gated as Gated

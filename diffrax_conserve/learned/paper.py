@@ -14,7 +14,7 @@ from ._networks.cores import Product
 from ._networks.deeponet import DeepONet
 from ._networks.pinn import PINN
 from ._networks.trainable import LayerSchedule
-from ._training.recipe import Recipe, staged
+from ._training.recipe import Recipe
 
 
 def pinn(y0: Y, t0: RealScalarLike, t1: RealScalarLike, **options: Any) -> PINN:
@@ -46,12 +46,21 @@ def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) 
     """
     if isinstance(model, PINN):
         return Recipe(epochs=epochs, points=2000 if points is None else points, schedule=_projected)
-    return Recipe(epochs=epochs, points=5000 if points is None else points, loss=_bounded)
+    points = 5000 if points is None else points
+    return Recipe(epochs=epochs, points=points, schedule=_staged, loss=_bounded)
+
+
+def _staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
+    """No iteration of the layer at first and one more in each stage, with a weight that rises from
+    0 to 1, so that the trained function is continuous."""
+    position = epoch * (steps + 1) / epochs
+    p = jnp.minimum(steps, epoch * (steps + 1) // epochs)
+    return p, position - jnp.minimum(jnp.floor(position), steps)
 
 
 def _projected(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
-    """All iterations from the first epoch on, the last one with the weight of `staged`."""
-    return jnp.full_like(epoch, steps), staged(epoch, epochs, steps)[1]
+    """All iterations from the first epoch on, the last one with the weight of `_staged`."""
+    return jnp.full_like(epoch, steps), _staged(epoch, epochs, steps)[1]
 
 
 def _bounded(squares: Array, typical: Array) -> Float[Array, ""]:

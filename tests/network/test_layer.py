@@ -25,50 +25,51 @@ def residual(layer, y, values):
 
 
 @eqx.filter_jit
-def moved(layer, y, values, radius, schedule=None):
-    return layer(y, values, 0.0, radius, schedule)
+def moved(layer, y, start, radius=ONE, schedule=None):
+    """The state on the manifold through the state `start`, at time zero."""
+    return layer(y, 0.0, (0.0, start), radius, schedule)
 
 
 @given(st.integers(0, 10**6), st.integers(2, 12))
-def test_enough_iterations_reach_the_manifold_from_far_away(seed, halves):
+def test_it_reaches_the_manifold_from_far_away(seed, halves):
     distance = 10 ** (-halves / 2)  # from 0.1 to 1e-6
-    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=12)
-    values = layer.values(0.0, OMEGA0)
     candidate = OMEGA0 + distance * jr.normal(jr.key(seed), (3,))
-    y = moved(layer, candidate, values, ONE)
-    assert residual(layer, y, values) < 1e-14
+    for steps in (None, 12):
+        layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)
+        y = moved(layer, candidate, OMEGA0)
+        assert residual(layer, y, layer.values(0.0, OMEGA0)) < 1e-14
 
 
 def test_the_move_is_along_the_gradients_at_the_candidate():
-    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=8)
-    values = layer.values(0.0, OMEGA0)
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY)
     candidate = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
     rows = jnp.stack(jax.tree.leaves(jax.jacrev(lambda y: layer.values(0.0, y))(candidate)))
-    move = moved(layer, candidate, values, ONE) - candidate
+    move = moved(layer, candidate, OMEGA0) - candidate
     multipliers = np.linalg.lstsq(rows.T, move)[0]
     np.testing.assert_allclose(rows.T @ multipliers, move, atol=1e-15)
 
 
 def test_where_the_gradient_vanishes_nothing_blows_up():
-    layer = dfc.learned.ConservativeLayer(RADIUS, steps=5)
+    paper, layer = (dfc.learned.ConservativeLayer(RADIUS, steps=steps) for steps in (5, None))
     for scale in (0.0, 1e-300, 1e-12, 1e-3):
-        y = moved(layer, scale * EAST, layer.values(0.0, EAST), ONE)
-        assert float(jnp.max(jnp.abs(y))) <= 1 + 5
+        assert float(jnp.max(jnp.abs(moved(paper, scale * EAST, EAST)))) <= 1 + 5
+        y = moved(layer, scale * EAST, EAST)
+        assert bool(jnp.all(y == scale * EAST) | jnp.allclose(y, EAST))
 
 
 def test_dependent_integrals_change_nothing():
-    once, twice = (dfc.learned.ConservativeLayer(m, steps=8) for m in (RADIUS, (RADIUS, RADIUS)))
+    once, twice = (dfc.learned.ConservativeLayer(m) for m in (RADIUS, (RADIUS, RADIUS)))
     candidate = jnp.array([1.1, 0.3])
-    a, b = (moved(x, candidate, x.values(0.0, EAST), ONE) for x in (once, twice))
+    a, b = (moved(x, candidate, EAST) for x in (once, twice))
     np.testing.assert_allclose(a, b, atol=1e-9)
 
 
 def test_many_constraints_use_the_dense_solve():
     sphere = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2, axis=1))
-    layer = dfc.learned.ConservativeLayer(sphere, steps=8)
+    layer = dfc.learned.ConservativeLayer(sphere)
     y0 = jr.normal(jr.key(0), (12, 3))
     candidate = 1.1 * y0
-    y = moved(layer, candidate, layer.values(0.0, y0), ONE)
+    y = moved(layer, candidate, y0)
     np.testing.assert_allclose(y, y0, rtol=1e-14)
 
 
@@ -78,7 +79,7 @@ CANDIDATE = OMEGA0 + jnp.array([0.1, -0.2, 0.1])
 def scheduled(p, s, steps=3):
     layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)
     schedule = (jnp.asarray(p), jnp.asarray(s))
-    return moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE, schedule)
+    return moved(layer, CANDIDATE, OMEGA0, ONE, schedule)
 
 
 def test_a_schedule_blends_successive_iterates():
@@ -87,18 +88,19 @@ def test_a_schedule_blends_successive_iterates():
     for p in (1, 2, 3):
         # With `p` iterations in all, the layer makes them without a schedule.
         layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=p)
-        expected = moved(layer, CANDIDATE, layer.values(0.0, OMEGA0), ONE)
+        expected = moved(layer, CANDIDATE, OMEGA0)
         np.testing.assert_allclose(scheduled(p, 1.0), expected, rtol=1e-15)
         blend = 0.75 * scheduled(p - 1, 1.0) + 0.25 * scheduled(p, 1.0)
         np.testing.assert_allclose(scheduled(p, 0.25), blend, rtol=1e-14)
 
 
-def test_derivatives_with_respect_to_the_manifold_and_the_values():
+def test_derivatives_with_respect_to_the_manifold_and_the_start():
     @jax.jit
-    def moved_to(omega, value):
+    def moved_to(omega, start):
         energy = dfc.FirstIntegral(lambda t, y, args: (y[1] ** 2 + (omega * y[0]) ** 2) / 2)
-        layer = dfc.learned.ConservativeLayer(energy, steps=12)
-        return layer(jnp.array([1.1, 0.4]), value, 0.0, ONE)[0]
+        layer = dfc.learned.ConservativeLayer(energy)
+        start = 0.0, jnp.stack([start, 0.3])
+        return layer(jnp.array([1.1, 0.4]), 0.0, start, ONE)[0]
 
     point, h = jnp.array([1.3, 0.9]), 1e-6
     gradient = jnp.stack(jax.jit(jax.grad(moved_to, argnums=(0, 1)))(*point))
@@ -108,7 +110,7 @@ def test_derivatives_with_respect_to_the_manifold_and_the_values():
 
 
 def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifold():
-    layer = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=12)
+    layer = dfc.learned.ConservativeLayer(LORENZ.manifold)
     net = flow_map(layer=layer)
 
     @jax.jit
@@ -122,17 +124,58 @@ def test_the_time_derivative_of_a_conservative_network_is_tangent_to_the_manifol
 
 
 def test_a_conservative_network_is_its_candidate_moved():
-    layer = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=12)
+    layer = dfc.learned.ConservativeLayer(LORENZ.manifold)
     plain, y0 = flow_map(), LORENZ.y0
     conservative = eqx.filter_jit(flow_map(layer=layer))
     values = layer.values(0.0, y0)
-    expected = moved(layer, plain(y0, 0.2), values, plain.scale)
+    expected = moved(layer, plain(y0, 0.2), y0)
     np.testing.assert_allclose(conservative(y0, 0.2), expected, rtol=1e-14)
     assert residual(layer, conservative(y0, 0.2), values) < 1e-14
     np.testing.assert_allclose(conservative(y0, 0.0), y0, rtol=0, atol=1e-15)
     pinn = eqx.filter_jit(solution(layer=layer))
     assert residual(layer, pinn(1.5), values) < 1e-14
     np.testing.assert_allclose(pinn(0.0), y0, rtol=0, atol=1e-15)
+
+
+LOGARITHM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.log(y)))
+TOTAL = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
+
+
+@pytest.mark.parametrize("candidate", [[0.9, 0.5], [2.0, 1e-3], [3.0, -0.1], [0.0, 0.0]])
+@pytest.mark.parametrize("manifold", [LOGARITHM, (LOGARITHM, TOTAL)], ids=["one", "two"])
+def test_near_and_beyond_the_end_of_a_domain_all_derivatives_are_finite(candidate, manifold):
+    """A result is on the manifold, or it is the candidate, with the derivative of the candidate."""
+    layer, start = dfc.learned.ConservativeLayer(manifold), jnp.array([0.8, 0.7])
+    candidate = jnp.array(candidate)
+
+    @jax.jit
+    def derivatives(candidate):
+        to = lambda y: layer(y, 0.0, (0.0, start), ONE)  # noqa: E731
+        rate = lambda y: jax.jvp(to, (y,), (jnp.ones(2),))[1]  # noqa: E731
+        return to(candidate), jax.jacrev(to)(candidate), jax.jacrev(rate)(candidate)
+
+    y, slopes, curvatures = derivatives(candidate)
+    assert bool(jnp.all(jnp.isfinite(curvatures)))
+    if bool(jnp.all(y == candidate)):
+        np.testing.assert_array_equal(slopes, jnp.eye(2))
+    else:
+        assert residual(layer, y, layer.values(0.0, start)) < 1e-14
+
+
+@pytest.mark.parametrize("steps", [None, 2])
+def test_second_derivatives_are_those_of_differences(steps):
+    """Also of iterations that have not converged, as in the recipe of the paper."""
+    layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)
+    along = jnp.array([0.3, -0.5, 0.2])
+
+    @jax.jit
+    def rate(y):
+        return jax.jvp(lambda y: layer(y, 0.0, (0.0, OMEGA0), ONE), (y,), (along,))[1]
+
+    found, h = jax.jit(jax.jacrev(rate))(CANDIDATE), 1e-6
+    for i, direction in enumerate(h * jnp.eye(3)):
+        difference = (rate(CANDIDATE + direction) - rate(CANDIDATE - direction)) / (2 * h)
+        np.testing.assert_allclose(found[:, i], difference, atol=1e-7)
 
 
 def test_what_is_refused():

@@ -96,6 +96,22 @@ def test_data_that_make_no_sense(options, error, match):
         dfc.fit(network(), key=KEY, **options)
 
 
+@pytest.mark.parametrize("exponent", [0.1, 0.5, 0.75])
+def test_exact_zeros_train_in_box_cox_coordinates(exponent):
+    ts = jnp.broadcast_to(jnp.linspace(0, 2, 9), (40, 9))
+    ys = jnp.exp(Y0S)[:, None] * jnp.exp(-ts[..., None] * jnp.array([1.0, 3.0]))
+    ys = jnp.where(ys < 0.05, 0.0, ys)
+    boxcox = dfc.learned.BoxCox(exponent)
+    inner = dfc.DeepONet(boxcox(ys.reshape(-1, 2)), 1.0, width=8, depth=1, key=KEY)
+    before = dfc.learned.Transformed(inner, boxcox)
+    _, log = dfc.fit(before, data=(ts, ys), key=KEY, recipe=recipe(before, epochs=20, points=40))
+    assert log.skipped == 0
+    assert log.losses[-1] < log.losses[0]
+    logarithm = dfc.learned.Transformed(inner, dfc.learned.BoxCox(0.0))
+    with pytest.raises(ValueError, match="such as the logarithm of zero"):
+        dfc.fit(logarithm, data=(ts, ys), key=KEY)
+
+
 TRANSFORMATIONS = {
     "log": dfc.learned.BoxCox(0.0),
     "box-cox": dfc.learned.BoxCox(0.1),

@@ -114,6 +114,18 @@ def test_progress():
     assert calls[-1][3] <= calls[0][3]
 
 
+def test_progress_ends_a_training_by_returning_true():
+    _, log = train(circle(), progress=lambda done, *rest: done >= 20)
+    assert (log.ended, log.losses.size) == ("progress", 20)
+    np.testing.assert_array_equal(log.checked, [0, 20])
+
+
+def test_a_line_search_of_optax():
+    _, log = train(circle(), optimiser=optax.lbfgs(), epochs=20)
+    assert log.skipped == 0
+    assert log.criteria.min() < log.criteria[0] / 100
+
+
 def test_the_losses():
     q = jnp.array([0.0, 1.0, 3.0, 1e12])
     assert dfc.learned.Recipe().loss(q[:3], jnp.array(9.0)) == 4 / 3

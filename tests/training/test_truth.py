@@ -214,8 +214,7 @@ def test_it_ends_at_a_target_and_after_a_time():
     with pytest.warns(UserWarning, match="flow map is wrong"):
         _, log = dfc.fit(network, **options, seconds=1e-6)
     assert log.ended == "seconds"
-    assert log.losses.size == 24
-    assert not np.any(np.isfinite(log.losses))
+    assert log.losses.size == 0
     target = float(log.criteria.min()) / 2
     _, log = dfc.fit(network, **options, target=target)
     assert log.ended == "target"

@@ -14,7 +14,15 @@ from ..._options import check_counts
 from ..._tree import unflatten
 from .cores import AbstractCore, Activation, Gated, Sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
-from .flat import as_states, check_key, check_scalars, flatten, stacked_vectors, working_dtype
+from .flat import (
+    as_states,
+    check_key,
+    check_scalars,
+    check_within,
+    flatten,
+    stacked_vectors,
+    working_dtype,
+)
 from .flow_map import AbstractFlowMap, checked_args
 from .layer import ConservativeLayer
 from .taylor import Taylor
@@ -121,11 +129,12 @@ class DeepONet(AbstractFlowMap):
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
             raise TypeError(f"This `DeepONet` is called as `{expected}`.")
+        check_within("h", step[-1], 0.0, self.max_step)
         candidate = self.candidate(y0, *step)
         if self.layer is None:
             return candidate
-        values = self.layer.values(0.0, jtu.tree_map(jnp.asarray, y0))
-        return self.layer(candidate, values, step[-1], self.scale, schedule)
+        start = 0.0, jtu.tree_map(jnp.asarray, y0)
+        return self.layer(candidate, step[-1], start, self.scale, schedule)
 
     def candidate(self, y0: Y, *step: Any) -> Y:
         *args, h = step
@@ -185,9 +194,6 @@ class DeepONet(AbstractFlowMap):
         return self.core
 
     def linear_weights(self) -> tuple[Any, ...]:
-        # With a conservative layer the output is not linear in any weights.
-        if self.layer is not None:
-            return ()
         net = self.core.output_layer()
         return net.weights[-1], net.biases[-1]
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -47,6 +48,18 @@ def check_scalars(
         if np.ndim(value):
             raise TypeError(f"`{name}` is {value!r}, but it must be one number.")
         check_number(name, value, least=least, above=above, optional=optional)
+
+
+def check_within(name: str, value: Any, first: float, last: float) -> None:
+    """Raises if a value that is known, outside of `jit`, is not from `first` to `last`."""
+    if isinstance(value, jax.core.Tracer):
+        return
+    slack = 1e-6 * (last - first)
+    if not np.all((first - slack <= np.asarray(value)) & (np.asarray(value) <= last + slack)):
+        raise ValueError(
+            f"`{name}` is {value}, but the network was trained from {first:g} to {last:g}, and "
+            "does not extrapolate."
+        )
 
 
 def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:

@@ -14,7 +14,15 @@ from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._options import check_counts
 from ..._tree import unflatten
 from .cores import MLP, Activation
-from .flat import as_state, check_key, check_scalars, flatten, stacked_vectors, working_dtype
+from .flat import (
+    as_state,
+    check_key,
+    check_scalars,
+    check_within,
+    flatten,
+    stacked_vectors,
+    working_dtype,
+)
 from .layer import ConservativeLayer
 from .trainable import AbstractTrainable, LayerSchedule, Points, Sampler, Times, checked_part
 
@@ -34,8 +42,7 @@ class Window(AbstractTrainable):
         candidate = self.candidate(t)
         if self.layer is None:
             return candidate
-        values = self.layer.values(self.start, self.y0)
-        return self.layer(candidate, values, t, self.scale, schedule)
+        return self.layer(candidate, t, (self.start, self.y0), self.scale, schedule)
 
     def candidate(self, t: RealScalarLike) -> Y:
         t = jnp.asarray(t).astype(self.scale.dtype)
@@ -68,7 +75,7 @@ class Window(AbstractTrainable):
 
     def linear_weights(self) -> tuple[Any, ...]:
         # With a conservative layer the output is not linear in any weights.
-        return () if self.layer is not None else (self.net.weights[-1], self.net.biases[-1])
+        return self.net.weights[-1], self.net.biases[-1]
 
 
 @final
@@ -142,7 +149,9 @@ class PINN(eqx.Module):
         self.scale = flatten(jtu.tree_map(_magnitude, y0))
 
     def __call__(self, t: RealScalarLike) -> Y:
-        """The state at time `t`."""
+        """The state at time `t`. Outside the interval, which is known outside of `jit`, a
+        `ValueError`."""
+        check_within("t", t, self.t0, self.t1)
         return self.window(self._index(t))(t)
 
     @property

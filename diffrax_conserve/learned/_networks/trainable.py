@@ -61,4 +61,4 @@ class AbstractTrainable(eqx.Module):
 
     @abc.abstractmethod
     def linear_weights(self) -> Any:
-        """The weights in which the output is linear, as a tuple, which may be empty."""
+        """The weights in which the candidate is linear, as a tuple, perhaps empty."""

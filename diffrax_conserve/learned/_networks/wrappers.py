@@ -132,7 +132,9 @@ class BoxCox(eqx.Module):
     r"""$z = (y^\lambda - 1) / \lambda$ in every component, for states that are not negative.
 
     Its inverse is never negative. Small exponents spread magnitudes like a logarithm, but the image
-    of zero is finite; 0 is the logarithm. Powers of 1/2 are ten times as fast as others.
+    of zero is finite; 0 is the logarithm. At zero, where its derivative is infinite, that of this
+    class is zero, so that states with exact zeros can be learned. Powers of 1/2 are ten times as
+    fast as others.
     """
 
     exponent: float = eqx.field(static=True, default=0.1)
@@ -143,7 +145,9 @@ class BoxCox(eqx.Module):
 
     def __call__(self, y: Y) -> Y:
         p = self.exponent
-        return jtu.tree_map(lambda x: (_root(x, p) - 1) / p if p else jnp.log(x), y)
+        if p == 0:
+            return jtu.tree_map(jnp.log, y)
+        return jtu.tree_map(lambda x: (_of_positive(lambda x: _root(x, p), x) - 1) / p, y)
 
     def inverse(self, z: Y) -> Y:
         p = self.exponent
@@ -151,7 +155,14 @@ class BoxCox(eqx.Module):
             return jtu.tree_map(jnp.exp, z)
         # An integer power is a product of a few factors.
         power = round(1 / p) if 1 / p == round(1 / p) else 1 / p
-        return jtu.tree_map(lambda x: jnp.maximum(p * x + 1, 0) ** power, z)
+        return jtu.tree_map(lambda x: _of_positive(lambda x: x**power, p * x + 1), z)
+
+
+def _of_positive(function: Callable[[Array], Array], x: Array) -> Array:
+    """`function(x)` where `x` is positive, elsewhere zero with a derivative of zero: the derivative
+    of a root at zero is infinite, which times zero would be NaN."""
+    positive = x > 0
+    return jnp.where(positive, function(jnp.where(positive, x, 1)), 0)
 
 
 def _root(x: Array, exponent: float) -> Array:

@@ -59,7 +59,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz-standard")
         solver = dfc.DeepONetSolver(flow_map, corrections=4)
-        solver = dfc.ManifoldProjection(solver, system.manifold, projection=dfc.Newton())
+        solver = dfc.ManifoldProjection(solver, system.manifold)
         term = diffrax.ODETerm(system.vector_field)
         solution = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0)
         ```

@@ -223,4 +223,9 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
     whole = Data(jnp.asarray(ts, jnp.result_type(float)), ys, jnp.asarray(last), jnp.ones(1))
     pairs = whole.draw(2000, jr.key(0))
     deviation = jnp.sqrt(jnp.mean(jnp.square(flow_map.compared(pairs.y1s, pairs.y0s)), axis=0))
+    if not bool(jnp.all(jnp.isfinite(deviation))):
+        raise ValueError(
+            "`data` holds states whose coordinates are not finite, such as the logarithm of zero. "
+            "Leave them out, or take `BoxCox` with a positive exponent."
+        )
     return eqx.tree_at(lambda d: d.deviation, whole, jnp.where(deviation > 0, deviation, 1))

@@ -9,6 +9,7 @@ estimate has two correct digits both for an accurate solution and for a wrong on
 evaluate the defect at four times as many points as the training, and so between them.
 """
 
+import warnings
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -101,6 +102,32 @@ def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArra
     example = jtu.tree_map(lambda x: x[0], y0s)
     squares = jnp.mean(jnp.square(errors), axis=0)
     return relative(jnp.sqrt(squares), jnp.max(sizes, axis=0), example)
+
+
+@eqx.filter_jit
+def _off_manifold(model: AbstractTrainable, points: Points) -> Float[Array, ""]:
+    starts, ts = model.starts(points), points.ts
+    starts = jtu.tree_map(lambda x: jnp.broadcast_to(x, (ts.size, *x.shape[1:])), starts)
+
+    def off(y: Y, t: Array, t0: Array, y0: Y) -> Array:
+        equations, vector = model.layer.equations(y, t, (t0, y0))
+        return ~equations.judged(vector)
+
+    ys = model.states(points, ts, None)
+    return jnp.mean(jax.vmap(off)(ys, ts, starts.ts, starts.y0s))
+
+
+def warn_off_manifold(model: AbstractTrainable, points: Points) -> None:
+    """Warns if the layer finds no state on the manifold at some of the points."""
+    if model.layer is None or model.layer.steps is not None:
+        return
+    if (share := float(_off_manifold(model, points))) > 0:
+        warnings.warn(
+            f"At {share:.2g} of the collocation points the conservative layer finds no state on "
+            "the manifold near the output of the network, which it then leaves as it is. Train "
+            "longer, or a shorter step or interval.",
+            stacklevel=4,
+        )
 
 
 # For a flow map: the number of initial states, and of RK4 steps for the error of each.

@@ -13,7 +13,7 @@ from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
 from .checks import check_types, checked
-from .errors import flow_map_error
+from .errors import flow_map_error, warn_off_manifold
 from .loop import FitLog, Loop, Progress
 from .objective import Carry, VectorField
 from .recipe import Recipe
@@ -86,7 +86,8 @@ def fit(
         cut until it is about 1e-7 (1e-4 in single precision), and above 1e-4 the solution is wrong.
     - `seconds`: ends the training after this wall time, without the compilation.
     - `progress`: whether to print lines on standard error, or a function of the number of epochs
-        done, the total number, the last loss and the best criterion.
+        done, the total number, the last loss and the best criterion, which may return `True` to
+        end the training.
 
     **Returns:**
 
@@ -140,6 +141,7 @@ def _train_flow_map(loop: Loop, flow_map: Any, given: FitState | None) -> tuple[
     state, carry, ended = loop.train(objective, state, close_enough, error)
     trained = objective.best(carry)
     found = error(trained)
+    warn_off_manifold(trained, objective.first_points)
     if not found <= 0.1:  # not one correct digit
         warnings.warn(
             f"The trained flow map is wrong: its longest step has an estimated error of {found:.2g}"

@@ -15,10 +15,12 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from .objective import Carry, Objective, Problem, advance, start
+from .second_order import SecondOrder
 from .state import FitState
 
-# Called with the number of epochs done, the total number, the last loss and the best criterion.
-Progress = Callable[[int, int, float, float], None]
+# Called with the number of epochs done, the total number, the last loss and the best criterion. If
+# it returns `True` the training ends.
+Progress = Callable[[int, int, float, float], bool | None]
 
 
 @final
@@ -33,10 +35,11 @@ class FitLog(eqx.Module):
     - `errors`: for each window of a `PINN`, the error that this window alone causes.
     - `losses`: the training loss at each epoch, before its update.
     - `checked`, `criteria`: the epochs at which the model was compared with the best so far, and
-        what was compared: the loss on the first collocation points with all iterations of a layer.
+        what was compared: the loss on the first collocation points, with the complete layer.
     - `skipped`: the number of updates that were not finite. Each was replaced by a return to the
         best model so far, with a new state of the optimiser.
-    - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"` or `"interrupt"`.
+    - `ended`: why the training ended: `"epochs"`, `"target"`, `"seconds"`, `"interrupt"`, or
+        `"progress"` if that function returned `True`.
     - `seconds`, `compile_seconds`: the wall times of the training, and of all before its first
         epoch.
     - `state`: the state of the training, to continue it by `fit(..., state=log.state)`.
@@ -108,8 +111,10 @@ class Loop:
                 state = self._advanced(objective, state, stop, stop == goal)
                 if stop < goal:
                     continue
-                self._report(state, lambda s=state: estimate(objective.best(s.carry)))
-                if close_enough(state.carry):
+                stopped = self._report(state, lambda s=state: estimate(objective.best(s.carry)))
+                if stopped:
+                    ended = "progress"
+                elif close_enough(state.carry):
                     ended = "target"
                 elif state.done >= recipe.epochs:
                     ended = "epochs"
@@ -119,12 +124,20 @@ class Loop:
             ended = "interrupt"
         skipped = int(state.carry.skipped)
         if skipped and skipped == state.done:
-            raise FloatingPointError(
-                f"None of the {skipped} updates was finite. The vector field may not be finite "
-                "where the network leads, or the updates are too long: lower the learning rate."
-            )
+            raise FloatingPointError(self._none_finite(skipped))
         shown = state if ended != "seconds" else self._advanced(objective, state, state.done, True)
         return state, shown.carry, ended
+
+    def _none_finite(self, count: int) -> str:
+        problem, parts = self.problem, []
+        if problem.vector_field is not None:
+            parts.append("the vector field may not be finite where the network leads")
+        if problem.data is not None:
+            parts.append("`data` may hold a state at which the loss has no derivative")
+        if not isinstance(problem.recipe.optimiser, SecondOrder):
+            parts.append("the updates may be too long: lower the learning rate")
+        reasons = "; ".join(parts)
+        return f"None of the {count} updates was finite: {reasons}."
 
     def _affordable(self, done: int, goal: int) -> int:
         """The epoch up to which to train in one piece: `goal`, or less if the time is limited."""
@@ -153,14 +166,12 @@ class Loop:
         self, state: FitState, carry: Carry, ended: str, error: float, errors: Any = ()
     ) -> FitLog:
         found = dataclasses.replace(state, carry=carry).closed()
-        # The records of a network have one criterion more than losses.
-        compared = np.flatnonzero(~np.isnan(found.criteria))
         return FitLog(
             error=error,
             errors=np.asarray(errors),
             losses=found.losses,
-            checked=compared - compared // carry.criteria.size,
-            criteria=found.criteria[compared],
+            checked=found.checked,
+            criteria=found.criteria,
             skipped=found.skipped,
             ended=ended,
             seconds=self.elapsed,
@@ -180,10 +191,11 @@ class Loop:
         estimate(objective.best(state.carry))
         self.compile_seconds = time.perf_counter() - self.created
 
-    def _report(self, state: FitState, estimate: Callable[[], float]) -> None:
-        """Calls the function `progress`, or prints a line for each tenth of the epochs."""
+    def _report(self, state: FitState, estimate: Callable[[], float]) -> bool:
+        """Calls the function `progress`, or prints a line for each tenth of the epochs. Whether the
+        function ends the training."""
         if self.progress is False:
-            return
+            return False
         rest = (len(state.networks) - state.present) * self.problem.recipe.epochs
         done, total = state.losses.size + state.done, state.losses.size + rest
         # Before the first epoch there is no loss yet.
@@ -191,9 +203,10 @@ class Loop:
         loss = float(carry.losses[state.done - 1] if state.done else carry.criteria[0])
         best = float(carry.best)
         if self.progress is not True:
-            self.progress(done, total, loss, best)
-        elif done == total or done % max(total // 10, 1) == 0:
+            return self.progress(done, total, loss, best) is True
+        if done == total or done % max(total // 10, 1) == 0:
             epoch = f"epoch {done:>{len(str(total))}} of {total}: loss {loss:.3e}, best {best:.3e}"
             spent = f"{self.elapsed:.0f} s after {self.compile_seconds:.0f} s to compile"
             error = f"estimated error {estimate():.1e}"
             print(epoch, error, spent, sep=", ", file=sys.stderr, flush=True)
+        return False

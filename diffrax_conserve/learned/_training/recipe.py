@@ -17,19 +17,6 @@ from .._networks.trainable import LayerSchedule, Times
 from .second_order import SPRING, LevenbergMarquardt, Loss, SecondOrder
 
 
-def staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
-    """No iteration of the layer at first and one more in each stage, with a weight that rises from
-    0 to 1, so that the trained function is continuous."""
-    position = epoch * (steps + 1) / epochs
-    p = jnp.minimum(steps, epoch * (steps + 1) // epochs)
-    return p, position - jnp.minimum(jnp.floor(position), steps)
-
-
-def complete(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
-    del epochs
-    return jnp.full_like(epoch, steps), jnp.ones_like(epoch, float)
-
-
 def mean(squares: Array, typical: Array) -> Float[Array, ""]:
     del typical
     return jnp.mean(squares)
@@ -63,7 +50,7 @@ class Recipe(eqx.Module):
     optimiser: optax.GradientTransformation | SecondOrder = eqx.field(
         default_factory=lambda: optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3))
     )
-    schedule: Callable[[Array, int, int], LayerSchedule] = staged
+    schedule: Callable[[Array, int, int], LayerSchedule] | None = None
     loss: Loss = mean
     times: Times = uniform
     taylor: int = 0
@@ -88,10 +75,10 @@ Recipe.__init__.__doc__ = r"""**Arguments:**
 - `points`: the number of collocation points: times, or pairs of an initial state and a time.
 - `optimiser`: any [`optax.GradientTransformation`][], [`diffrax_conserve.learned.SPRING`][] or
     [`diffrax_conserve.learned.LevenbergMarquardt`][]. Default: Adam at 1e-3 and clipping.
-- `schedule`: for a conservative layer, a function `(epoch, epochs, steps)` of traced `epoch` that
-    returns $p$ and $s$. The network is trained through $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$
-    is its output after $k$ iterations. Default: one more iteration in each of `steps + 1` stages,
-    in each of which $s$ rises from 0 to 1.
+- `schedule`: for a conservative layer with `steps`, a function `(epoch, epochs, steps)` of traced
+    `epoch` that returns $p$ and $s$. The network is trained through
+    $(1 - s) P_{p-1} u + s P_p u$, where $P_k u$ is its output after $k$ iterations. Default: the
+    layer is complete in every epoch.
 - `loss`: a function from the squared norm $q$ of the defect at each point, and the median of
     $|f|^2$ over the initial states, to the loss. Default: the mean of $q$. With `lambda q, typical:
     jnp.mean(q / (1 + q / typical))` states that change too fast for the network do not dominate.
@@ -122,5 +109,5 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= 2000:
         # Up to 1,024 windows in the place of one.
         options: dict[str, Any] = dict(times=grid, check_every=5, retries=10)
-        return Recipe(updates(40), 120, LevenbergMarquardt(), complete, **options)
-    return Recipe(updates(1000), 250, SPRING(), complete, taylor=1, check_every=20, refresh=1)
+        return Recipe(updates(40), 120, LevenbergMarquardt(), **options)
+    return Recipe(updates(1000), 250, SPRING(), taylor=1, check_every=20, refresh=1)

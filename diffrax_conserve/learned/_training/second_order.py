@@ -112,7 +112,10 @@ _LENGTH = optax.linear_schedule(1.0, 0.0, 0.6, transition_begin=0.4)  # pyright:
 
 
 def _solve(gram: Array, damping: Array, rhs: Array) -> Array:
-    matrix = gram + damping * jnp.eye(rhs.size, dtype=rhs.dtype)
+    # Roundoff in the Gram matrix is proportional to its largest eigenvalue. A damping below it does
+    # not keep the matrix positive definite: in float32 four of five updates were then NaN.
+    roundoff = float(jnp.finfo(gram.dtype).eps) * jnp.trace(gram)
+    matrix = gram + jnp.maximum(damping, roundoff) * jnp.eye(rhs.size, dtype=rhs.dtype)
     return jsl.cho_solve(jsl.cho_factor(matrix, lower=True), rhs)
 
 

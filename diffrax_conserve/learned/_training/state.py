@@ -34,14 +34,20 @@ class FitState(eqx.Module):
     # The records of all networks without the present one.
     losses: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
     criteria: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0))
+    checked: np.ndarray = eqx.field(default_factory=lambda: np.zeros(0, int))  # epochs of these
     skipped: int = 0
 
     def closed(self) -> "FitState":
         """This state with its present network in the records."""
+        # Without what is reserved for epochs that were not made.
+        losses = np.asarray(self.carry.losses)[: max(self.done, 0)]
+        criteria = np.asarray(self.carry.criteria)[: self.done + 1]
+        compared = np.flatnonzero(~np.isnan(criteria))
         return dataclasses.replace(
             self,
-            losses=np.concatenate([self.losses, np.asarray(self.carry.losses)]),
-            criteria=np.concatenate([self.criteria, np.asarray(self.carry.criteria)]),
+            losses=np.concatenate([self.losses, losses]),
+            criteria=np.concatenate([self.criteria, criteria[compared]]),
+            checked=np.concatenate([self.checked, self.losses.size + compared]),
             skipped=self.skipped + int(self.carry.skipped),
             done=-1,
             trained=self.trained + 1,

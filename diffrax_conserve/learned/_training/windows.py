@@ -22,7 +22,8 @@ from ..._projection.project import project
 from .._networks.cores import fresh, initial_slope
 from .._networks.flat import flatten
 from .._networks.pinn import PINN, Window
-from .errors import relative, window_errors
+from .._networks.trainable import Points
+from .errors import relative, warn_off_manifold, window_errors
 from .loop import FitLog, Loop
 from .state import FitState
 
@@ -56,7 +57,7 @@ def train_windows(
                 windows.own_error,
             )
             shown = windows.judged(state, objective.best(carry))
-            if ended in ("seconds", "interrupt"):
+            if ended in ("seconds", "interrupt", "progress"):
                 # A continued training judges the window at its end.
                 break
             state, ended = windows.next(shown), "epochs"
@@ -66,6 +67,9 @@ def train_windows(
             raise
         ended = "interrupt"
     along = windows.errors_along(shown)
+    for window in shown.networks if pinn.layer is not None else ():
+        ts = jnp.linspace(window.start, window.start + window.length, loop.problem.recipe.points)
+        warn_off_manifold(window, Points(ts, None))
     if not max(along) <= windows.wrong:
         windows.warn(shown, along)
     if ended == "epochs" and loop.target is not None and max(along) <= loop.target:

@@ -1,0 +1,48 @@
+"""The iterations of the paper's conservative layer, whose number grows in the training.
+
+Their derivatives are those of what is computed, iteration by iteration, also far from the manifold.
+"""
+
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..._projection.elimination import combined, gram_matrix, gram_solve
+from ..._projection.equations import Equations, relative
+from .trainable import LayerSchedule
+
+
+def iterated(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    radius: Float[Array, ""],
+    steps: int,
+    schedule: LayerSchedule | None,
+) -> Float[Array, " n"]:
+    r"""`ŷ + G(ŷ)ᵀ λ` with `λ = (1 - s) λ_{p-1} + s λ_p`, where `schedule` is `(p, s)`; by default
+    `λ` after all `steps`. Iterations beyond the `p`-th are not computed.
+
+    Newton's method in `λ`, with rows scaled to norm one, a damping `μ = min(1e-2, |g|²)` that
+    vanishes with the residual relative to its scale, and moves of at most `radius`. As printed, the
+    algorithm also freezes `G(y)` at `ŷ` and does not damp, and so needs an output that is close.
+    """
+    dtype = candidate.dtype
+    p, s = (jnp.asarray(steps), jnp.ones(())) if schedule is None else schedule
+    before, rows = equations.linearise(candidate)
+
+    def improve(multipliers: Array) -> Array:
+        y = candidate + combined(multipliers, rows)
+        g, jacobian = equations.linearise(y)
+        ratio = relative(g, equations.scale(jacobian, y))
+        damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
+        gram = gram_matrix(jacobian, rows)
+        change = gram_solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)
+        step = combined(change, rows)
+        return multipliers - lax.rsqrt(1 + jnp.sum(step * step) / radius**2) * change
+
+    def iterate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
+        return lax.cond(i < p, lambda c: (c[1], improve(c[1])), lambda c: c, carry), None
+
+    zeros = jnp.zeros_like(before)
+    (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
+    return candidate + combined(previous + s.astype(dtype) * (last - previous), rows)
