@@ -120,8 +120,8 @@ def learned_solvers(
 ) -> dict[str, dfx.AbstractSolver]:
     """The standard network, the conservative one, and the standard one projected afterwards.
 
-    A network can be far from the manifold, so the projection is `Newton`, in the Euclidean metric of
-    the paper. The conservative network is projected too, because its layer makes only a few
+    A network can be far from the manifold, so the projection is `Newton`, in the Euclidean metric
+    of the paper. The conservative network is projected too, because its layer makes only a few
     iterations.
     """
     standard, conservative = (
