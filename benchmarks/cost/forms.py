@@ -60,7 +60,7 @@ FORMS: dict[str, Callable[[Any], Any]] = {
 def solve(system: Any, manifold: Any, steps: int, y0: Any) -> Any:
     solver = dfc.RK4()
     if manifold is not None:
-        solver = dfc.ManifoldProjection(solver, manifold, max_correction=None)
+        solver = dfc.ManifoldProjection(solver, manifold)
     solution = dfx.diffeqsolve(
         dfx.ODETerm(system.vector_field),
         solver,

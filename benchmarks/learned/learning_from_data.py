@@ -79,8 +79,7 @@ class Network(eqx.Module):
 
 
 def projected(solver, manifold):
-    options = dict(projection=dfc.Newton(), max_correction=None)
-    return dfc.ManifoldProjection(solver, manifold, **options)
+    return dfc.ManifoldProjection(solver, manifold, projection=dfc.Newton())
 
 
 def solve(field, solver, y0, times, step=SPACING):

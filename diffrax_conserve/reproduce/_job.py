@@ -10,6 +10,7 @@ from typing import Any
 import diffrax as dfx
 import jax.tree_util as jtu
 
+from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
 from .._tree import tree_size
@@ -44,8 +45,9 @@ def solvers(system: AbstractSystem, networks: dict[str, Any]) -> dict[str, dfx.A
         projection = system.mechanism.positive_projection()
         kept = ManifoldProjection(dfx.Kvaerno5(), system.manifold, projection=projection)
         return {"kvaerno5": dfx.Kvaerno5(), "projected kvaerno5": kept}
-    # The paper projects whatever RK4 proposes, too long steps of the double pendulum as well.
-    projected = ManifoldProjection(RK4(), system.manifold, max_correction=None)
+    # The paper knows the Euclidean distance only, so its systems are projected in that metric.
+    projection = SimplifiedNewton(metric=1.0 if is_learned(system) else None)
+    projected = ManifoldProjection(RK4(), system.manifold, projection=projection)
     classical = {"rk4": RK4(), "projected rk4": projected}
     return classical | (learned_solvers(system, networks) if networks else {})
 

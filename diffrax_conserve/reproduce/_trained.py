@@ -120,8 +120,9 @@ def learned_solvers(
 ) -> dict[str, dfx.AbstractSolver]:
     """The standard network, the conservative one, and the standard one projected afterwards.
 
-    A network can be far from the manifold, so the projection is `Newton`. The conservative network
-    is projected too, because its layer makes only a few iterations.
+    A network can be far from the manifold, so the projection is `Newton`, in the Euclidean metric
+    of the paper. The conservative network is projected too, because its layer makes only a few
+    iterations.
     """
     standard, conservative = (
         PINNSolver(network) if isinstance(network, PINN) else DeepONetSolver(network)
@@ -129,7 +130,7 @@ def learned_solvers(
     )
 
     def projected(solver: dfx.AbstractSolver) -> ManifoldProjection:
-        return ManifoldProjection(solver, system.manifold, projection=Newton())
+        return ManifoldProjection(solver, system.manifold, projection=Newton(metric=1.0))
 
     return {
         "standard": standard,
