@@ -111,7 +111,7 @@ def _off_manifold(model: AbstractTrainable, points: Points) -> Float[Array, ""]:
 
     def off(y: Y, t: Array, t0: Array, y0: Y) -> Array:
         equations, vector = model.layer.equations(y, t, (t0, y0))
-        return ~equations.judged(vector)
+        return ~equations.holds(vector)
 
     ys = model.states(points, ts, None)
     return jnp.mean(jax.vmap(off)(ys, ts, starts.ts, starts.y0s))
