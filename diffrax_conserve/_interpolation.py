@@ -122,9 +122,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 
 @eqx.filter_custom_jvp
-def _evaluated(
-    projected: Callable[[Array], Y], moved: Callable[[Array], Y], t: RealScalarLike
-) -> Y:
+def _evaluated(projected: Callable[..., Y], moved: Callable[..., Y], t: RealScalarLike) -> Y:
     del moved
     return projected(t)
 

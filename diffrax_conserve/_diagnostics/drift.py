@@ -75,10 +75,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         4e-08
         ```
     """
-    values, residual = _residuals(sol, manifold, args, "drift")
-    t0, y0 = sol.ts[0], jtu.tree_map(lambda y: y[0], sol.ys)
-    _, scale = measure(manifold, values, t0, y0, args)
-    return jax.vmap(lambda t, y: relative(residual(t, y), scale))(sol.ts, sol.ys)
+    ts, ys, values, residual = _residuals(sol, manifold, args, "drift")
+    _, scale = measure(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
+    return jax.vmap(lambda t, y: relative(residual(t, y), scale))(ts, ys)
 
 
 def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bool[Array, " times"]:
@@ -120,7 +119,7 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         0
         ```
     """
-    values, residual = _residuals(sol, manifold, args, "off_manifold")
+    ts, ys, values, residual = _residuals(sol, manifold, args, "off_manifold")
     numbers = jnp.abs(ravel(values))
 
     def at(t: Array, y: Y) -> Array:
@@ -130,14 +129,15 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         limit = 2 * ROUNDOFF_MULTIPLE * float(jnp.finfo(g.dtype).eps) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 
-    return jax.vmap(at)(sol.ts, sol.ys)
+    return jax.vmap(at)(ts, ys)
 
 
 def _residuals(
     sol: dfx.Solution, manifold: Manifold, args: Args, user: str
-) -> tuple[Values, Callable[[Array, Y], Values]]:
-    """The conserved values at the start of a solve, and the residuals as a function of a saved time
-    and state, zero where diffrax padded them. Raises unless `sol` has what they need."""
+) -> tuple[Array, Any, Values, Callable[[Array, Y], Values]]:
+    """The saved times and states, the conserved values at the start of the solve, and the residuals
+    as a function of a saved time and state, zero where diffrax padded them. Raises unless `sol` has
+    what they need."""
     check_solution(sol, user)
     check_manifold(manifold)
     if sol.ts is None or sol.ys is None:
@@ -191,7 +191,7 @@ def _residuals(
         found = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
         return jtu.tree_map(lambda x: jnp.where(padded, 0, x), found)
 
-    return values, residual
+    return sol.ts, sol.ys, values, residual
 
 
 def _gained(

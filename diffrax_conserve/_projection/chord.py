@@ -47,7 +47,7 @@ class Solved(NamedTuple):
 
     y: Float[Array, " n"]
     ok: Bool[Array, ""]
-    count: Int[Array, ""]
+    num_steps: Int[Array, ""]
 
 
 def chord(
@@ -75,7 +75,8 @@ def chord(
     def batched(size: int, axes: Any, arrays: Any) -> Any:
         del size
         (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
-        return jax.vmap(lane, (axes,))(arrays), Solved(True, True, True)
+        is_batched: Any = Solved(*[True] * 3)  # pyright: ignore
+        return jax.vmap(lane, (axes,))(arrays), is_batched
 
     return alone(arrays)
 

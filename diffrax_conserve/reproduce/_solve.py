@@ -103,12 +103,13 @@ def _timed(
     started = time.process_time()
     compiled = _solve.lower(*arguments).compile()  # pyright: ignore[reportFunctionMemberAccess]
     compile_seconds = time.process_time() - started
-    solution, found = None, []
-    while len(found) < _RUNS_MAX and sum(found) < _SECONDS_MAX:
+    solution: Any = None
+    times: list[float] = []
+    while len(times) < _RUNS_MAX and sum(times) < _SECONDS_MAX:
         started = time.process_time()
         solution = jax.block_until_ready(compiled(*arguments))
-        found.append(time.process_time() - started)
-    seconds = min(found)
+        times.append(time.process_time() - started)
+    seconds = min(times)
 
     batch_drift = jax.vmap(lambda sol: drift(sol, system.manifold, system.args))
     drifts = eqx.filter_jit(batch_drift)(solution)
