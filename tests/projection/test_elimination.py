@@ -1,0 +1,75 @@
+"""The linear systems of projections, by themselves, against numpy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffrax_conserve._projection import elimination, equations
+
+EPS = np.finfo(np.float64).eps
+
+
+@jax.jit
+def correction(rows, others, b):
+    """`othersᵀ (rows othersᵀ)⁻¹ b`, and the multipliers."""
+    gram = elimination.gram_matrix(rows, others)
+    along = elimination.combined(*elimination.eliminated(gram, b, others))
+    return along, elimination.gram_solve(gram, b)
+
+
+@pytest.mark.parametrize("m", [1, 2, 4, 5, 12])
+def test_independent_rows_agree_with_numpy(m):
+    rng = np.random.default_rng(m)
+    for _ in range(20):
+        rows, b = rng.normal(size=(m, 15)), rng.normal(size=m)
+        others = rows + 0.1 * rng.normal(size=rows.shape)  # the gradients at two states
+        gram = rows @ others.T
+        multiplier = np.linalg.solve(gram, b)
+        along, found = correction(rows, others, b)
+        tol = 100 * m * EPS * np.linalg.cond(gram)
+        np.testing.assert_allclose(found, multiplier, atol=tol * np.max(np.abs(multiplier)))
+        np.testing.assert_allclose(rows @ along, b, atol=tol * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("m", [2, 3, 4, 7, 13])
+def test_dependent_rows_are_corrected_if_they_are_consistent(m):
+    """They may outnumber the unknowns, or be zero."""
+    rng = np.random.default_rng(m)
+    independent = rng.normal(size=(max(1, m // 2), 12))
+    mixed = np.concatenate([np.eye(len(independent)), rng.normal(size=(m, len(independent)))])[:m]
+    mixed[-1] *= m % 2  # a zero row
+    rows = mixed @ independent
+    b = mixed @ rng.normal(size=len(independent))
+    along, multiplier = correction(rows, rows, b)
+    assert np.all(np.isfinite(multiplier))
+    np.testing.assert_allclose(rows @ along, b, atol=1e-10 * np.max(np.abs(b)))
+    shortest = np.linalg.lstsq(rows, b, rcond=1e-10)[0]
+    np.testing.assert_allclose(along, shortest, atol=1e-9 * np.max(np.abs(shortest)))
+
+
+@pytest.mark.parametrize("m", [2, 6])
+def test_columns_in_other_units_change_no_bit(m):
+    """What a power of two does to a column and to its unit cancels."""
+    rng = np.random.default_rng(m)
+    rows, units, b = rng.normal(size=(m, 9)), rng.uniform(1, 2, 9), rng.normal(size=m)
+    factors = 2.0 ** rng.integers(-40, 40, 9)
+    change, _ = correction(rows * units, rows * units, b)
+    again, _ = correction(rows / factors * (units * factors), rows * units, b)
+    np.testing.assert_array_equal(change, again)
+
+
+def test_a_factor_is_the_inverse_and_exists_for_dependent_rows():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(8, 10))
+    inverse = np.asarray(elimination.inverse_factor(rows @ rows.T, np.ones(8)))
+    np.testing.assert_allclose(inverse.T @ inverse @ (rows @ rows.T), np.eye(8), atol=1e-9)
+    rows[3] = rows[1]
+    assert np.all(np.isfinite(elimination.inverse_factor(rows @ rows.T, np.ones(8))))
+
+
+def test_the_scale_of_a_residual_is_the_size_of_its_terms():
+    y = np.array([3.0, -4.0])
+    jacobian = jnp.array([[2.0, 0.5], [0.0, 0.0]])
+    np.testing.assert_array_equal(equations.shown_terms(jacobian, y), [8.0, 0.0])
+    assert equations.relative(jnp.array(2.0), jnp.array(0.0)) == 2.0
