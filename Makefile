@@ -115,7 +115,7 @@ COSTS := core overhead gradients work_precision scaling unlike_lanes devices bal
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
   parameters defaults held_out
-STUDIES := max_correction claims long_run refusals
+STUDIES := max_correction claims long_run refusals units
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
