@@ -1,0 +1,203 @@
+"""The answer does not depend on the units: neither its digits, nor how accurate it is.
+
+What is exact is computed here in numpy, by Kepler's equation or in closed form.
+"""
+
+import functools
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import RIGID_BODY, rigid_body
+
+
+def kepler(t, y, mu):
+    return jnp.concatenate([y[2:], -mu * y[:2] / jnp.sum(y[:2] ** 2) ** 1.5])
+
+
+KEPLER = {
+    "energy": dfc.FirstIntegral(lambda t, y, mu: y[2:] @ y[2:] / 2 - mu / jnp.sqrt(y[:2] @ y[:2])),
+    "momentum": dfc.FirstIntegral(lambda t, y, mu: y[0] * y[3] - y[1] * y[2]),
+}
+
+
+def pendulum(t, y, _):
+    pull = (y[2:] @ y[2:] - y[1]) / (y[:2] @ y[:2])
+    return jnp.append(y[2:], jnp.array([0.0, -1.0]) - pull * y[:2])
+
+
+PENDULUM = {
+    "length": dfc.Constraint(lambda t, y, _: y[:2] @ y[:2] - 1),
+    "energy": dfc.FirstIntegral(lambda t, y, _: y[2:] @ y[2:] / 2 + y[1]),
+}
+# The field, what is kept, a start, the solver and the projection.
+SYSTEMS = {
+    "Kepler": (kepler, KEPLER, [0.8, 0.3, -0.4, 1.0], dfx.Tsit5(), dfc.SimplifiedNewton()),
+    "rigid body": (rigid_body, RIGID_BODY, [1.0, 0.3, -0.6], dfc.RK4(), dfc.Newton()),
+    "pendulum": (pendulum, PENDULUM, [0.8, 0.6, 0.0, 0.0], dfc.RK4(), dfc.SimplifiedNewton()),
+}
+
+
+def in_units(fn, factor):
+    """`fn` of what is in units of `args[0]`, and of `args[1]` for time, times `factor(args)`."""
+    return lambda t, y, args: factor(args) * fn(t / args[1], y / args[0], 1.0)
+
+
+def natural(field, manifold, y0, solver, projection):
+    """Saved times, an event, statistics and a derivative, all brought back to natural units."""
+    manifold = {
+        k: type(entry)(in_units(entry.fn, lambda args, i=i: args[2][i]))
+        for i, (k, entry) in enumerate(manifold.items())
+    }
+    term = dfx.ODETerm(in_units(field, lambda args: args[0] / args[1]))
+    projected = dfc.ManifoldProjection(solver, manifold, projection=projection)
+
+    def run(y0, units, clock, sizes):
+        crossed = lambda t, y, args, **kwargs: clock * (y[1] / units[1] + 0.1)  # noqa: E731
+        event = dfx.Event(crossed, optx.Newton(1e-10, 1e-10 * clock)) if len(y0) > 3 else None
+        pid = dfx.PIDController(rtol=1e-5, atol=1e-5 * units)
+        sol = dfx.diffeqsolve(
+            term, projected, 0.0 * clock, 9 * clock, 0.1 * clock, y0 * units, (units, clock, sizes),
+            event=event, max_steps=100, throw=False, adjoint=dfx.ForwardMode(),
+            saveat=dfx.SaveAt(ts=clock * jnp.linspace(0, 0.4, 9), t1=True, solver_state=True),
+            stepsize_controller=pid if isinstance(solver, dfx.Tsit5) else dfx.ConstantStepSize(),
+        )  # fmt: skip
+        counts, happened = dfc.statistics(sol), sol.result == dfx.RESULTS.event_occurred
+        happened = happened | (event is None) & dfx.is_okay(sol.result)
+        kept = counts.num_iterations, counts.residual_before, counts.residual_after
+        return sol.ys / units, (sol.ts / clock, *kept, happened)
+
+    y0 = jnp.array(y0)
+    return jax.jit(
+        lambda *units: jax.jvp(lambda y: run(y, *units), (y0,), (jnp.cos(y0 + 1),), has_aux=True)
+    )
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_powers_of_two_as_units_change_nothing(name):
+    _, manifold, y0, *_ = SYSTEMS[name]
+    run, shapes = natural(*SYSTEMS[name]), (len(y0), (), len(manifold))
+    expected = jax.tree.leaves(run(*map(np.ones, shapes)))
+    assert expected[-1]
+    assert all(np.all(np.isfinite(x)) for x in expected)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        got = run(*(np.asarray(2.0 ** rng.integers(-40, 41, shape)) for shape in shapes))
+        for a, b in zip(jax.tree.leaves(got), expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+TURNS, EARTH, SUN = 12, 3.986004418e14, 1.32712440018e20
+# The gravitational parameter and the semi-major axis: a low orbit, another in km, and a planet.
+BODIES = ((EARTH, 7.078e6), (EARTH / 1e9, 4.2164e4), (SUN, 1.496e11))
+LANES = [(*body, e) for body in BODIES for e in (0.0, 1e-5, 1e-2, 0.2)]
+
+
+def on_ellipse(mu, a, e, mean_anomaly):
+    m = np.asarray(mean_anomaly, np.longdouble)
+    anomaly = m + e * np.sin(m)
+    for _ in range(8):
+        anomaly -= (anomaly - e * np.sin(anomaly) - m) / (1 - e * np.cos(anomaly))
+    c, s, b = np.cos(anomaly), np.sin(anomaly), np.sqrt(1 - e * e)
+    speed = np.sqrt(mu / a) / (1 - e * c)
+    states = np.stack([a * (c - e), a * b * s, -speed * s, speed * b * c], axis=-1)
+    return states.astype(float)
+
+
+@jax.jit
+@jax.vmap
+def orbit(ts, y0, mu, size):
+    """Plain and projected, at saved times and at the steps."""
+    options = dict(
+        saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(t0=True, steps=True)]),
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6 * size), throw=False,
+        max_steps=600,
+    )  # fmt: skip
+    solve = functools.partial(dfx.diffeqsolve, dfx.ODETerm(kepler), **options)
+    times = 0.0, ts[-1], ts[-1] / TURNS / 50
+    projected = dfc.ManifoldProjection(dfx.Dopri8(), KEPLER)
+    return [solve(solver, *times, y0, mu) for solver in (dfx.Dopri8(), projected)]
+
+
+def test_orbits_beat_plain_and_no_saved_state_is_of_another_time():
+    mu, a, e = np.transpose(LANES)[:, :, None]
+    rate = np.sqrt(mu / a**3)
+    size, y0 = np.stack([a, a, a * rate, a * rate], axis=-1), on_ellipse(mu, a, e, 0.7)
+    errors, ts = [], 2 * np.pi * TURNS / rate * np.linspace(0, 1, 301)
+    for sol in orbit(ts, y0[:, 0], mu[:, 0], size[:, 0]):
+        assert np.all(dfx.is_okay(sol.result))
+        for t, y in zip(sol.ts, sol.ys, strict=True):
+            saved = np.isfinite(t)
+            off = (y - on_ellipse(mu, a, e, 0.7 + rate * np.where(saved, t, 0))) / size
+            errors.append(np.max(np.where(saved, np.max(np.abs(off), axis=-1), 0), axis=1))
+    plain, plain_steps, projected, steps = errors
+    assert np.all(projected < plain)
+    assert np.median(projected / plain) < 0.1
+    # A saved state errs as the steps do, beside what plain's interpolant errs.
+    assert np.all(projected <= 3 * (steps + np.maximum(plain - plain_steps, 0)) + 1e-12)
+
+
+def test_newton_finds_perigees_on_circles_in_what_closes_over_a_traced_value():
+    a, phases = 4.2164e7, np.linspace(0.3, 6.0, 8)
+    rate = np.sqrt(EARTH / a**3)
+    size = np.array([a, a, a * rate, a * rate])
+
+    @jax.jit
+    def find(mu, y0):
+        kept = [dfc.FirstIntegral(lambda t, y, _, f=v.fn: f(t, y, mu)) for v in KEPLER.values()]
+        solver = dfc.ManifoldProjection(dfx.Dopri8(), kept)
+        # An angle: in metres no root finder meets an absolute tolerance of 1e-10.
+        event = dfx.Event(lambda t, y, args, **kwargs: y[1] / jnp.sqrt(y[:2] @ y[:2]),
+                          optx.Newton(1e-10, 1e-10), direction=True)  # fmt: skip
+        return jax.vmap(lambda y0: dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, _: kepler(t, y, mu)), solver, 0.0, 7.5 / rate, 0.1 / rate, y0,
+            event=event, throw=False,
+            stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8 * size)))(y0)  # fmt: skip
+
+    sol = find(EARTH, np.concatenate([on_ellipse(EARTH, a, e, phases) for e in (0.0, 2e-4)]))
+    assert np.all(sol.result == dfx.RESULTS.event_occurred)
+    np.testing.assert_allclose(sol.ts[:, 0] * rate, np.tile(2 * np.pi - phases, 2), atol=1e-6)
+
+
+PROTON, RATE = 1.67262192e-27, 7.6e7
+PROTON_KEEPS = {
+    "energy": dfc.FirstIntegral(lambda t, y, _: PROTON * (y[2:] @ y[2:]) / 2),
+    "momentum": dfc.FirstIntegral(
+        lambda t, y, _: PROTON * (y[0] * y[3] - y[1] * y[2] + RATE / 2 * (y[:2] @ y[:2]))
+    ),
+}
+# A proton in a magnetic field in SI, and an electron on a circle in atomic units: the field, what
+# is kept, the angular frequency, and the states by its cosine and sine.
+PEOPLES = {
+    "proton": (lambda t, y, _: jnp.append(y[2:], RATE * jnp.stack([y[3], -y[2]])), PROTON_KEEPS,
+               RATE, lambda c, s: [4e4 / RATE * s, 4e4 / RATE * (c - 1), 4e4 * c, -4e4 * s]),
+    "electron": (kepler, KEPLER, 1.0, lambda c, s: [c, s, -s, c]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("proton", float), ("electron", np.float32)])
+def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype):
+    field, manifold, rate, state = PEOPLES[name]
+    phases, eps = np.linspace(0, 16 * np.pi, 161), np.finfo(dtype).eps
+    exact = np.stack(state(np.cos(phases), np.sin(phases)), axis=-1)
+
+    @jax.jit
+    def run(y0, ts):
+        solvers = dfc.RK4(), dfc.ManifoldProjection(dfc.RK4(), manifold)
+        times, options = (ts[0], ts[-1], ts[1] / 2), dict(saveat=dfx.SaveAt(ts=ts), throw=False)
+        mu, term = jnp.ones((), dtype), dfx.ODETerm(field)
+        sols = [dfx.diffeqsolve(term, solver, *times, y0, mu, **options) for solver in solvers]
+        okay, drift = dfx.is_okay(sols[1].result), dfc.drift(sols[1], manifold, mu)
+        return [sol.ys for sol in sols], okay, drift
+
+    found, okay, drift = run(*(jnp.asarray(x, dtype) for x in (exact[0], phases / rate)))
+    assert okay
+    assert max(np.max(np.abs(x)) for x in jax.tree.leaves(drift)) < 100 * eps
+    plain, projected = (np.max(np.abs(x - exact) / np.max(np.abs(exact), axis=0)) for x in found)
+    assert projected <= max(plain, 100 * eps)
