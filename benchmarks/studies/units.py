@@ -225,7 +225,7 @@ def other_times():
 def perigee(solver, y0, axis, scale):
     # An angle: in metres no root finder meets an absolute tolerance of 1e-10.
     event = dfx.Event(
-        lambda t, y, mu, **_: (axis @ y[:2]) / jnp.sqrt(y[:2] @ y[:2]),
+        lambda t, y, args, **_: (axis @ y[:2]) / jnp.sqrt(y[:2] @ y[:2]),
         optx.Newton(1e-10, 1e-10), direction=True,
     )  # fmt: skip
     options = dict(rtol=1e-9, atol=1e-9 * scale, event=event)
@@ -240,7 +240,7 @@ def events():
         axis = np.stack([-np.sin(orbits.angle), np.cos(orbits.angle)], -1)
         for solver in (dfx.Dopri8(), dfc.ManifoldProjection(dfx.Dopri8(), KEPLER)):
             t, okay = perigee(solver, orbits.y0, axis, orbits.scale)
-            error = np.abs(t - (2 * np.pi - phases) / orbits.rate)
+            error = np.abs(np.asarray(t) - (2 * np.pi - phases) / orbits.rate)
             off.append(np.where(okay, error, np.inf).astype(float))
         found = off[0] < 1
         missed, ratio = np.sum(off[1][found] > 60), largest(off[1][found]) / largest(off[0][found])
