@@ -35,7 +35,7 @@ from .scalars import components, in_scalars, joined
 
 # Newton's method for the multipliers converges quadratically. If that of several constraints has
 # not after this many iterations, the plane of its corrections may miss the manifold, as on circular
-# orbits, whose states are a curve: from then on it follows the gradients at the last state.
+# orbits, whose states are a curve: then it starts again, along the gradients at the last state.
 FROZEN_STEPS = 6
 # A component that a correction reduces to as many units of roundoff of itself is zero, or, where
 # the terms of several constraints cancel in it, of these terms.
@@ -114,10 +114,14 @@ def _of_few(
 
     def start(y: Any) -> Any:
         if directions is not None:
-            return directions
-        return scaled_rows(equations.scaled(equations.linearise(y)[1]))[1]
+            return y, directions
+        return y, scaled_rows(equations.scaled(equations.linearise(y)[1]))[1]
 
-    def iterate(frozen: Any, y: Any, left: Array) -> tuple[Any, Array]:
+    def iterate(first: Any, y: Any, left: Array) -> tuple[Any, Array]:
+        candidate, along = first
+        refreshed = directions is None and several
+        if refreshed:  # from the candidate, because a plane that misses may lead far away
+            y = jnp.where(left == max_steps - FROZEN_STEPS, candidate, y)
         seen = equations.linearise(y)
         if not written_out:  # otherwise XLA evaluates residuals for each use
             seen = lax.optimization_barrier(seen)
@@ -125,9 +129,8 @@ def _of_few(
         level, noise = equations.level(g, jacobian, y)
         left = after_test(level, left, extra=1, gives_up=left > 0)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
-        along = frozen
-        if directions is None and several:
-            along = jnp.where(left > max_steps - FROZEN_STEPS, frozen, rows)
+        if refreshed:
+            along = jnp.where(left > max_steps - FROZEN_STEPS, along, rows)
         moved = corrected(equations, y, g / sizes, noise / sizes, rows, along)
         return jnp.where(left > 0, moved, y), left
 
@@ -142,11 +145,11 @@ def _of_few(
             y = components(y)
     if not isinstance(y, tuple):
         y = lax.optimization_barrier(y)  # otherwise XLA evaluates it for each use
-    frozen = start(y)
+    first = start(y)
 
     def body(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         y, left, count = carry
-        y, left = iterate(frozen, y, left)
+        y, left = iterate(first, y, left)
         return y, left, count + (left > 0).astype(int)
 
     y, left, count = lax.while_loop(lambda x: any_lane(x[1] > 0), body, (y, left, jnp.asarray(0)))
