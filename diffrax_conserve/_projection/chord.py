@@ -129,7 +129,7 @@ def _of_few(
         level, noise = equations.level(g, jacobian, y)
         left = after_test(level, left, extra=1, gives_up=left > 0)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
-        if refreshed:
+        if refreshed:  # and in the extra iteration, within the tolerance, where both are alike
             along = jnp.where(left > max_steps - FROZEN_STEPS, along, rows)
         moved = corrected(equations, y, g / sizes, noise / sizes, rows, along)
         return jnp.where(left > 0, moved, y), left
