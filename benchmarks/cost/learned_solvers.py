@@ -20,7 +20,6 @@ import jax.random as jr
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._training.objective import Problem, start
-from diffrax_conserve.learned._training.recipe import complete
 from diffrax_conserve.reproduce._trained import KINDS, build, is_flow_map, is_learned
 
 OUT = Path(__file__).parent.parent / "results" / "learned_solvers.json"
@@ -51,7 +50,7 @@ def epoch(system, kind, points):
     if isinstance(network, dfc.PINN):
         network = network.window(0)
     sample = system.sample if is_flow_map(system) else None
-    recipe = dfc.learned.Recipe(epochs=1, points=points, schedule=complete)
+    recipe = dfc.learned.Recipe(epochs=1, points=points)
     problem = Problem(system.vector_field, None, sample, None, recipe)
     objective, carry = start(problem, network, jr.key(2))
 

@@ -203,7 +203,8 @@ def hand_written_c(problem: Problem, start: np.ndarray) -> dict[str, Contestant]
 def fixed_step_contestants(
     problem: Problem, solver: dfx.AbstractSolver, start: np.ndarray
 ) -> dict[str, Contestant]:
-    projected = dfc.ManifoldProjection(solver, problem.system.manifold)
+    nearest = dfc.SimplifiedNewton(metric=1.0)  # as by hand and in C
+    projected = dfc.ManifoldProjection(solver, problem.system.manifold, projection=nearest)
     contestants = {
         "plain": compiled(solve, problem, solver, start),
         "projected": compiled(solve, problem, projected, start, MAX_DRIFT),

@@ -126,13 +126,16 @@ def compare(
     !!! example
 
         ```python
+        import contextlib
+
         import diffrax_conserve as dfc
         import jax
 
         system = dfc.systems.get("conservative-lorenz")
         flow_map = dfc.load_pretrained("conservative-lorenz")
         states = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), 100))
-        verdict = dfc.learned.compare(flow_map, system.vector_field, states)
+        with contextlib.redirect_stdout(None):  # without this it prints the table
+            verdict = dfc.learned.compare(flow_map, system.vector_field, states)
         ```
     """
     flow_map, states = as_flow_map(flow_map), as_states(states)
