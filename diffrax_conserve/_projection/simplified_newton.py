@@ -21,10 +21,11 @@ class SimplifiedNewton(AbstractNewton):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    Two iterations are enough for nearly every step of an integrator. With more than four scalar
-    constraints the matrix is that at the candidate, factored once, so that after a long step it
-    takes more iterations, and fails sooner. For candidates far away use
-    [`diffrax_conserve.Newton`][].
+    Two iterations are enough for nearly every step of an integrator. If two to four constraints are
+    not met after six, the plane of the corrections may miss the manifold, as on a circular orbit:
+    then the iteration starts again along fresh gradients, and the derivative is NaN. With more than
+    four the matrix is that at the candidate, factored once, so that after a long step it takes more
+    iterations, and fails sooner. For candidates far away use [`diffrax_conserve.Newton`][].
 
     The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state,
     independent of the number of iterations. It is NaN where the gradients of the constraints are so
