@@ -29,7 +29,7 @@ from .._manifold import (
 )
 from .._options import ONE_STATE, one_of
 from .._printing import printed
-from .._projection.equations import equations_of, relative
+from .._projection.equations import Jacobian, equations_of, relative, shown_terms
 from .._projection.roundoff import hidden_terms
 from .._tree import ravel, unravel
 
@@ -212,10 +212,10 @@ def _relative_sizes(
         along = Along(entry.fn, vector_field)(t, unravel(vector, y), args)
         return ravel(along).astype(dtype) - rate
 
-    def terms_at(vector: Array, jacobian: Array) -> Array:
+    def terms_at(vector: Array, jacobian: Jacobian) -> Array:
         state = unravel(vector, y)
         slope = ravel(slope_like(state, vector_field(t, state, args)))
-        return jnp.sum(jnp.abs(jacobian * slope), axis=1) + jnp.abs(partial) + jnp.abs(rate)
+        return shown_terms(jacobian, slope) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)
     # Where each term is zero nothing is tested, unless that is so beside the state too, as it is of
@@ -224,15 +224,21 @@ def _relative_sizes(
     beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
     idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field.
-    _, _, hidden = hidden_terms(excess, vector)
-    terms = jnp.where(hidden > 4 * terms, hidden, terms)
+    if equations.pattern is None:
+        _, _, hidden = hidden_terms(excess, vector)
+        terms = jnp.where(hidden > 4 * terms, hidden, terms)
     # An integral that is not finite counts as not conserved, though its derivative may vanish.
     defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)
     violation = jnp.zeros_like(residual)
     if isinstance(entry, Constraint):
         violation = relative(residual, equations.scale(jacobian, vector))
     defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
-    return defect, violation, jnp.all(jacobian == 0) & jnp.all(partial == 0), idle
+    return (
+        defect,
+        violation,
+        ~jnp.any(shown_terms(jacobian, jnp.ones_like(vector))) & jnp.all(partial == 0),
+        idle,
+    )
 
 
 def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:

@@ -137,7 +137,7 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
         # A maximum can lose NaN on a CPU.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        success = equations.level(after, jacobian, y)[0] >= ON if ok is None else ok
+        success = equations.level(after, scale)[0] >= ON if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence

@@ -25,13 +25,14 @@ from .elimination import (
     WRITTEN_OUT_MAX,
     combined,
     eliminated,
+    factored,
     gram_matrix,
     gram_solve,
-    inverse_factor,
     scaled_rows,
 )
 from .equations import NOT_FINITE, ON, SETTLED, Equations, any_lane
 from .scalars import components, in_scalars, joined
+from .sparse import SparseRows
 
 # Newton's method for the multipliers converges quadratically. If that of several constraints has
 # not after this many iterations, the plane of its corrections may miss the manifold, as on circular
@@ -126,7 +127,7 @@ def _of_few(
         if not written_out:  # otherwise XLA evaluates residuals for each use
             seen = lax.optimization_barrier(seen)
         g, jacobian = seen
-        level, noise = equations.level(g, jacobian, y)
+        level, noise = equations.level(g, equations.scale(jacobian, y))
         left = after_test(level, left, extra=1, gives_up=left > 0)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
         if refreshed:  # and in the extra iteration, within the tolerance, where both are alike
@@ -156,48 +157,46 @@ def _of_few(
     return Solved(joined(candidate, y), left != -1, count)
 
 
-class _Seen(NamedTuple):
-    """The residuals at a state, and what is noise in them. With many constraints the loop carries
-    them, so that none is computed twice."""
-
-    g: Float[Array, " m"]
-    noise: Float[Array, " m"]
-
-
 def _of_many(
     equations: Equations,
     candidate: Float[Array, " n"],
     directions: None,
     max_steps: int,
 ) -> Solved:
-    """For more constraints: the Gram matrix at the candidate is factored once."""
+    """For more constraints, dense or sparse: an iteration evaluates only the residuals. The Gram
+    matrix at the candidate is factored once, and residuals are judged by their scales there. By
+    those at the result it is decided at the end whether that is on the manifold."""
     del directions
     y = lax.optimization_barrier(candidate)
-
-    def test(g: Array, jacobian: Array, y: Array, left: Array) -> tuple[_Seen, Float[Array, ""]]:
-        level, noise = equations.level(g, jacobian, y)
-        return _Seen(g, noise), after_test(level, left, extra=1, gives_up=left > 0)
-
     g, jacobian = equations.linearise(y)
+    scale = equations.scale(jacobian, y)
     scaled = equations.scaled(jacobian)
     sizes, rows = scaled_rows(scaled)
-    inverse = inverse_factor(gram_matrix(rows, rows), sizes)
-    seen, left = test(g, jacobian, y, counter(max_steps))
+    solve = factored(gram_matrix(rows, rows), sizes)
+    _, vjp = jax.vjp(equations.residual, y)
 
-    def body(carry: tuple[Array, _Seen, Array, Array]) -> tuple[Array, _Seen, Array, Array]:
-        y, (g, noise), left, count = carry
-        g = jnp.where(jnp.abs(g) <= noise, 0, g)
-        half = combined(g.astype(inverse.dtype), inverse.T)
-        multiplier = combined(half, inverse).astype(g.dtype)
-        terms = combined(jnp.abs(multiplier), jnp.abs(scaled)) if equations.may_vanish else None
-        moved = _moved(equations, y, combined(multiplier, scaled), terms)
+    def test(g: Array, left: Array) -> tuple[Array, Array]:
+        level, noise = equations.level(g, scale)
+        left = after_test(level, left, extra=1, gives_up=left > 0)
+        return jnp.where(jnp.abs(g) <= noise, 0, g), left
+
+    def body(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        y, g, left, count = carry
+        multiplier, terms = solve(g), None
+        if isinstance(scaled, SparseRows):  # a reverse pass has no indices
+            moved = _moved(equations, y, equations.scaled(vjp(multiplier)[0]), None)
+        else:
+            if equations.may_vanish:
+                terms = combined(jnp.abs(multiplier), jnp.abs(scaled))
+            moved = _moved(equations, y, combined(multiplier, scaled), terms)
         y = jnp.where(left > 0, moved, y)
-        seen, left = test(*equations.linearise(y), y, left)
-        return y, seen, left, count + (left > 0).astype(int)
+        g, left = test(equations.residual(y), left)
+        return y, g, left, count + (left > 0).astype(int)
 
-    start = y, seen, left, (left > 0).astype(int)
+    g, left = test(g, counter(max_steps))
+    start = y, g, left, (left > 0).astype(int)
     y, _, left, count = lax.while_loop(lambda x: any_lane(x[2] > 0), body, start)
-    return Solved(y, left != -1, count)
+    return Solved(y, (left != -1) & equations.holds(y), count)
 
 
 def corrected(
@@ -207,7 +206,8 @@ def corrected(
     are, and the directions `V`."""
     gram, terms = gram_matrix(rows, along), None
     if equations.may_vanish:
-        terms = combined(jnp.abs(gram_solve(gram, g, noise)), jnp.abs(along))
+        sizes = jtu.tree_map(jnp.abs, along)
+        terms = combined(jnp.abs(gram_solve(gram, g, noise)), sizes)
     return _moved(equations, y, combined(*eliminated(gram, g, along, noise)), terms)
 
 

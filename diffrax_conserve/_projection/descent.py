@@ -42,10 +42,11 @@ def descend(
     def body(carry: tuple[Array, _Best, Array, Array]) -> tuple[Array, _Best, Array, Array]:
         y, best, left, count = carry
         g, jacobian = lax.optimization_barrier(equations.linearise(y))
-        level, noise = equations.level(g, jacobian, y)
+        here = equations.scale(jacobian, y)
+        level, noise = equations.level(g, here)
         left = after_test(level, left, extra=extra, gives_up=left == max_steps + 1)
         first = best.largest == jnp.inf
-        scale = jnp.where(first, equations.scale(jacobian, y), best.scale)
+        scale = jnp.where(first, here, best.scale)
         sizes = jnp.abs(relative(g, scale))
         better = jnp.all(sizes <= best.largest)  # NaN is not
         largest = jnp.where(better, jnp.max(sizes), best.largest)

@@ -6,10 +6,16 @@ is exact if the constraints are consistent. Of gradients that are only nearly pa
 because the correction needs the direction in which they differ.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy as jsp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
+
+from .sparse import BlockGram, SparseRows
 
 # Up to this many constraints a solve is written out, so that XLA fuses it with what is around it.
 WRITTEN_OUT_MAX = 4
@@ -22,32 +28,45 @@ _ADDED = 16
 _REFINEMENTS = 3
 
 
-def gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
+def gram_matrix(rows: Any, others: Any) -> Any:
     """`rows othersᵀ`."""
+    if isinstance(rows, SparseRows):
+        return rows.gram(others)
     if len(rows) > WRITTEN_OUT_MAX:
         return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)
     return jnp.sum(rows[:, None, :] * others[None], axis=2)
 
 
-def combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+def combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
     """`rowsᵀ multiplier`."""
+    if isinstance(rows, SparseRows):
+        return rows.combined(multiplier)
     if len(rows) > WRITTEN_OUT_MAX:
         return jnp.matmul(multiplier, rows, precision=lax.Precision.HIGHEST)
     return jnp.sum(multiplier[:, None] * rows, axis=0)
 
 
-def gram_solve(gram: Float[Array, "m m"], b: Array, noise: Array | None = None) -> Array:
+def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`rows x`."""
+    return rows.times(x) if isinstance(rows, SparseRows) else combined(x, rows.T)
+
+
+def gram_solve(gram: Any, b: Array, noise: Array | None = None) -> Array:
     """`gram⁻¹ b`, for a matrix not symmetric in general."""
+    if isinstance(gram, BlockGram):
+        return gram.factored()(b)
     return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), noise))
 
 
 def eliminated(
-    gram: Float[Array, "m m"], b: Array, rows: Float[Array, "m n"], noise: Array | None = None
-) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    gram: Any, b: Array, rows: Any, noise: Array | None = None
+) -> tuple[Float[Array, " m"], Any]:
     """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
     `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
     in the sum, which is wrong if XLA evaluates `b` once for each. If a small matrix is written out,
     what is within the `noise` of `b` is zero in `L⁻¹ b`: a small pivot would amplify it."""
+    if isinstance(gram, BlockGram):
+        return gram.factored()(b), rows
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         added, diagonal = _added(gram), jnp.abs(jnp.diagonal(gram))
@@ -77,20 +96,26 @@ def eliminated(
     return jnp.stack(x), jnp.stack(d)
 
 
-def inverse_factor(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
-    """`L⁻¹ S⁻¹` for `gram = L Lᵀ` and the diagonal matrix `S` of `sizes`. With the inverse of a
-    triangle each solve is two products."""
+def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
+    """`S⁻¹ gram⁻¹ S⁻¹ g` as a function of `g`, for the diagonal matrix `S` of `sizes`. With the
+    inverse of a triangle, `L⁻¹ S⁻¹` for `gram = L Lᵀ`, each solve is two products."""
+    if isinstance(gram, BlockGram):
+        solve = gram.factored()
+        return lambda g: solve(g / sizes) / sizes
     added = _added(gram) * jnp.where(gram > 0, gram, 1)
     lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
     one = jnp.eye(len(gram), dtype=added.dtype)
-    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
+    inverse = jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
+    return lambda g: combined(combined(g.astype(inverse.dtype), inverse.T), inverse).astype(g.dtype)
 
 
-def scaled_rows(rows: Float[Array, "m n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
     """The largest element of each row, or one if all are zero, and the rows divided by it. In
     float64 one: products of elements neither overflow nor underflow in usual units."""
-    if rows.dtype == jnp.float64:
+    if jnp.result_type(*jtu.tree_leaves(rows)) == jnp.float64:
         return jnp.ones(len(rows)), rows
+    if isinstance(rows, SparseRows):
+        return rows.scaled()
     sizes = jnp.max(jnp.abs(rows), axis=1)
     sizes = jnp.where(sizes > 0, sizes, 1)
     return sizes, rows / sizes[:, None]

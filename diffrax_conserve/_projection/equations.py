@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, evaluate, is_entry, named_entries
 from .._tree import ravel, unflatten, unravel
+from .sparse import Pattern, SparseRows, pattern_of
 
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
 # residual contribute about one unit each.
@@ -31,6 +32,7 @@ NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
 # gradient shows from which a state counts as near rest.
 _NOISE, _NEAR_REST = 1 / 8, 64
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
+Jacobian = Float[Array, "m n"] | SparseRows
 
 
 class Equations(eqx.Module):
@@ -49,6 +51,7 @@ class Equations(eqx.Module):
     - `clip`: within bounds the map to the state from a vector without bounds, then the argument of
       all methods. The residual is the gradient of a convex function of the multipliers with kinks:
       an iteration looks for the minimum along its step.
+    - `pattern`: that of a sparse Jacobian.
     """
 
     parts: tuple[Part, ...]
@@ -60,14 +63,17 @@ class Equations(eqx.Module):
     atol: float | Array | None = None
     may_vanish: bool = eqx.field(default=False, static=True)
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
+    pattern: Pattern | None = eqx.field(default=None, static=True)
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
         return jnp.concatenate([part(y) for part in self.parts])
 
     @eqx.filter_jit  # traced once for all uses
-    def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Jacobian]:
         """`g(y)` and the constraint Jacobian `G(y)`. Entry by entry, so that the rows of one do not
         contain the gradients of the others."""
+        if self.pattern is not None:
+            return SparseRows.linearised(self.pattern, self.parts, y)
         values, rows = [], []
         for part in self.parts:
             value, vjp = jax.vjp(part, y)
@@ -78,7 +84,7 @@ class Equations(eqx.Module):
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
 
-    def scale(self, jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
+    def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         y = y if self.clip is None else self.clip(y)
         return self.magnitude + shown_terms(jacobian, y)
 
@@ -89,18 +95,18 @@ class Equations(eqx.Module):
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
 
     def level(
-        self, g: Float[Array, " m"], jacobian: Float[Array, "m n"], y: Float[Array, " n"]
+        self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """What a state is, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the residuals.
+        """What a state is, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the residuals,
+        given these and their scales.
 
         The noise is what only chance could reduce: an eighth of the tolerance, or half of it where
         the tolerance is a large part of what the gradient shows, as near rest, where a correction
         within it would move the state by much. A state is settled if each residual is within twice
         the noise. A residual within a tolerance that underflows says nothing.
         """
-        scale = self.scale(jacobian, y)
         limit = self.tolerance(scale)
-        valid = (limit >= float(jnp.finfo(y.dtype).tiny)) | (scale == 0)
+        valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         valid = valid & (limit < jnp.inf)
         near_rest = _NEAR_REST * limit >= scale - self.magnitude
         noise = jnp.where(near_rest, 1 / 2, _NOISE) * limit
@@ -112,12 +118,16 @@ class Equations(eqx.Module):
     def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.level(g, jacobian, y)[0] >= ON
+        return self.level(g, self.scale(jacobian, y))[0] >= ON
 
-    def scaled(self, x: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled(self, x: Any) -> Any:
         """Each component times its unit: `G diag(s)` of a Jacobian, and the correction `s Uᵀ λ` of
         a combination `Uᵀ λ` of its rows `U`."""
-        return x if self.units is None else x * jnp.broadcast_to(self.units, x.shape)
+        if self.units is None:
+            return x
+        if isinstance(x, SparseRows):
+            return x.times_columns(self.units)
+        return x * jnp.broadcast_to(self.units, x.shape)
 
 
 def in_units(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, " n"]:
@@ -144,8 +154,10 @@ def reach(
     return length(jnp.maximum(jnp.abs(end - start), least), units)
 
 
-def shown_terms(jacobian: Float[Array, "m n"], y: Float[Array, " n"]) -> Float[Array, " m"]:
+def shown_terms(jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
     """`Σ_k |y_k ∂g/∂y_k|`, the part of a scale that the gradient shows."""
+    if isinstance(jacobian, SparseRows):
+        return jtu.tree_map(jnp.abs, jacobian).times(jnp.abs(y))
     return jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
 
 
@@ -186,17 +198,20 @@ def equations_of(
     hidden = jnp.zeros_like(values) if hidden is None else hidden
     like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
-    for fn in functions_of(manifold, t, like, args):
+    functions = functions_of(manifold, t, like, args)
+    sizes = [jax.eval_shape(fn, vector).size for fn in functions]
+    for fn, size in zip(functions, sizes, strict=True):
 
-        def part(y: Array, fn=fn, start=start) -> Array:
-            return (out := fn(y)) - values[start : start + out.size]
+        def part(y: Array, fn=fn, start=start, end=start + size) -> Array:
+            return fn(y) - values[start:end]
 
         # Arrays over which `fn` closes become leaves, and can be differentiated.
         parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
-        start += jax.eval_shape(part, vector).size
+        start += size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
     may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
-    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish)
+    pattern = pattern_of(functions, sizes, vector)
+    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish, pattern=pattern)
 
 
 class _Known:

@@ -22,8 +22,10 @@ from .elimination import (
     gram_matrix,
     gram_solve,
     scaled_rows,
+    times,
 )
-from .equations import Equations, in_units
+from .equations import Equations, Jacobian, in_units
+from .sparse import SparseRows
 
 # Gradients count as nearly parallel if the sine of their angle is below the cube root of roundoff,
 # or if it is below `_SMALL_ANGLE` and the correction, relative to the state and divided by the
@@ -61,7 +63,7 @@ def _project_along_jvp(primals: Any, tangents: Any, **options: Any) -> Any:
     if rows is None:
         rows = equations.scaled(equations.linearise(candidate)[1])
     sizes, rows = scaled_rows(rows)
-    along = combined(in_units(y - candidate, equations.units), rows.T)
+    along = times(rows, in_units(y - candidate, equations.units))
     multiplier = gram_solve(gram_matrix(rows, rows), along) / sizes
 
     def displaced(equations: Equations, candidate: Array, directions: Array | None) -> Any:
@@ -90,13 +92,15 @@ def certain(
     equations: Equations,
     candidate: Array,
     y: Array,
-    jacobian: Array,
+    jacobian: Jacobian,
     directions: Array | None = None,
 ) -> Float[Array, ""]:
     """One if the derivative of the projected state `y` is well determined, otherwise NaN: where
     gradients are nearly parallel, multipliers are large and cancel, so that roundoff dominates
     their derivatives. Constraints with gradients parallel everywhere are redundant: no harm."""
     one, eps = jnp.ones((), y.dtype), float(jnp.finfo(y.dtype).eps)
+    if isinstance(jacobian, SparseRows):
+        return one
     if len(jacobian) == 1:
         if directions is None:
             return one

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .base import Problem, ProjectionInfo
 from .descent import descend
-from .elimination import combined, gram_matrix, gram_solve, scaled_rows
+from .elimination import combined, gram_matrix, gram_solve, scaled_rows, times
 from .equations import Equations, in_units
 from .implicit import certain
 from .options import NEWTON_OPTIONS, option
@@ -102,10 +102,12 @@ def _nearest(
         y, _, count = descend(equations, candidate, max_steps=max_steps)
     else:
         y, _, count = project_within(box, equations, candidate, max_steps=max_steps)
-    n, (sizes, unit, gram, units) = y.size, _scaled(equations, y)
-    if n + equations.magnitude.size > _NEAREST_MAX:
-        return jnp.concatenate([y, 0 * equations.magnitude]), sizes, jnp.asarray(False), count
-    along = combined(in_units(y - candidate, equations.units), unit.T)
+    n, nothing = y.size, jnp.zeros_like(equations.magnitude)
+    if n + nothing.size > _NEAREST_MAX:
+        return jnp.concatenate([y, nothing]), nothing + 1, jnp.asarray(False), count
+    equations = dataclasses.replace(equations, pattern=None)
+    sizes, unit, gram, units = _scaled(equations, y)
+    along = times(unit, in_units(y - candidate, equations.units))
     start = jnp.concatenate([y, gram_solve(gram, along)])
     optimality = dataclasses.replace(
         equations,
@@ -141,6 +143,7 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     if unknowns.size > _NEAREST_MAX:
         return solved, (jnp.full_like(unknowns, jnp.nan), None, None, None)
     y = unknowns[: candidate.size]
+    equations = dataclasses.replace(equations, pattern=None)
     _, _, _, units = _scaled(equations, y)
     _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right

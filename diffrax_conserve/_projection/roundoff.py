@@ -19,8 +19,9 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._tree import ravel, tree_stop_gradient
-from .equations import functions_of, shown_terms
+from .equations import Jacobian, functions_of, shown_terms
 from .scalars import walk
+from .sparse import LEAST_CONSTRAINTS, SparseRows, pattern_of
 
 # Sums, and sums of products, each of which has an error of its own.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
@@ -37,13 +38,27 @@ _CONSTANT, _STATE, _COMPUTED = range(3)
 _Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
 
 
-def hidden_scale(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> _Measured:
+def hidden_scale(
+    manifold: Manifold, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Float[Array, " m"], Jacobian, Float[Array, " m"]]:
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
     gradients do not show: nothing where they show more, because elsewhere they may show less."""
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)
-    measured = [hidden_terms(fn, vector) for fn in functions_of(manifold, t, y, args)]
-    value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
+    functions = functions_of(manifold, t, y, args)
+    sizes = [jax.eval_shape(fn, vector).size for fn in functions]
+    pattern = pattern_of(functions, sizes, vector)
+    if pattern is None:
+        measured = [hidden_terms(fn, vector) for fn in functions]
+        value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
+    else:  # not of entries with many elements, for which it would cost a reverse pass each
+        value, jacobian = SparseRows.linearised(pattern, functions, vector)
+        few = [size < LEAST_CONSTRAINTS for size in sizes]
+        measured = [
+            hidden_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
+            for fn, size, one in zip(functions, sizes, few, strict=True)
+        ]
+        hidden = jnp.concatenate(measured)
     shown = jnp.abs(value) + shown_terms(jacobian, vector)
     return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo, adapted
 from .equations import Equations
+from .sparse import pattern_of
 
 
 @final
@@ -100,12 +101,14 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
     wanted = [key in keys for key in problem.keys]
     sizes = [eqx.filter_eval_shape(part, y).size for part in problem.equations.parts]
     rows = np.flatnonzero(np.repeat(wanted, sizes))
+    parts = tuple(it.compress(problem.equations.parts, wanted))
     equations = Equations(
-        tuple(it.compress(problem.equations.parts, wanted)),
+        parts,
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
         units=problem.equations.units,
         motion=problem.equations.motion,
         may_vanish=problem.equations.may_vanish,
+        pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
     )
     return dataclasses.replace(problem, equations=adapted(equations, projection, problem.like))

@@ -85,7 +85,8 @@ def _semismooth(
     def body(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         z, left, count = carry
         g, jacobian = lax.optimization_barrier(equations.linearise(z))
-        left = after_test(equations.level(g, jacobian, z)[0], left, extra=_EXTRA, gives_up=left > 0)
+        level, _ = equations.level(g, equations.scale(jacobian, z))
+        left = after_test(level, left, extra=_EXTRA, gives_up=left > 0)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
         gram, right = gram_matrix(rows, directions), g / sizes
         # What is noise for one constraint may be needed for another, so none is left out.

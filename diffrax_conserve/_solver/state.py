@@ -16,7 +16,7 @@ from .._manifold import Constraint, is_entry
 from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
-from .._projection.equations import Equations, length, reach
+from .._projection.equations import Equations, length, reach, shown_terms
 from .._projection.roundoff import hidden_scale
 from .._tree import ravel
 from .diffrax_private import register
@@ -203,7 +203,7 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     those of `q v = 0` where a pendulum passes a horizontal position."""
     g, jacobian = equations.linearise(y)
     sizes = jnp.abs(y) if equations.motion is None else jnp.abs(y) + equations.motion
-    limit = jnp.sum(jnp.abs(jacobian) * sizes, axis=1) + equations.hidden
+    limit = shown_terms(jacobian, sizes) + equations.hidden
     limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * limit
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]

@@ -1,5 +1,6 @@
 """The conservative layer: a projection to the manifold, as the last layer of a network."""
 
+import dataclasses
 from typing import final
 
 import equinox as eqx
@@ -94,7 +95,8 @@ class ConservativeLayer(eqx.Module):
         """Those of the manifold through `start`, and the candidate as a vector."""
         vector = ravel(candidate)
         values = ravel(self.values(*start)).astype(vector.dtype)
-        return equations_of(self.manifold, values, t, candidate, self.args), vector
+        equations = equations_of(self.manifold, values, t, candidate, self.args)
+        return dataclasses.replace(equations, pattern=None), vector
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**

@@ -1,0 +1,162 @@
+"""Many constraints: their sparse Jacobian against a dense one, in each order of blocks."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+import diffrax_conserve as dfc
+from diffrax_conserve._projection import sparse
+from diffrax_conserve._projection.elimination import combined, gram_matrix, gram_solve, times
+from diffrax_conserve._projection.equations import Equations, equations_of
+
+NUM = 40
+
+
+def _bonds(pairs: np.ndarray) -> dfc.Constraint:
+    i, j = pairs.T
+    return dfc.Constraint(lambda t, y, args: jnp.sum((y[i] - y[j]) ** 2, axis=1) - 1)
+
+
+def _lattice(side: int) -> np.ndarray:
+    """The bonds of a square lattice, too wide for blocks."""
+    of = np.arange(side**2).reshape(side, side)
+    across = np.stack([of[:, :-1].ravel(), of[:, 1:].ravel()], 1)
+    down = np.stack([of[:-1].ravel(), of[1:].ravel()], 1)
+    return np.concatenate([across, down])
+
+
+_CHAIN = np.stack([np.arange(NUM), np.arange(1, NUM + 1)], 1)
+_TRIANGLES = (3 * np.arange(NUM)[:, None, None] + np.array([[0, 1], [0, 2], [1, 2]])).reshape(-1, 2)
+# The name of a manifold, its entries, and the number of points.
+MANIFOLDS: dict[str, tuple[Any, int]] = {
+    "spins": (dfc.Constraint(lambda t, y, args: jnp.sum(y**2, axis=1) - 1), NUM),
+    "triangles": (_bonds(_TRIANGLES), 3 * NUM),
+    "chain": (_bonds(_CHAIN), NUM + 1),
+    "shuffled chain": (_bonds(np.random.default_rng(0).permutation(_CHAIN)), NUM + 1),
+    "ring": (_bonds(np.stack([np.arange(NUM), (np.arange(NUM) + 1) % NUM], 1)), NUM),
+    "lattice": (_bonds(_lattice(12)), 144),
+}
+ENERGY = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.cos(y)) + jnp.sum(y[1:] * y[:-1]))
+MOMENTUM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y, axis=0))
+
+
+CASES = [*((name, jnp.float64) for name in MANIFOLDS), ("triangles", jnp.float32)]
+
+
+@pytest.mark.parametrize(("name", "dtype"), CASES)
+def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: Any):
+    """With an energy and a momentum beside the sparse rows, and in units of its own for each
+    component, for a symmetric matrix and for one that is not."""
+    entry, points = MANIFOLDS[name]
+    manifold = {"a": ENERGY, "many": entry, "z": MOMENTUM}
+    key = jr.split(jr.key(0), 5)
+    y = jr.normal(key[0], (points, 3), dtype)
+    beside = y + 0.01 * jr.normal(key[1], y.shape, dtype)
+    values = jnp.zeros(jax.eval_shape(entry.fn, 0.0, y, None).size + 4, dtype)
+    equations = equations_of(manifold, values, 0.0, y, None)
+    equations = dataclasses.replace(equations, units=jnp.exp(jr.normal(key[2], (y.size,), dtype)))
+    assert equations.pattern is not None
+    x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
+
+    def rows(equations: Equations, y: Array) -> Any:
+        return equations.scaled(equations.linearise(y.reshape(-1))[1])
+
+    @jax.jit
+    def found() -> Any:
+        a, b = rows(equations, y), rows(equations, beside)
+        solved = (gram_solve(gram_matrix(a, other), multiplier) for other in (a, b))
+        return times(a, x), combined(multiplier, a), *solved
+
+    dense = dataclasses.replace(equations, pattern=None)
+    a, b = (np.asarray(rows(dense, state), np.float64) for state in (y, beside))
+    ahead, back, same, other = (np.asarray(z, np.float64) for z in found())
+    eps = float(jnp.finfo(dtype).eps)
+
+    def check(matrix: np.ndarray, solution: np.ndarray, right: Array, multiple: float) -> None:
+        sizes = np.abs(matrix) @ np.abs(solution)
+        assert np.max(np.abs(matrix @ solution - right)) <= multiple * eps * np.max(sizes)
+
+    check(a, np.asarray(x), jnp.asarray(ahead), 16)
+    check(a.T, np.asarray(multiplier), jnp.asarray(back), 16)
+    # As much roundoff is added to the diagonal; conjugate gradients end at its power 3/4.
+    multiple = eps ** (-1 / 4) if name == "lattice" else 256
+    check(a @ a.T, same, multiplier, multiple)
+    check(a @ b.T, other, multiplier, multiple)
+
+
+def _walk(name: str) -> tuple[Any, Array, Any]:
+    """A manifold with the conserved values of a first state, and a second one near to it."""
+    entry, points = MANIFOLDS[name]
+    key = jr.split(jr.key(1), 2)
+    y = jr.normal(key[0], (points, 3))
+    at = lambda fn: dfc.FirstIntegral(fn, value=fn(0.0, y, None))  # noqa: E731
+    return {"many": at(entry.fn), "z": at(ENERGY.fn)}, y, 1e-3 * jr.normal(key[1], y.shape)
+
+
+@pytest.mark.parametrize("name", ["spins", "ring", "lattice"])
+def test_derivatives_are_those_by_differences(name: str):
+    """Of a projection, in both modes: blocks, coupled blocks, and an iteration."""
+    manifold, y, change = _walk(name)
+
+    @jax.jit
+    def projected(y: Array) -> Array:
+        end, info = dfc.project(manifold, y, projection=dfc.SimplifiedNewton())
+        return eqx.error_if(end, ~info.ok, "not projected")
+
+    start, direction = y + change, jnp.cos(7 * y)
+    by_difference = (
+        projected(start + 1e-6 * direction) - projected(start - 1e-6 * direction)
+    ) / 2e-6
+    _, ahead = jax.jvp(projected, (start,), (direction,))
+    assert jnp.max(jnp.abs(ahead - by_difference)) < 1e-7
+    back = jax.grad(lambda y: jnp.sum(jnp.sin(3 * projected(y))))(start)
+    expected = jnp.sum(3 * jnp.cos(3 * projected(start)) * ahead)
+    assert jnp.abs(jnp.sum(back * direction) - expected) < 1e-9 * jnp.sum(jnp.abs(back * direction))
+
+
+def test_many_dependent_constraints():
+    """Each bond is listed twice, so that each block is singular."""
+    manifold = {"one": MANIFOLDS["triangles"][0], "two": _bonds(_TRIANGLES)}
+    shape = jnp.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.75**0.5, 0]])
+    y = jnp.tile(shape, (NUM, 1)) + 0.01 * jr.normal(jr.key(2), (3 * NUM, 3))
+    end, info = dfc.project(manifold, y, projection=dfc.SimplifiedNewton())
+    assert info.ok
+    once, _ = dfc.project(manifold["one"], y, projection=dfc.SimplifiedNewton())
+    assert jnp.max(jnp.abs(end - once)) < 1e-13
+
+
+def test_what_is_not_sparse_is_told(monkeypatch: pytest.MonkeyPatch):
+    """Indices that are not known when the solve is traced could be any."""
+    monkeypatch.setattr(sparse, "_LARGE", 0)
+    pick = dfc.Constraint(lambda t, y, args: y[args] ** 2 - 1)
+    with pytest.warns(UserWarning, match=r"GiB\. A function that selects .* close over it"):
+        dfc.project(pick, jnp.full(50, 1.1), args=jnp.arange(NUM))
+    monkeypatch.setattr(sparse, "_asdex", lambda: None)
+    with pytest.warns(UserWarning, match=r"diffrax-conserve\[sparse\]"):
+        dfc.project(MANIFOLDS["spins"][0], jnp.ones((NUM, 3)))
+
+
+def test_a_solve_keeps_spins_and_their_energy():
+    spins = MANIFOLDS["spins"][0]
+    energy = dfc.FirstIntegral(lambda t, y, args: -jnp.sum(y[1:] * y[:-1]) - jnp.sum(y[:, 2] ** 2))
+
+    def field(t: Any, y: Array, args: Any) -> Array:
+        return jnp.cross(y, -jax.grad(lambda y: energy.fn(t, y, args))(y))
+
+    y0 = jr.normal(jr.key(3), (NUM, 3))
+    y0 = y0 / jnp.linalg.norm(y0, axis=1, keepdims=True)
+    manifold = {"spins": spins, "energy": energy}
+    solver = dfc.ManifoldProjection(diffrax.Tsit5(), manifold)
+    saveat = diffrax.SaveAt(ts=jnp.linspace(0, 5, 30))
+    sol = diffrax.diffeqsolve(diffrax.ODETerm(field), solver, 0, 5, 0.05, y0, saveat=saveat)
+    for drift in jax.tree.leaves(dfc.drift(sol, manifold)):
+        assert jnp.max(jnp.abs(drift)) < 1e-14
+    assert not jnp.any(dfc.off_manifold(sol, manifold))
