@@ -1,8 +1,11 @@
 """Projection with many constraints, and with many bodies.
 
 1. A hanging chain of rigid bonds, bond lengths and relative velocities along the bonds kept: twice
-   as many constraints as bonds.
-2. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
+   as many constraints as bonds; and with bond lengths alone.
+2. Spins on a line that precess about their neighbours (Landau and Lifshitz): the length of each,
+   and the energy.
+3. Rigid molecules of water in a periodic field: three bonds each, and the energy.
+4. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
    of mass, angular momentum.
 
 For each size: seconds per RK4 step, plain and projected, the memory that the compiled step needs
@@ -72,6 +75,95 @@ def chain(bonds):
     d = np.stack([np.sin(angles[:, 0]), np.sin(angles[:, 1]) * np.cos(angles[:, 0])], -1)
     d = np.concatenate([d, -np.sqrt(1 - np.sum(d**2, -1, keepdims=True))], -1)
     return jnp.cumsum(jnp.asarray(d), axis=0), jnp.zeros((bonds, 3))
+
+
+# ---- Spins: s has shape (spins, 3) ----
+
+
+def spin_energy(t, y, args):
+    return -jnp.sum(y[1:] * y[:-1]) - jnp.sum(y[:, 2] ** 2) / 2
+
+
+def spin_vector_field(t, y, args):
+    zero = jnp.zeros((1, 3))
+    field = jnp.concatenate([y[1:], zero]) + jnp.concatenate([zero, y[:-1]])
+    field = field + y * jnp.array([0.0, 0.0, 1.0])
+    (a, b, c), (u, v, w) = y.T, field.T
+    return jnp.stack([b * w - c * v, c * u - a * w, a * v - b * u], axis=1)
+
+
+SPINS = {
+    "length": dfc.Constraint(lambda t, y, args: jnp.sum(y**2, axis=1) - 1),
+    "energy": dfc.FirstIntegral(spin_energy),
+}
+
+
+def spins(count):
+    y = np.random.default_rng(0).normal(size=(count, 3))
+    return jnp.asarray(y / np.linalg.norm(y, axis=1, keepdims=True))
+
+
+# ---- Molecules: q and v have shape (molecules, atoms, 3) ----
+
+MASSES = np.array([16.0, 1.0, 1.0])
+BONDS = np.array([[0, 1], [0, 2], [1, 2]])
+WATER = np.array([[0.0, 0.0, 0.0], [0.9572, 0.0, 0.0], [-0.24, 0.9266, 0.0]])
+LENGTHS = np.sum((WATER[BONDS[:, 0]] - WATER[BONDS[:, 1]]) ** 2, axis=1)
+# The atoms at the ends of each bond, with signs.
+ENDS = (np.eye(3)[BONDS[:, 0]] - np.eye(3)[BONDS[:, 1]]).T
+
+
+def apart(x):
+    return x[:, BONDS[:, 0]] - x[:, BONDS[:, 1]]
+
+
+def molecule_lengths(t, y, args):
+    return jnp.sum(apart(y[0]) ** 2, axis=2) - LENGTHS
+
+
+def molecule_energy(t, y, args):
+    q, v = y
+    return jnp.sum(MASSES[:, None] * v**2) / 2 + jnp.sum(1 - jnp.cos(q))
+
+
+def molecule_vector_field(t, y, args):
+    """The tensions of the three bonds solve a system of their own in each molecule."""
+    q, v = y
+    pull = -jnp.sin(q) / MASSES[:, None]
+    d, w = apart(q), apart(v)
+    (a, b, c), r = jnp.moveaxis(d, 1, 0), -jnp.sum(w * w, 2) - jnp.sum(d * apart(pull), 2)
+    coupling = (ENDS.T / MASSES) @ ENDS
+    m = [
+        [coupling[i, j] * jnp.sum(x * z, 1) for j, z in enumerate((a, b, c))]
+        for i, x in enumerate((a, b, c))
+    ]
+    minor = lambda i, j, k, l: m[i][k] * m[j][l] - m[i][l] * m[j][k]  # noqa: E731
+    c0, c1, c2 = minor(1, 2, 1, 2), minor(1, 2, 0, 2), minor(1, 2, 0, 1)
+    determinant = m[0][0] * c0 - m[0][1] * c1 + m[0][2] * c2
+    inverse = [
+        [c0, -minor(0, 2, 1, 2), minor(0, 1, 1, 2)],
+        [-c1, minor(0, 2, 0, 2), -minor(0, 1, 0, 2)],
+        [c2, -minor(0, 2, 0, 1), minor(0, 1, 0, 1)],
+    ]
+    tension = jnp.stack([sum(x * r[:, j] for j, x in enumerate(row)) for row in inverse], 1)
+    forces = (tension / determinant[:, None])[..., None] * d
+    return v, pull + jnp.stack(
+        [forces[:, 0] + forces[:, 1], -forces[:, 0] + forces[:, 2], -forces[:, 1] - forces[:, 2]], 1
+    ) / MASSES[:, None]
+
+
+MOLECULES = {
+    "length": dfc.Constraint(molecule_lengths),
+    "energy": dfc.FirstIntegral(molecule_energy),
+}
+
+
+def molecules(count):
+    rng = np.random.default_rng(0)
+    q = WATER + rng.uniform(0, 100, size=(count, 1, 3))
+    centre = np.sum(MASSES[:, None] * q, 1, keepdims=True) / np.sum(MASSES)
+    v = rng.normal(size=(count, 1, 3)) + np.cross(rng.normal(size=(count, 1, 3)), q - centre)
+    return jnp.asarray(q), jnp.asarray(v)
 
 
 # ---- Gravitating bodies; the sums over pairs go row by row, so that memory is linear ----
@@ -184,11 +276,21 @@ def measure(name, vector_field, manifold, y0, dt, steps, plain_steps, rounds=3):
 
 def main(argv=None):
     options = measuring.parser(__doc__, "many_constraints").parse_args(argv)
-    chains, counts = ([100], [100]) if options.smoke else ([250, 500, 1000], [1000, 10_000])
+    few, many = ([100], [100]) if options.smoke else ([200, 1000], [1000, 10_000])
+    large = few if options.smoke else [200, 1000, 10_000, 100_000]
     cases = [
-        (f"chain, {n} bonds", chain_vector_field, CHAIN, chain(n), 1e-3, 5, 100) for n in chains
+        (f"chain, {n} bonds", chain_vector_field, CHAIN, chain(n), 1e-3) for n in few + many[1:]
     ]
-    cases += [(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2, 2) for n in counts]
+    bonds = {"length": CHAIN["length"]}
+    cases += [
+        (f"chain, lengths of {n} bonds", chain_vector_field, bonds, chain(n), 1e-3) for n in large
+    ]
+    cases += [(f"{n} spins", spin_vector_field, SPINS, spins(n), 2e-2) for n in large]
+    cases += [
+        (f"{n} molecules", molecule_vector_field, MOLECULES, molecules(n), 1e-2) for n in large
+    ]
+    cases = [(*case, max(5, 100_000 // case[3][0].size), 100) for case in cases]
+    cases += [(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2, 2) for n in many]
     rows = []
     for case in cases:
         if options.only in case[0]:
