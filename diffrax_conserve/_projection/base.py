@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree, Real
+from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
 from .._balance import integrated_rates
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
@@ -20,7 +20,7 @@ from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
 from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 from .equations import ON, Equations, equations_of, length, relative
-from .options import units_of
+from .metric import MatrixUnits, Units, units_of
 
 
 @final
@@ -168,7 +168,7 @@ class AbstractProjection(eqx.Module):
     as in a stage of [`diffrax_conserve.Staged`][].
     """
 
-    metric: eqx.AbstractVar[PyTree[ArrayLike] | None]
+    metric: eqx.AbstractVar[PyTree[Any] | None]
     # Whether `Problem.step` is set. If so, dense output also stores the error estimate.
     sees_step: ClassVar[bool] = True
 
@@ -182,11 +182,16 @@ class AbstractProjection(eqx.Module):
         """
 
 
-def adapted(equations: Equations, projection: AbstractProjection, like: Any) -> Equations:
-    """The equations with the metric, if it has one, and the tolerances of a projection."""
+def adapted(
+    equations: Equations, projection: AbstractProjection, t: RealScalarLike, y: Y, args: Args
+) -> Equations:
+    """The equations with the metric at a state, if it has one, and the tolerances of a
+    projection."""
     changed = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
     if projection.metric is not None:
-        changed["units"] = units_of(projection.metric, like)
+        changed["units"] = units_of(projection.metric, t, y, args)
+    if isinstance(changed.get("units"), MatrixUnits):
+        changed["pattern"] = None  # products with a matrix are dense
     return dataclasses.replace(equations, **changed)
 
 
@@ -257,12 +262,12 @@ class Target(eqx.Module):
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
         equations = dataclasses.replace(equations, units=self.motion, motion=self.motion)
-        return adapted(equations, self.projection, like)
+        return adapted(equations, self.projection, t, y, self.args)
 
-    def units(self, y: Y) -> Float[Array, " n"] | None:
-        """The units of the components of a state like `y` in the metric of the projection."""
+    def units(self, t: RealScalarLike, y: Y) -> Units:
+        """The units of the components in the metric of the projection, at a time of the solver."""
         metric = self.projection.metric
-        return self.motion if metric is None else units_of(metric, y)
+        return self.motion if metric is None else units_of(metric, t * self.direction, y, self.args)
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Callable[[], Y], error: Y | None

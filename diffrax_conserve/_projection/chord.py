@@ -214,8 +214,8 @@ def corrected(
 def _moved(equations: Equations, y: Array, change: Array, terms: Array | None) -> Array:
     """`y - s change`. If a correction cancels a component down to roundoff, that is set to zero: a
     tolerance that is relative to the component could never be met by what is left."""
-    rest = y - equations.scaled(change)
+    rest = y - equations.moved(change)
     size, units = jnp.abs(y), _CANCELLED
     if terms is not None:
-        size, units = size + equations.scaled(terms), _CANCELLED_TERMS
+        size, units = size + jnp.abs(equations.moved(terms)), _CANCELLED_TERMS
     return jnp.where(jnp.abs(rest) <= units * float(jnp.finfo(y.dtype).eps) * size, 0, rest)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, evaluate, is_entry, named_entries
 from .._tree import ravel, unflatten, unravel
+from .metric import MatrixUnits, Units
 from .sparse import Pattern, SparseRows, pattern_of
 
 # The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
@@ -41,10 +42,11 @@ class Equations(eqx.Module):
     - `parts`: the residual of each entry.
     - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
     - `hidden`: the part of it that the gradients do not show.
-    - `units`: the unit `s` of each component in which a correction is measured, `M⁻¹ = diag(s²)`;
-      `None` if all are one. A component whose unit is zero is never moved. All linear algebra works
-      with `G diag(s)`, whose columns no longer know the units of the user: so nothing is squared
-      before it is scaled, and a change of units by powers of two changes no bit of the result.
+    - `units`: the unit `s` of each component in which a correction is measured, `M⁻¹ = diag(s²)`,
+      or a factor `S` of `M⁻¹ = S Sᵀ`; `None` if all are one. A component whose unit is zero is
+      never moved. All linear algebra works with `G S`, whose columns no longer know the units of
+      the user: so nothing is squared before it is scaled, and a change of units by powers of two
+      changes no bit of the result.
     - `motion`: how far each component moves in a step, where that is known; see `Target`.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `may_vanish`: whether all terms of a residual may be zero, as those of a `Constraint`.
@@ -57,7 +59,7 @@ class Equations(eqx.Module):
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    units: Float[Array, " n"] | None = None
+    units: Units = None
     motion: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
@@ -120,33 +122,40 @@ class Equations(eqx.Module):
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= ON
 
-    def scaled(self, x: Any) -> Any:
-        """Each component times its unit: `G diag(s)` of a Jacobian, and the correction `s Uᵀ λ` of
-        a combination `Uᵀ λ` of its rows `U`."""
+    def scaled(self, rows: Any) -> Any:
+        """`G S` for the rows of a Jacobian, or for one gradient."""
         if self.units is None:
-            return x
-        if isinstance(x, SparseRows):
-            return x.times_columns(self.units)
-        return x * jnp.broadcast_to(self.units, x.shape)
+            return rows
+        if isinstance(self.units, MatrixUnits):
+            return self.units.scaled(rows)
+        if isinstance(rows, SparseRows):
+            return rows.times_columns(self.units)
+        return rows * jnp.broadcast_to(self.units, rows.shape)
+
+    def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """`S u`, the change of the state that is `u` in the units."""
+        if isinstance(self.units, MatrixUnits):
+            return self.units.moved(change)
+        return change if self.units is None else change * self.units
 
 
-def in_units(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, " n"]:
+def in_units(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
     """A change of the state, each component in its unit; zero where the unit is zero, because such
     a component is never moved."""
     if units is None:
         return change
+    if isinstance(units, MatrixUnits):
+        return units.measured(in_units(change, units.diagonal))
     moves = units != 0
     return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
 
 
-def length(change: Float[Array, " n"], units: Float[Array, " n"] | None) -> Float[Array, ""]:
-    """The length of a change of the state in the metric `diag(1/units²)`."""
+def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
+    """The length of a change of the state in the metric."""
     return jnp.linalg.norm(in_units(change, units))
 
 
-def reach(
-    start: Float[Array, " n"], end: Float[Array, " n"], units: Float[Array, " n"] | None
-) -> Float[Array, ""]:
+def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:
     """The length of a step in the metric, the yardstick of corrections. Each component counts at
     least by the root of roundoff of itself, by which roundoff alone moves a state where gradients
     are nearly parallel: otherwise no correction would be short in a step at rest."""

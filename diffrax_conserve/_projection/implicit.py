@@ -72,7 +72,7 @@ def _project_along_jvp(primals: Any, tangents: Any, **options: Any) -> Any:
         else:  # by one reverse pass, not row by row
             _, vjp = jax.vjp(equations.residual, candidate)
             moved = equations.scaled(vjp(multiplier)[0])
-        moved = equations.scaled(moved)
+        moved = equations.moved(moved)
         return candidate + moved, equations.residual(candidate + moved)
 
     tangent = eqx.filter_jvp(displaced, primals, tangents)[1]
@@ -80,7 +80,7 @@ def _project_along_jvp(primals: Any, tangents: Any, **options: Any) -> Any:
     _, jacobian = equations.linearise(y)
     heights, unit = scaled_rows(equations.scaled(jacobian))
     change = combined(*eliminated(gram_matrix(unit, rows), t_g / heights, rows))
-    t_y = t_y - equations.scaled(change)
+    t_y = t_y - equations.moved(change)
     factor = certain(equations, candidate, y, jacobian, directions)
     if directions is None and 1 < len(rows) <= WRITTEN_OUT_MAX:
         factor = jnp.where(count <= FROZEN_STEPS, factor, jnp.nan)  # not of this form

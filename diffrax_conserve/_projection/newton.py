@@ -14,6 +14,7 @@ from .descent import descend
 from .elimination import combined, gram_matrix, gram_solve, scaled_rows, times
 from .equations import Equations, in_units
 from .implicit import certain
+from .metric import MatrixUnits
 from .options import NEWTON_OPTIONS, option
 from .within_bounds import AbstractNewton, Box, project_within
 
@@ -87,8 +88,8 @@ class _Optimality(eqx.Module):
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         y, multiplier = jnp.split(unknowns, [self.candidate.size])
         g, vjp = jax.vjp(self.equations.residual, y)  # by one reverse pass, not row by row
-        scaled = self.equations.scaled
-        z = self.candidate + scaled(scaled(vjp(multiplier / self.sizes)[0]))
+        gradient = self.equations.scaled(vjp(multiplier / self.sizes)[0])
+        z = self.candidate + self.equations.moved(gradient)
         return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
 
 
@@ -130,7 +131,8 @@ def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, 
     gram = gram_matrix(unit, unit)
     lengths = jnp.diagonal(gram)
     units = lax.rsqrt(jnp.where(lengths > 0, lengths, 1))
-    units = jnp.concatenate([equations.scaled(jnp.ones_like(y)), units])
+    own = equations.units.sizes if isinstance(equations.units, MatrixUnits) else equations.units
+    units = jnp.concatenate([jnp.ones_like(y) if own is None else own, units])
     return sizes, unit, gram, units
 
 

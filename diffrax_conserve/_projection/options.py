@@ -4,16 +4,11 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Y
 from .._options import check_counts, check_number, check_numbers, dtype_of
-from .._tree import ravel, real_view
 
 
 def option(default: Any, **kwargs: Any) -> Any:
@@ -39,7 +34,9 @@ NEWTON_OPTIONS = r"""**Arguments:**
 - `max_steps`: the largest number of iterations; twice as many with bounds, or in all by `Newton`.
 - `metric`: positive weights $M_k$ (masses, or $1/\text{scale}^2$): distances are
     $\sum_k M_k (y_k - \hat y_k)^2$. One number or array, or a PyTree of them for the parts of the
-    state, which broadcast against their leaves. An infinite weight freezes its component;
+    state, which broadcast against their leaves; or, for a part, a symmetric, positive definite
+    matrix of the size of the part, or a function `(t, y, args)` that returns one, such as the mass
+    matrix $M(q)$ of generalised coordinates. An infinite weight freezes its component;
     `metric=1.0` is the Euclidean distance in the numbers of the state. Default: in the steps of an
     ordinary differential equation the *metric of motion*, see `ManifoldProjection`; elsewhere, as
     in [`diffrax_conserve.project`][] and with noise, Euclidean.
@@ -55,57 +52,6 @@ NEWTON_OPTIONS = r"""**Arguments:**
 less than 1, a weight is not positive, a lower bound is above its upper bound, or, in use, the
 weights or bounds are not shaped like the state.
 """
-
-
-def positive_weights(metric: PyTree[ArrayLike] | None) -> PyTree[ArrayLike] | None:
-    """`metric`, checked now if its values are known, and at run time if they are tracers."""
-    message = "`metric` has a weight that is not positive. Give one per component, not a matrix."
-
-    def check(weight: ArrayLike) -> ArrayLike:
-        check_number("metric", weight)
-        if isinstance(weight, jax.core.Tracer):
-            return eqx.error_if(weight, ~jnp.all(weight > 0), message)
-        if not np.all(np.asarray(weight) > 0):  # known, also within a jitted function
-            raise ValueError(message)
-        return weight
-
-    return jtu.tree_map(check, metric)
-
-
-def units_of(metric: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
-    """The units `M^(-1/2)` of a metric, as a vector; that of an infinite weight is zero."""
-    return 1 / jnp.sqrt(spread("metric", metric, like))
-
-
-def spread(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
-    """An option of numbers or arrays for the parts of a state, as a vector like the state."""
-
-    def spread_leaf(given: ArrayLike, leaf: Any) -> Any:
-        shape = jnp.shape(given)
-        try:
-            fits = np.broadcast_shapes(shape, leaf.shape) == leaf.shape
-        except ValueError:
-            fits = False
-        if not fits:
-            raise ValueError(
-                f"`{name}` has a leaf of shape {shape} for one of shape {leaf.shape} of the state. "
-                "Give a number or an array that broadcasts against it."
-            )
-        view = jax.eval_shape(real_view, leaf)  # both parts of a complex component are alike
-        return jnp.broadcast_to(jnp.asarray(given, view.dtype), view.shape)
-
-    def spread_part(given: ArrayLike, part: Any) -> Any:
-        return jtu.tree_map(lambda leaf: spread_leaf(given, leaf), part)
-
-    try:
-        jtu.tree_map(lambda given, part: None, option, like)
-    except ValueError as error:
-        raise ValueError(
-            f"`{name}` has the structure {jtu.tree_structure(option)}, but the state has "
-            f"{jtu.tree_structure(like)}. Give one number, or one number or array for each part of "
-            "the state."
-        ) from error
-    return ravel(jtu.tree_map(spread_part, option, like))
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:

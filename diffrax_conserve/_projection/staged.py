@@ -77,7 +77,7 @@ class Staged(AbstractProjection):
             )
         y, infos = candidate, []
         for number, projection in enumerate(self.projections, start=1):
-            y, info = projection.solve(_restricted(problem, self.names[:number], projection), y)
+            y, info = projection.solve(_restricted(problem, self.names[:number], projection, y), y)
             infos.append(info)
         count = sum(info.num_steps for info in infos)
         # The last stage has judged all parts, by its own tolerances.
@@ -95,7 +95,9 @@ Staged.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractProjection) -> Problem:
+def _restricted(
+    problem: Problem, keys: tuple[Any, ...], projection: AbstractProjection, candidate: Array
+) -> Problem:
     """The problem restricted to the entries with these keys, in the metric of the projection."""
     y = jax.eval_shape(ravel, problem.like)
     wanted = [key in keys for key in problem.keys]
@@ -111,4 +113,7 @@ def _restricted(problem: Problem, keys: tuple[Any, ...], projection: AbstractPro
         may_vanish=problem.equations.may_vanish,
         pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
     )
-    return dataclasses.replace(problem, equations=adapted(equations, projection, problem.like))
+    return dataclasses.replace(
+        problem,
+        equations=adapted(equations, projection, problem.t, problem.state(candidate), problem.args),
+    )

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, PyTree
 
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
@@ -27,7 +27,8 @@ from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
 from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
 from .equations import equations_of
-from .options import check_state, positive_weights, units_of
+from .metric import positive_weights, units_of
+from .options import check_state
 from .scalars import written_out
 
 
@@ -35,7 +36,7 @@ def tangent(
     vector_field: Callable[[RealScalarLike, Any, Args], Any],
     manifold: Manifold,
     *,
-    metric: PyTree[ArrayLike] | None = None,
+    metric: PyTree[Any] | None = None,
     gain: float | Array = 0.0,
 ) -> "TangentField":
     r"""The vector field minus its normal component, so that it is tangent to a manifold.
@@ -119,7 +120,7 @@ class TangentField(eqx.Module):
 
     vector_field: Callable[[RealScalarLike, Any, Args], Any]
     manifold: Manifold
-    metric: PyTree[ArrayLike] | None
+    metric: PyTree[Any] | None
     gain: float | Array
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
@@ -141,7 +142,7 @@ class TangentField(eqx.Module):
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
         if self.metric is not None:
-            equations = dataclasses.replace(equations, units=units_of(self.metric, y))
+            equations = dataclasses.replace(equations, units=units_of(self.metric, t, y, args))
         evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
@@ -153,7 +154,7 @@ class TangentField(eqx.Module):
             _, jacobian = equations.linearise(vector)
             sizes, rows = scaled_rows(equations.scaled(jacobian))
             gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = equations.scaled(combined(*eliminated(gram, right, rows)))
+            change = equations.moved(combined(*eliminated(gram, right, rows)))
             return change, gram_solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))

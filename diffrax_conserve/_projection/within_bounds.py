@@ -25,7 +25,8 @@ from .chord import Solved, after_test, counter
 from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
 from .equations import Equations, any_lane
 from .implicit import project_along
-from .options import check_options, option, positive_weights, spread
+from .metric import positive_weights, spread
+from .options import check_options, option
 
 # A component beyond its bound has this derivative: with zero, a constraint all of whose components
 # are at bounds would never change.
@@ -90,7 +91,7 @@ def _semismooth(
         sizes, rows = scaled_rows(equations.scaled(jacobian))
         gram, right = gram_matrix(rows, directions), g / sizes
         # What is noise for one constraint may be needed for another, so none is left out.
-        change = equations.scaled(combined(*eliminated(gram, right, directions)))
+        change = equations.moved(combined(*eliminated(gram, right, directions)))
         share = _share(equations, z, gram_solve(gram, right), change)
         rest = z - share * change
         rest = jnp.where(jnp.abs(rest) <= _VANISHES * jnp.abs(z), 0, rest)
@@ -128,7 +129,7 @@ class AbstractNewton(AbstractProjection):
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+    metric: PyTree[Any] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
     sees_step: ClassVar[bool] = False

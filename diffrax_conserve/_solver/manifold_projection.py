@@ -204,7 +204,10 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
-        units, cannot_start = start.units(y0), self._cannot_start(start, state, t0, y0, made_jump)
+        units, cannot_start = (
+            start.units(t0, y0),
+            self._cannot_start(start, state, t0, y0, made_jump),
+        )
         states = y0, candidate, y1
         failed = cause_of_failure(info.ok, cannot_start, states, units, self.max_correction)
         final = cannot_start | is_final(state, t0, t1, change, candidate)

@@ -17,6 +17,7 @@ from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
 from .._projection.equations import Equations, length, reach, shown_terms
+from .._projection.metric import Units
 from .._projection.roundoff import hidden_scale
 from .._tree import ravel
 from .diffrax_private import register
@@ -215,7 +216,7 @@ def cause_of_failure(
     ok: Bool[Array, ""],
     cannot_start: Bool[Array, ""],
     states: tuple[Y, Y, Y],
-    units: Float[Array, " n"] | None,
+    units: Units,
     max_correction: RealScalarLike | None,
 ) -> Int[Array, ""]:
     """Why a step failed, 0 if it did not. The `states` are the last one, the candidate and the
