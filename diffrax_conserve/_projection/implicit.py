@@ -122,7 +122,7 @@ def certain(
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, one)
 
 
-def _sines(equations: Equations, jacobian: Float[Array, "m n"]) -> Float[Array, " m"]:
+def _sines(equations: Equations, jacobian: Any) -> Float[Array, " m"]:
     """The sine of the angle between each gradient and the span of those before, in the metric."""
     _, unit = scaled_rows(equations.scaled(jacobian))
     columns = unit.astype(jnp.float32 if jnp.finfo(unit.dtype).bits < 32 else unit.dtype).T

@@ -158,11 +158,11 @@ def pattern_of(
         return None
     traced = [jax.make_jaxpr(part)(y) for part in parts]
     keys = tuple((str(x.jaxpr), *map(_content, x.consts)) for x in traced)
-    pattern = _KNOWN.get(keys, False)
-    if pattern is False:
+    if keys not in _KNOWN:
         with jax.ensure_compile_time_eval():
             found = [(size, _entries(x, y)) for size, x in zip(sizes, traced, strict=True)]
-            pattern = _KNOWN[keys] = _sparse((m, n), found)
+            _KNOWN[keys] = _sparse((m, n), found)
+    pattern = _KNOWN[keys]
     if pattern is None and m * n * y.dtype.itemsize > _LARGE:
         warnings.warn(
             f"The Jacobian of the {m} constraints is not sparse, or its pattern is not known when "
