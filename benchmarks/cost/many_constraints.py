@@ -289,7 +289,8 @@ def main(argv=None):
     cases += [
         (f"{n} molecules", molecule_vector_field, MOLECULES, molecules(n), 1e-2) for n in large
     ]
-    cases = [(*case, max(5, 100_000 // case[3][0].size), 100) for case in cases]
+    size = lambda y0: sum(x.size for x in jax.tree.leaves(y0))  # noqa: E731
+    cases = [(*case, max(5, 100_000 // size(case[3])), 100) for case in cases]
     cases += [(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2, 2) for n in many]
     rows = []
     for case in cases:
