@@ -27,6 +27,7 @@ from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
 from ._diagnostics.drift import off_manifold as off_manifold
+from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
