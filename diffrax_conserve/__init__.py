@@ -9,9 +9,10 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
-What is conserved    FirstIntegral, Constraint, check_invariance, drift, off_manifold
+What is conserved    FirstIntegral, Constraint, find_invariants, check_invariance, drift, off_manifold
 Solvers              ManifoldProjection, RK4, Unrolled, statistics
-Projections          SimplifiedNewton, Newton, ClosedForm, Directional, Staged, project
+Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
+Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
 Your own tests       import diffrax_conserve.testing
@@ -31,6 +32,7 @@ from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
+from ._projection import closed_forms as closed_forms
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
@@ -39,6 +41,7 @@ from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
+from ._projection.relaxation import Relaxation as Relaxation
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
 from ._projection.tangent import TangentField as TangentField

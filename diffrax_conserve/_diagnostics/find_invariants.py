@@ -130,7 +130,7 @@ def find_invariants(
         key = jr.key(0) if key is None else key
         ts, ys = batch(t, states, key, 0 if num_states is None else num_states)
         ts, ys = jtu.tree_map(lambda x: x.astype(jnp.promote_types(x.dtype, float)), (ts, ys))
-        like = jtu.tree_map(lambda y: y[0], ys)
+        like = _one(ys)
         names, functions = _names(basis, like), _functions(basis, like)
         if ts.size < 2 * len(names):
             raise ValueError(
@@ -143,6 +143,10 @@ def find_invariants(
     _check_position(samples, names)
     found = _independent(samples, _combinations(samples))
     return {_formula(c, names): FirstIntegral(_combination(c, functions)) for c in found}
+
+
+def _one(ys: Any) -> Any:
+    return jtu.tree_map(lambda y: y[0], ys)
 
 
 class _Products(eqx.Module):
@@ -257,7 +261,9 @@ def _formula(c: np.ndarray, names: list[str]) -> str:
     parts = []
     for j in np.flatnonzero(c):
         number = f"{abs(c[j]):.6g}"
-        parts.append(f"{'-' if c[j] < 0 else '+'} {'' if number == '1' else number + ' '}{names[j]}")
+        parts.append(
+            f"{'-' if c[j] < 0 else '+'} {'' if number == '1' else number + ' '}{names[j]}"
+        )
     return " ".join(parts).removeprefix("+ ")
 
 
@@ -329,7 +335,19 @@ def _sampled(
             "conserved that is not at others. Give one time for each state, such as "
             "`t=jnp.linspace(0, 10, num_states)`."
         )
-    slope = eqx.filter_eval_shape(vector_field, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
+    x = np.asarray(jax.vmap(ravel)(ys))
+    largest = np.abs(x).max(axis=0)
+    apart = np.where(largest > 0, largest, largest.max()) * np.sin(np.arange(x.size)).reshape(
+        x.shape
+    )
+    moved = np.asarray(measure(ts, jax.vmap(unravel)(x + apart / 10, ys))[2])
+    idle = (slopes == 0).all(axis=0) & (np.isfinite(moved) & (moved != 0)).any(axis=0)
+    if idle.any():
+        raise ValueError(
+            f"The component `{_components(_one(ys))[np.argmax(idle)]}` of the state moves, but at "
+            "none of `states`, so they are not in general position. Let every component vary."
+        )
+    slope = eqx.filter_eval_shape(vector_field, ts[0], _one(ys), args)
     eps = max(float(jnp.finfo(jnp.result_type(float, x)).eps) for x in jtu.tree_leaves(slope))
     return _Samples(values, gradients, slopes, eps)
 
@@ -361,8 +379,12 @@ def _combinations(samples: _Samples) -> list[np.ndarray]:
     orthogonal = np.linalg.qr(np.concatenate([still, moving[:count]]).T)[0].T
     found = [_simplified(samples, row) for row in _reduced(orthogonal)]
     # Once more without the errors among which the first pivots were chosen.
-    exact = np.array([c * samples.size for c in found if c is not None]).reshape(-1, len(samples.size))
-    found = [_simplified(samples, row) for row in _reduced(exact, np.abs(exact).max(axis=0, initial=0))]
+    exact = np.array([c * samples.size for c in found if c is not None]).reshape(
+        -1, len(samples.size)
+    )
+    found = [
+        _simplified(samples, row) for row in _reduced(exact, np.abs(exact).max(axis=0, initial=0))
+    ]
     return [c for c in found if c is not None]
 
 
