@@ -26,9 +26,10 @@ def density_matrix(where: Callable[[Any], Any] = lambda y: y) -> ClosedForm:
     r"""The projection to the nearest density matrix: Hermitian, of trace one, not negative.
 
     Of the Hermitian part $V \operatorname{diag}(w) V^\dagger$ the eigenvalues become
-    $\max(w_i - \mu, \varepsilon)$, with the $\mu$ for which their sum is one; $\varepsilon$ is one
-    unit of roundoff, so that rounding the entries makes no eigenvalue negative. In the Frobenius
-    norm no density matrix is nearer, up to roundoff. The result is Hermitian exactly.
+    $\max(w_i - \mu, 2 n \varepsilon)$, with the $\mu$ for which their sum is one. The bound of $2 n$
+    units of roundoff $\varepsilon$ keeps the rounding of the entries from making an eigenvalue
+    negative. In the Frobenius norm no density matrix is nearer, up to roundoff. The result is
+    Hermitian exactly.
 
     **Arguments:**
 
@@ -148,7 +149,8 @@ class _OfPart(eqx.Module):
 
 def _closed_form(where: Any, formula: Callable[[Array], Array]) -> ClosedForm:
     check_function("`where`", where, "where(y)", "a part of the state")
-    return ClosedForm(_OfPart(where, formula))
+    # The nearest state in the Euclidean metric.
+    return ClosedForm(_OfPart(where, formula), metric=1.0)
 
 
 def _check_square(x: Array) -> None:
@@ -203,15 +205,19 @@ def _spectral(x: Matrices) -> tuple[Array, Array, Array, Array, Array]:
     """The density matrix, and the eigenvectors and eigenvalues before and after of which it is."""
     _check_square(x)
     w, v = jnp.linalg.eigh(_hermitian(x), symmetrize_input=False)
-    least = float(jnp.finfo(w.dtype).eps)
+    n = w.shape[-1]
+    least = 2 * n * float(jnp.finfo(w.dtype).eps)
     p, positive = _onto_simplex(w, least)
     root = v * jnp.sqrt(p)[..., None, :]
-    y = _hermitian(_product(root, _dagger(root)))
-    # What rounding added to the trace, from the largest entry of the diagonal.
+    # From the lower triangle, because a compiler may evaluate a sum with the adjoint in two ways.
+    y = _product(root, _dagger(root))
+    lower = jnp.tril(y, -1)
     diagonal = jnp.diagonal(y, axis1=-2, axis2=-1).real
-    largest = jax.nn.one_hot(jnp.argmax(diagonal, axis=-1), w.shape[-1], dtype=w.dtype)
+    # What rounding added to the trace is taken from the largest entry.
+    largest = jnp.arange(n) == jnp.argmax(diagonal, axis=-1)[..., None]
     excess = jnp.sum(diagonal, axis=-1, keepdims=True) - 1
-    y = y - (excess * largest)[..., None, :] * jnp.eye(w.shape[-1], dtype=w.dtype)
+    diagonal = diagonal - jnp.where(largest, excess, 0)
+    y = lower + _dagger(lower) + (diagonal[..., None] * jnp.eye(n, dtype=w.dtype)).astype(y.dtype)
     return y, v, w, p, positive
 
 
