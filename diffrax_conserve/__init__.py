@@ -9,8 +9,9 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
-What is conserved    FirstIntegral, Constraint, find_invariants, check_invariance, drift, off_manifold
-Solvers              ManifoldProjection, RK4, Unrolled, statistics
+What is conserved    FirstIntegral, Constraint, find_invariants
+Diagnostics          check_invariance, drift, off_manifold, statistics
+Solvers              ManifoldProjection, RK4, Unrolled
 Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
 Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned

@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from typing import Any, final
 
@@ -23,8 +23,8 @@ from .._tree import ravel, real_view, tree_size, unravel
 from .check_invariance import batch
 
 # A combination is conserved if its derivative is within `_ROUNDOFF` units of roundoff of the terms
-# that cancel in it; true ones have 0.1 to 0.5. The next singular value must be `_GAP` times as large
-# as roundoff, because the inverse is the error of the coefficients.
+# that cancel in it; true ones have 0.1 to 0.7. The next singular value must be `_GAP` times as
+# large, because the inverse of this ratio is the error of the coefficients.
 _ROUNDOFF, _GAP = 16, 1e3
 # What counts as the error of a coefficient, as a share of the largest term: each is tried, and the
 # combination must then still be conserved. A number may be a decimal, of fewer digits than the
@@ -129,7 +129,7 @@ def find_invariants(
             check_counts(num_states=num_states)
         key = jr.key(0) if key is None else key
         ts, ys = batch(t, states, key, 0 if num_states is None else num_states)
-        ts, ys = jtu.tree_map(lambda x: x.astype(jnp.promote_types(x.dtype, float)), (ts, ys))
+        ts, ys = jtu.tree_map(lambda x: x.astype(jnp.promote_types(x.dtype, jnp.float64)), (ts, ys))
         like = _one(ys)
         names, functions = _names(basis, like), _functions(basis, like)
         if ts.size < 2 * len(names):
@@ -294,7 +294,7 @@ class _Samples:
 
     def resolution(self, sizes: np.ndarray) -> float:
         """The singular value below which there is roundoff."""
-        return float(np.max(sizes)) * self.terms.size**0.5 * float(np.finfo(float).eps)
+        return float(np.max(sizes) * self.terms.size**0.5 * np.finfo(float).eps)
 
     def has_gradient(self, c: np.ndarray) -> bool:
         size = np.abs(self.gradients) @ np.abs(c)
@@ -302,7 +302,7 @@ class _Samples:
 
     def defect(self, c: np.ndarray, states: slice) -> float:
         """The derivative of a combination, in units of roundoff of its terms."""
-        terms = self.eps * np.linalg.norm(self.totals[states] @ np.abs(c))
+        terms = self.eps * float(np.linalg.norm(self.totals[states] @ np.abs(c)))
         return float(np.linalg.norm(self.derivatives[states] @ c)) / (terms or 1.0)
 
 
@@ -377,15 +377,10 @@ def _combinations(samples: _Samples) -> list[np.ndarray]:
             stacklevel=3,
         )
     orthogonal = np.linalg.qr(np.concatenate([still, moving[:count]]).T)[0].T
-    found = [_simplified(samples, row) for row in _reduced(orthogonal)]
+    found = _simplified(samples, _reduced(orthogonal))
     # Once more without the errors among which the first pivots were chosen.
-    exact = np.array([c * samples.size for c in found if c is not None]).reshape(
-        -1, len(samples.size)
-    )
-    found = [
-        _simplified(samples, row) for row in _reduced(exact, np.abs(exact).max(axis=0, initial=0))
-    ]
-    return [c for c in found if c is not None]
+    exact = np.array([c * samples.size for c in found]).reshape(-1, len(samples.size))
+    return _simplified(samples, _reduced(exact, np.abs(exact).max(axis=0, initial=0)))
 
 
 def _check_position(samples: _Samples, names: list[str]) -> None:
@@ -421,16 +416,22 @@ def _reduced(rows: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
     return rows[::-1]
 
 
-def _simplified(samples: _Samples, c: np.ndarray) -> np.ndarray | None:
-    """The simplest form of a combination that is conserved at all states, if there is one."""
-    for share in _SHARES:
-        short = np.where(np.abs(c) <= share * np.abs(c).max(), 0, c) / samples.size
-        short /= np.abs(short).max() * np.sign(short[np.flatnonzero(short)[0]])
-        for form in (np.array([_number(x, share) for x in short]), short):
-            scaled = form * samples.size
-            if all(samples.defect(scaled, half) <= _ROUNDOFF for half in (_FIRST, _SECOND)):
-                return form
-    return None
+def _simplified(samples: _Samples, rows: np.ndarray) -> list[np.ndarray]:
+    """The simplest form of each combination that is conserved at all states, if it has one."""
+
+    def forms(c: np.ndarray) -> Iterator[np.ndarray]:
+        for share in _SHARES:
+            short = np.where(np.abs(c) <= share * np.abs(c).max(), 0, c) / samples.size
+            short /= np.abs(short).max() * np.sign(short[np.flatnonzero(short)[0]])
+            yield np.array([_number(x, share) for x in short])
+            yield short
+
+    def is_conserved(c: np.ndarray) -> bool:
+        halves = (_FIRST, _SECOND)
+        return all(samples.defect(c * samples.size, half) <= _ROUNDOFF for half in halves)
+
+    found = [next(filter(is_conserved, forms(row)), None) for row in rows]
+    return [c for c in found if c is not None]
 
 
 def _number(x: float, share: float) -> float:

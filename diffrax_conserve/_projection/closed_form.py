@@ -38,7 +38,9 @@ class ClosedForm(AbstractProjection):
     fn: Callable[[RealScalarLike, Any, Any, Values], Any]
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    metric: PyTree[ArrayLike] | None = option(None, converter=positive_weights)
+    metric: PyTree[ArrayLike] | None = eqx.field(
+        default=None, converter=positive_weights, kw_only=True
+    )
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):

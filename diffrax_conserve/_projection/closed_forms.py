@@ -26,8 +26,8 @@ def density_matrix(where: Callable[[Any], Any] = lambda y: y) -> ClosedForm:
     r"""The projection to the nearest density matrix: Hermitian, of trace one, not negative.
 
     Of the Hermitian part $V \operatorname{diag}(w) V^\dagger$ the eigenvalues become
-    $\max(w_i - \mu, 2 n \varepsilon)$, with the $\mu$ for which their sum is one. The bound of $2 n$
-    units of roundoff $\varepsilon$ keeps the rounding of the entries from making an eigenvalue
+    $\max(w_i - \mu, 2 n \varepsilon)$, with the $\mu$ for which their sum is one. The bound of
+    $2 n$ units of roundoff $\varepsilon$ keeps the rounding of the entries from making an eigenvalue
     negative. In the Frobenius norm no density matrix is nearer, up to roundoff. The result is
     Hermitian exactly.
 
@@ -42,7 +42,7 @@ def density_matrix(where: Callable[[Any], Any] = lambda y: y) -> ClosedForm:
 
     **Raises:**
 
-    `TypeError` if `where` is not a function; `ValueError`, in use, if a part is not a square matrix.
+    `TypeError` if `where` is not a function; `ValueError`, in use, if a part is no square matrix.
 
     !!! example
 
