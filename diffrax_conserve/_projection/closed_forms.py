@@ -27,9 +27,9 @@ def density_matrix(where: Callable[[Any], Any] = lambda y: y) -> ClosedForm:
 
     Of the Hermitian part $V \operatorname{diag}(w) V^\dagger$ the eigenvalues become
     $\max(w_i - \mu, 2 n \varepsilon)$, with the $\mu$ for which their sum is one. The bound of
-    $2 n$ units of roundoff $\varepsilon$ keeps the rounding of the entries from making an eigenvalue
-    negative. In the Frobenius norm no density matrix is nearer, up to roundoff. The result is
-    Hermitian exactly.
+    $2 n$ units of roundoff $\varepsilon$ keeps rounded entries from having a negative eigenvalue.
+    In the Frobenius norm no density matrix is nearer, up to roundoff. The result is Hermitian
+    exactly.
 
     **Arguments:**
 
