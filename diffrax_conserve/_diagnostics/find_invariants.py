@@ -260,17 +260,15 @@ def _formula(c: np.ndarray, names: list[str]) -> str:
     """Such as `0.5 v^2 - cos(q)`."""
     parts = []
     for j in np.flatnonzero(c):
-        number = f"{abs(c[j]):.6g}"
-        parts.append(
-            f"{'-' if c[j] < 0 else '+'} {'' if number == '1' else number + ' '}{names[j]}"
-        )
+        number = f"{abs(c[j]):.6g} ".removeprefix("1 ")
+        parts.append(f"{'-' if c[j] < 0 else '+'} {number}{names[j]}")
     return " ".join(parts).removeprefix("+ ")
 
 
 class _Samples:
     """What is known of the functions at the states, with rows and columns scaled to size one.
 
-    - `values`, of shape `(states, functions)`: their values, less those by which they differ.
+    - `values`, of shape `(states, functions)`: their values.
     - `gradients`, `terms`, of shape `(states, components, functions)`: their derivatives, and the
       terms of the `derivatives` along the field, of shape `(states, functions)`.
     - `size`: the scale of each function by which it was divided.
@@ -337,10 +335,9 @@ def _sampled(
         )
     x = np.asarray(jax.vmap(ravel)(ys))
     largest = np.abs(x).max(axis=0)
-    apart = np.where(largest > 0, largest, largest.max()) * np.sin(np.arange(x.size)).reshape(
-        x.shape
-    )
-    moved = np.asarray(measure(ts, jax.vmap(unravel)(x + apart / 10, ys))[2])
+    apart = np.where(largest > 0, largest, largest.max()) / 10
+    beside = x + apart * np.sin(np.arange(x.size)).reshape(x.shape)
+    moved = np.asarray(measure(ts, jax.vmap(unravel)(beside, ys))[2])
     idle = (slopes == 0).all(axis=0) & (np.isfinite(moved) & (moved != 0)).any(axis=0)
     if idle.any():
         raise ValueError(
