@@ -9,9 +9,11 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solver = dfc.ManifoldProjection(diffrax.Tsit5(), energy)
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
-What is conserved    FirstIntegral, Constraint, check_invariance, drift, off_manifold
-Solvers              ManifoldProjection, RK4, Unrolled, statistics
-Projections          SimplifiedNewton, Newton, ClosedForm, Directional, Staged, project
+What is conserved    FirstIntegral, Constraint, find_invariants
+Diagnostics          check_invariance, drift, off_manifold, statistics
+Solvers              ManifoldProjection, RK4, Unrolled
+Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
+Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
 Your own tests       import diffrax_conserve.testing
@@ -27,9 +29,11 @@ from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
 from ._diagnostics.drift import off_manifold as off_manifold
+from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
+from ._projection import closed_forms as closed_forms
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
@@ -38,6 +42,7 @@ from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
+from ._projection.relaxation import Relaxation as Relaxation
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
 from ._projection.tangent import TangentField as TangentField

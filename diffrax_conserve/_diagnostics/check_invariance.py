@@ -148,7 +148,7 @@ def check_invariance(
     check_manifold(manifold)
     if isinstance(vector_field, dfx.ODETerm):
         vector_field = vector_field.vector_field
-    ts, ys = _batch(t, states, jr.key(0) if key is None else key, num_states)
+    ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
     with one_of(ys):
@@ -160,7 +160,7 @@ def check_invariance(
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
 
-def _batch(
+def batch(
     t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
 ) -> tuple[Float[Array, " states"], PyTree[Array]]:
     if callable(states):

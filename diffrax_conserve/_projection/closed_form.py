@@ -6,13 +6,13 @@ from typing import Any, ClassVar, final
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import RealScalarLike, Values
 from .._options import check_function
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .options import check_options, option
+from .options import check_options, option, positive_weights
 
 
 @final
@@ -38,7 +38,9 @@ class ClosedForm(AbstractProjection):
     fn: Callable[[RealScalarLike, Any, Any, Values], Any]
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    metric: None = eqx.field(default=None, init=False)
+    metric: PyTree[ArrayLike] | None = eqx.field(
+        default=None, converter=positive_weights, kw_only=True
+    )
     sees_step: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -67,6 +69,8 @@ ClosedForm.__init__.__doc__ = r"""**Arguments:**
     conserved values (a PyTree like the manifold, with zeros in the place of each `Constraint`),
     which returns a state like `y`. Derivatives of the projection are those of `fn`.
 - `rtol`, `atol`: the tolerances for residuals; see `SimplifiedNewton`.
+- `metric`: that in which the length of a correction is limited, as at a saved time by the length of
+    the step; see `SimplifiedNewton`.
 
 **Raises:**
 

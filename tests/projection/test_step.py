@@ -1,4 +1,4 @@
-"""What a projection of a user sees of the step, with relaxation in Ketcheson's sense."""
+"""What a projection sees of the step: relaxation, and projections of a user."""
 
 from typing import ClassVar
 
@@ -11,27 +11,19 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import EXPONENTIAL, EXPONENTIAL0, drift_of, evaluated, exponential
+from ..problems import (
+    EXPONENTIAL,
+    EXPONENTIAL0,
+    drift_of,
+    evaluated,
+    exponential,
+    exponential_solution,
+)
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)
 
 
-class Relaxation(dfc.AbstractProjection):
-    metric: None = None
-
-    def solve(self, problem, candidate):
-        y0 = problem.step.y0
-        gamma = jnp.ones(())
-        for _ in range(5):
-            g, slope = jax.jvp(
-                lambda x: problem.residual(y0 + x * (candidate - y0))[0], (gamma,), (1.0,)
-            )
-            gamma = gamma - jnp.where(slope == 0, 0, g / jnp.where(slope == 0, 1, slope))
-        y = y0 + gamma * (candidate - y0)
-        return y, problem.judge(candidate, y, num_steps=5)
-
-
-RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=Relaxation())
+RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=dfc.Relaxation())
 
 
 @eqx.filter_jit
@@ -45,6 +37,46 @@ def test_relaxation_keeps_the_energy_at_every_saved_time():
     assert jnp.max(jnp.abs(drift_of(sol, ENERGY))) < 4e-15
     kept = jax.vmap(ENERGY.fn, (None, 0, None))(0, evaluated(sol, jnp.linspace(0, 2, 91)), None)
     np.testing.assert_allclose(kept, ENERGY.fn(0, EXPONENTIAL0, None), rtol=4e-15)
+
+
+def carrying(t, y, args):
+    """The field with its time as a component."""
+    return {"y": exponential(t, y["y"], args), "time": jnp.ones(())}
+
+
+@pytest.mark.parametrize(("inner", "order"), [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"])
+def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(inner, order):
+    kept = dfc.FirstIntegral(lambda t, y, args: ENERGY.fn(t, y["y"], args))
+    solver = dfc.ManifoldProjection(inner, kept, projection=dfc.Relaxation())
+    y0 = {"y": EXPONENTIAL0, "time": jnp.zeros(())}
+
+    @jax.jit
+    def errors(h):
+        ys = dfx.diffeqsolve(dfx.ODETerm(carrying), solver, 0.0, 2.0, h, y0).ys
+        y, time = ys["y"][-1], ys["time"][-1]
+        exact = exponential_solution(2.0), exponential_solution(time)
+        return jnp.stack([jnp.max(jnp.abs(y - other)) for other in exact])
+
+    coarse, fine = errors(0.05), errors(0.025)
+    np.testing.assert_allclose(np.log2(coarse / fine), [order - 1, order], atol=0.15)
+
+
+def test_derivatives_of_relaxation_agree_with_differences():
+    def total(y0):
+        return jnp.sum(jnp.sin(dfx.diffeqsolve(TERM, RELAXED, 0.0, 1.0, 0.1, y0).ys))
+
+    gradient = jax.jit(jax.grad(total))(EXPONENTIAL0)
+    steps = 1e-5 * np.eye(2)
+    ends = [jax.jit(total)(EXPONENTIAL0 + step) for step in (*steps, *-steps)]
+    np.testing.assert_allclose(gradient, np.subtract(ends[:2], ends[2:]) / 2e-5, rtol=1e-7)
+
+
+def test_relaxation_is_refused_without_a_step_and_with_two_integrals():
+    with pytest.raises(ValueError, match="there is none outside a solve"):
+        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=dfc.Relaxation())
+    twice = dfc.ManifoldProjection(dfx.Heun(), (ENERGY, ENERGY), projection=dfc.Relaxation())
+    with pytest.raises(ValueError, match="has one unknown, but `manifold` has 2"):
+        solve(twice)
 
 
 class Seen(dfc.AbstractProjection):
@@ -92,6 +124,3 @@ def test_what_is_no_solution_is_a_failure():
     lazy = Unseeing(atol=0.0)
     solver = dfc.ManifoldProjection(dfc.RK4(), ENERGY, projection=lazy)
     assert solve(solver, dt0=0.3, throw=False).result != dfx.RESULTS.successful
-    # Outside a solve there is no step.
-    with pytest.raises(AttributeError, match="y0"):
-        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=Relaxation())

@@ -1,0 +1,94 @@
+"""Projection along the step, known as relaxation."""
+
+import dataclasses
+from typing import ClassVar, final
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .base import AbstractProjection, Problem, ProjectionInfo
+from .implicit import project_along
+from .options import check_options, option
+
+
+@final
+class Relaxation(AbstractProjection):
+    r"""Projects along the step, for one integral: $y_{n+1} = y_n + \gamma (\hat y - y_n)$.
+
+    The scalar $\gamma$ near 1 solves $g(y_n + \gamma (\hat y - y_n)) = 0$ by Newton's method. All
+    linear integrals that the wrapped solver conserves stay conserved, and no error estimate is
+    needed. For a Runge-Kutta method $y_{n+1}$ approximates the solution at $t_n + \gamma h$, where
+    $\gamma = 1 + O(h^{p-1})$ in a method of order $p$. But the steps of diffrax end at
+    $t_n + h$, so the order is $p - 1$ (the *incremental direction technique*).
+
+    For order $p$ (*relaxation* proper) let the solver carry the time: append a component $\tau$
+    with $\tau' = 1$ to the state, and write the vector field and the integral in terms of
+    $\tau$. It is relaxed like the others, and the state belongs to the time $\tau$, not to the time
+    of diffrax.
+
+    The projection fails where the integral does not change along the step, as at a candidate on a
+    chord of a level set that is straight. At saved times inside a step and in dense output
+    $\hat y$ is the dense output. Derivatives follow from the implicit function theorem.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        energy = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
+        solver = dfc.ManifoldProjection(diffrax.Heun(), energy, projection=dfc.Relaxation())
+        ```
+
+    ??? cite "Reference"
+
+        Ketcheson, "Relaxation Runge-Kutta methods: conservation and stability for inner-product
+        norms", *SIAM J. Numer. Anal.* 57 (2019), 2850-2870. Ranocha, Sayyari, Dalcin, Parsani and
+        Ketcheson, "Relaxation Runge-Kutta methods: fully discrete explicit entropy-stable schemes
+        for the compressible Euler and Navier-Stokes equations", *SIAM J. Sci. Comput.* 42 (2020),
+        A612-A638, for integrals that are not quadratic.
+    """
+
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    max_steps: int = option(50, static=True)
+    metric: None = eqx.field(default=None, init=False)
+    sees_step: ClassVar[bool] = True
+
+    def __check_init__(self):
+        check_options(self)
+
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        size = problem.equations.magnitude.size
+        if size != 1:
+            raise ValueError(
+                f"`Relaxation` has one unknown, but `manifold` has {size} scalar constraints. Keep "
+                "one integral, or pass `projection=SimplifiedNewton()`."
+            )
+        if problem.step is None:
+            raise ValueError(
+                "`Relaxation` moves along a step, but there is none outside a solve. Pass "
+                "`projection=Newton()`."
+            )
+        # The increment is the unit of each component, and its signs are the direction.
+        increment = candidate - problem.step.y0
+        equations = dataclasses.replace(problem.equations, units=jnp.abs(increment))
+        signs = lax.stop_gradient(jnp.sign(increment))[None]
+        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
+        return y, problem.judge(candidate, y, count, ok=ok)
+
+
+Relaxation.__init__.__doc__ = """**Arguments:**
+
+- `rtol`, `atol`, `max_steps`: see `SimplifiedNewton`.
+
+**Raises:**
+
+`ValueError` with more than one scalar constraint, and outside a solve, as in
+[`diffrax_conserve.project`][].
+"""

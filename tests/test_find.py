@@ -1,0 +1,265 @@
+"""`find_invariants` finds what is known to be conserved, and nothing else."""
+
+import functools as ft
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve import find_invariants, systems
+
+from .thinned import some_of
+
+
+def normal(size):
+    return lambda key: jr.normal(key, (size,))
+
+
+def component(i):
+    return lambda y: y[i]
+
+
+def monomials(*names):
+    """Products of `q1`, `q2`, `p1`, `p2` and powers of the radius for Kepler's problem."""
+    part = {"q1": (0, 0), "q2": (0, 1), "p1": (1, 0), "p2": (1, 1)}
+
+    def value(name, y):
+        r = jnp.sqrt(jnp.sum(y[0] ** 2))
+        factors = [1 / r if x == "/r" else y[part[x][0]][part[x][1]] for x in name.split()]
+        return ft.reduce(jnp.multiply, factors)
+
+    return {name: ft.partial(value, name) for name in names}
+
+
+KEPLER = systems.Kepler()
+KEPLER_BASIS = monomials(
+    *("p1 p1", "p2 p2", "p1 p2", "/r", "q1 p1", "q1 p2", "q2 p1", "q2 p2", "q1", "q2", "q1 /r"),
+    *("q2 /r", "q1 p1 p1", "q1 p2 p2", "q1 p1 p2", "q2 p1 p1", "q2 p2 p2", "q2 p1 p2", "p1", "p2"),
+)
+LOTKA_VOLTERRA = {"u": component(0), "v": component(1), "uv": lambda y: y[0] * y[1]} | {
+    f"log {name}": ft.partial(lambda y, i: jnp.log(y[i]), i=i) for i, name in enumerate("uv")
+}
+TODA = {f"p{i}": lambda y, i=i: y[1][i] for i in range(3)}
+TODA |= {f"p{i} p{j}": lambda y, i=i, j=j: y[1][i] * y[1][j] for i in range(3) for j in range(i, 3)}
+TODA |= {f"e{i}": lambda y, i=i: jnp.exp(y[0][i] - y[0][(i + 1) % 3]) for i in range(3)}
+TODA |= {f"1/e{i}": lambda y, i=i: jnp.exp(y[0][(i + 1) % 3] - y[0][i]) for i in range(3)}
+POLLU, ROBERTSON = systems.Pollu(), systems.Robertson()
+NITROGEN = systems.Mechanism(["NO + O3 -> NO2", "NO2 -> NO + O3", "2 NO2 -> N2O4"], [26.6, 0.3, 9])
+
+
+def sparse(size):
+    """Many concentrations are zero, so that slow reactions show without fast ones."""
+    return lambda key: jr.uniform(key, (size,)) * jr.bernoulli(jr.split(key)[0], 0.3, (size,))
+
+
+def species(mechanism):
+    return {name: component(i) for i, name in enumerate(mechanism.species)}
+
+
+def with_angle(key):
+    return jr.normal(key, (2,)) * jnp.array([2.0, 1.0])
+
+
+def isotropic(t, y, args):
+    return jnp.concatenate([y[2:], -y[:2]])
+
+
+def two_level(t, y, args):
+    return -1j * jnp.array([[1.0, 0.3], [0.3, -1.0]]) @ y
+
+
+def amplitudes(key):
+    return jax.lax.complex(*jr.normal(key, (2, 2)))
+
+
+def pendulum(t, y, args):
+    return jnp.stack([y[1], -jnp.sin(y[0])])
+
+
+PENDULUM = {"v^2": lambda y: y[1] ** 2, "v": component(1), "sin(q)": lambda y: jnp.sin(y[0])}
+PENDULUM["cos(q)"] = lambda y: jnp.cos(y[0])
+
+# The field, states, the basis, how many integrals there are, and some that are known.
+FOUND = {
+    name: (system.vector_field, system.sample, basis, count, system.manifold)
+    for name, system, basis, count in [
+        ("harmonic oscillator", systems.HarmonicOscillator(), 4, 1),
+        ("Hénon-Heiles", systems.HenonHeiles(), 3, 1),
+        ("rigid body", systems.RigidBody(), 4, 2),
+        ("conservative Lorenz", systems.ConservativeLorenz(), 3, 2),
+        ("Kepler", KEPLER, KEPLER_BASIS, 4),
+        ("Lotka-Volterra", systems.LotkaVolterra(), LOTKA_VOLTERRA, 1),
+    ]
+}
+RUNGE_LENZ = {"A": dfc.FirstIntegral(KEPLER.laplace_runge_lenz)}
+FOUND["Kepler"] = (*FOUND["Kepler"][:4], KEPLER.manifold | RUNGE_LENZ)
+toda = systems.TodaLattice()
+FOUND |= {
+    "Toda": (toda.vector_field, toda.sample, TODA, 2, toda.manifold),
+    "Robertson": (ROBERTSON.vector_field, sparse(3), 2, 1, ROBERTSON.manifold),
+    "Pollu": (POLLU.vector_field, sparse(20), species(POLLU.mechanism), 3, POLLU.manifold),
+    "nitrogen": (NITROGEN.vector_field, sparse(4), species(NITROGEN), 2, NITROGEN.manifold),
+    "isotropic": (isotropic, normal(4), 4, 4, {}),
+    "two levels": (two_level, amplitudes, 2, 4, {}),
+    "pendulum": (pendulum, with_angle, PENDULUM, 1, {}),
+}
+FOUND["Toda"] = (*FOUND["Toda"][:4], {k: toda.manifold[k] for k in ("linear momentum", "energy")})
+NUM_STATES = {"Pollu": 1000}
+
+
+@some_of("name", FOUND, ids=FOUND, period=4)
+def test_all_that_is_known_is_found(name):
+    field, sample, basis, count, known = FOUND[name]
+    found = find_invariants(field, sample, basis=basis, num_states=NUM_STATES.get(name))
+    assert len(found) == count, list(found)
+    other = jr.key(1)
+    assert dfc.check_invariance(field, found, sample, key=other, rtol=1e-11).ok
+    # What is known depends on what was found.
+    for key in jr.split(jr.key(2), 3):
+        y = jax.tree.map(lambda x: x + 0.1, sample(key))
+
+        def rank(manifold, y=y):
+            rows = [jax.jacfwd(lambda y, e=e: e.fn(0.0, y, None))(y) for e in manifold.values()]
+            rows = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(row)]) for row in rows]
+            return np.linalg.matrix_rank(np.stack(rows), tol=1e-9)
+
+        scalars = {k: e for k, e in known.items() if jnp.ndim(e.fn(0.0, y, None)) == 0}
+        if not jnp.iscomplexobj(jax.tree.leaves(y)[0]):
+            assert rank(found | scalars) == rank(found)
+
+
+def damped(size):
+    def field(t, y, args):
+        q, p = jnp.split(y, 2)
+        return jnp.concatenate([p, -q - size * p])
+
+    return field
+
+
+def henon_heiles(t, y, args):
+    x, y, u, v = y
+    return jnp.stack([u, v, -x - 2 * x * y - 1e-9 * u, -y - x**2 + y**2])
+
+
+NOT = {
+    "oscillator": (damped(1e-6), 2),
+    "two oscillators": (damped(jnp.array([1e-3, 2e-3])), 4),
+    "Hénon-Heiles": (henon_heiles, 4),
+    "pendulum": (lambda t, y, a: jnp.stack([y[1], -jnp.sin(y[0]) - 1e-9 * y[1]]), 2),
+    "Duffing": (lambda t, y, a: jnp.stack([y[1], y[0] - y[0] ** 3 - 1e-3 * y[1]]), 2),
+    "van der Pol": (lambda t, y, a: jnp.stack([y[1], (1 - y[0] ** 2) * y[1] - y[0]]), 2),
+    "Lorenz": (
+        lambda t, y, a: jnp.stack(
+            [10 * (y[1] - y[0]), y[0] * (28 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]]
+        ),
+        3,
+    ),
+    "Rössler": (
+        lambda t, y, a: jnp.stack([-y[1] - y[2], y[0] + y[1] / 5, 0.2 + y[2] * (y[0] - 5.7)]),
+        3,
+    ),
+    "Brusselator": (
+        lambda t, y, a: jnp.stack([1 + y[0] ** 2 * y[1] - 4 * y[0], 3 * y[0] - y[0] ** 2 * y[1]]),
+        2,
+    ),
+    "FitzHugh-Nagumo": (
+        lambda t, y, a: jnp.stack(
+            [y[0] - y[0] ** 3 / 3 - y[1] + 0.5, 0.08 * (y[0] + 0.7 - 0.8 * y[1])]
+        ),
+        2,
+    ),
+    "logistic": (lambda t, y, a: y * (1 - y), 1),
+    "heat": (lambda t, y, a: jnp.convolve(y, jnp.array([1.0, -2.0, 1.0]), "same"), 4),
+    "Thomas": (lambda t, y, a: jnp.sin(jnp.roll(y, -1)) - y / 5, 3),
+    "Chua": (
+        lambda t, y, a: jnp.stack([9 * (y[1] - y[0] ** 3), y[0] - y[1] + y[2], -14 * y[1]]),
+        3,
+    ),
+}
+
+
+@some_of("name", NOT, ids=NOT, period=4)
+def test_where_nothing_is_conserved_nothing_is_found(name):
+    field, size = NOT[name]
+    assert find_invariants(field, normal(size), basis=3) == {}
+
+
+def test_formulas_do_not_depend_on_units_and_precision():
+    """In metres and seconds, and from float32."""
+    mu = 3.986e14
+
+    def satellite(t, y, args):
+        q, v = y
+        return v, -mu * q / jnp.sum(q**2) ** 1.5
+
+    rng = np.random.default_rng(0)
+    states = (rng.normal(size=(80, 2)) * 7e6, rng.normal(size=(80, 2)) * 7e3)
+    states = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), states)
+    found = find_invariants(satellite, states, basis=KEPLER_BASIS)
+    assert len(found) == 4
+    assert "q1 p2 - q2 p1" in found
+    kinetic = f"{1 / (2 * mu):.6g}"
+    assert f"{kinetic} p1 p1 + {kinetic} p2 p2 - /r" in found
+    like = jax.tree.map(lambda x: x[0], states)
+    assert all(e.fn(0.0, like, None).dtype == jnp.float32 for e in found.values())
+
+
+def test_the_result_is_a_manifold():
+    found = find_invariants(pendulum, with_angle, basis=PENDULUM)
+    assert list(found) == ["0.5 v^2 - cos(q)"]
+    solver = dfc.ManifoldProjection(dfc.RK4(), found)
+    sol = dfx.diffeqsolve(dfx.ODETerm(pendulum), solver, 0, 9, 0.1, jnp.array([2.0, 0.0]))
+    expected = dfx.diffeqsolve(dfx.ODETerm(pendulum), dfx.Dopri8(), 0, 9, 1e-2, jnp.array([2.0, 0]))
+    np.testing.assert_allclose(sol.ys, expected.ys, atol=1e-5)
+    energy = sol.ys[-1, 1] ** 2 / 2 - jnp.cos(sol.ys[-1, 0])
+    np.testing.assert_allclose(energy, -jnp.cos(2.0), rtol=4e-15)
+
+
+def test_names_of_components():
+    def field(t, y, args):
+        return {"a": 0 * y["a"], "b": jnp.stack([y["b"][1], -y["a"] * y["b"][0]])}
+
+    ys = {"a": jr.normal(jr.key(0), (40,)), "b": jr.normal(jr.key(1), (40, 2))}
+    assert list(find_invariants(field, ys, basis=3)) == ["a", "b[1]^2 + a b[0]^2"]
+
+
+CURVE = KEPLER.solution(jnp.linspace(0, 5, 60), KEPLER.y0)
+PLANE = jr.normal(jr.key(0), (60, 2)) * jnp.array([1.0, 0.0])
+BAD = jr.normal(jr.key(0), (60, 2)).at[7].set(jnp.nan)
+
+
+F = pendulum
+
+
+@pytest.mark.parametrize(
+    ("field", "ys", "basis", "error", "match"),
+    [
+        (F, PLANE[:9], 2, ValueError, "9 states, but a basis of 5 functions needs at least 10"),
+        (F, PLANE, 2, ValueError, r"The component `y\[0\]` of the state moves"),
+        (ROBERTSON.vector_field, ROBERTSON.sample, 1, ValueError, r"The component `y\[2\]`"),
+        (F, PLANE + jnp.array([0.0, 1.0]), 2, ValueError, r"The function `y\[1\]` has the same"),
+        (lambda t, y, a: F(t, y, a) + t, PLANE + 1, 2, ValueError, "depends on time"),
+        (KEPLER.vector_field, CURVE, KEPLER_BASIS, ValueError, "as on one trajectory"),
+        (F, BAD, 2, ValueError, "`vector_field`, or its derivative, is not finite at state 7"),
+        (F, PLANE, 0, ValueError, "`basis` is 0"),
+        (F, PLANE, {}, ValueError, "`basis` is empty"),
+        (F, PLANE, "cubic", TypeError, "Give the degree of polynomials"),
+        (F, PLANE, {"y": lambda y: y}, ValueError, "must return one real"),
+        (F, PLANE, {"y": lambda t, y: y}, TypeError, r"Pass a function `fn\(y\)`"),
+    ],
+)
+def test_mistakes_are_named(field, ys, basis, error, match):
+    with pytest.raises(error, match=match):
+        find_invariants(field, ys, basis=basis)
+
+
+def test_what_cannot_be_told_apart_is_left_out_with_a_warning():
+    def nearly(t, y, args):
+        return jnp.stack([-y[0], y[0], -y[2], y[2] + 2e-14 * y[3]])
+
+    with pytest.warns(UserWarning, match="1 combinations seem to be conserved, but cannot be told"):
+        assert find_invariants(nearly, normal(4), basis=1) == {}
