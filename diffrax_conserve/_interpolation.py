@@ -23,6 +23,7 @@ from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import Target, has_bounds
 from ._projection.descent import descend
 from ._projection.equations import any_lane, length
+from ._projection.within_bounds import AbstractNewton
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
 
 # The largest number of damped steps.
@@ -112,8 +113,10 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             return near(candidate, y, ok)
 
         vector = ravel(candidate)
-        # Damped steps keep no bounds.
-        attempts = [project] if has_bounds(target.projection) else [project, damped]
+        # Damped steps keep no bounds, and lead elsewhere than another projection's own rule.
+        by_gradients = isinstance(target.projection, AbstractNewton)
+        damps = by_gradients and not has_bounds(target.projection)
+        attempts = [project, damped] if damps else [project]
         # Arrays over which the functions of the manifold close become leaves.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
         y, _ = _first_of(attempts, vector)

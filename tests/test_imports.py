@@ -47,7 +47,7 @@ MAY_IMPORT = {
 }
 
 # Packages that only one part may import, because they are optional.
-CONFINED = {"hypothesis": "testing", "matplotlib": "reproduce"}
+CONFINED = {"asdex": "_projection", "hypothesis": "testing", "matplotlib": "reproduce"}
 
 # Private names of other packages that have no public equivalent: `(file, name)`, and why.
 PRIVATE_ALLOWED = {

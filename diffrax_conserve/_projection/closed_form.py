@@ -12,7 +12,8 @@ from .._custom_types import RealScalarLike, Values
 from .._options import check_function
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .options import check_options, option, positive_weights
+from .metric import positive_weights
+from .options import check_options, option
 
 
 @final
