@@ -95,10 +95,9 @@ def test_args_outside_their_domain_are_steps_outside():
             TERM, solver, 0.0, 2.0, 0.5, Y0, args, saveat=statistics, throw=False
         )
 
-    report = dfc.learned.Report()
-    assert dfc.learned.domain_statistics(run(ARGS, report)).num_outside < 4
-    assert dfc.learned.domain_statistics(run(OUTSIDE, report)).num_outside == 4
-    refused = run(OUTSIDE, dfc.learned.Refuse())
+    assert dfc.learned.steps_outside(run(ARGS, "count")).number < 4
+    assert dfc.learned.steps_outside(run(OUTSIDE, "count")).number == 4
+    refused = run(OUTSIDE, "fail")
     assert "starts outside the domain" in dfx.RESULTS[refused.result]
     replaced = run(OUTSIDE, dfx.Tsit5())
     exact = dfx.diffeqsolve(TERM, dfx.Tsit5(), 0.0, 2.0, 0.5, Y0, OUTSIDE).ys
