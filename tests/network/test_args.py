@@ -53,6 +53,7 @@ def solve(flow_map, args, check_field=False, **options):
 def test_it_starts_at_its_state_and_sees_all_args(core, order):
     flow_map = family(order, core=core)
     np.testing.assert_array_equal(flow_map(Y0, ARGS, 0.0), Y0)
+    np.testing.assert_array_equal(flow_map(Y0, 0.3, args=ARGS), flow_map(Y0, ARGS, 0.3))
     slopes = jax.jit(jax.jacfwd(lambda args: flow_map(Y0, args, 0.3)))(ARGS)
     assert all(jnp.all(jnp.abs(leaf) > 0) for leaf in jax.tree.leaves(slopes))
 
