@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-
 Activation = Callable[[Array], Array]
 _HIGHEST = jax.lax.Precision.HIGHEST
 
