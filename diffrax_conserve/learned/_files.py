@@ -277,8 +277,11 @@ def _array(body: io.BytesIO, name: str, *shape: int) -> jax.Array:
 
 
 def _module(kind: Any, fields: dict[str, Any]) -> Any:
-    # Files of earlier versions tell that the inputs are normalised, as they always are.
+    # Files of earlier versions tell that the inputs are normalised, as they always are, and do not
+    # know the algorithm as printed.
     names = [field.name for field in dataclasses.fields(kind)]
+    if kind is ConservativeLayer:
+        fields.setdefault("as_printed", False)
     if fields.pop("normalise", True) is not True or list(fields) != names:
         raise ValueError(f"a {kind.__name__} has other fields")
     module = object.__new__(kind)
