@@ -15,8 +15,11 @@ import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, Still, Within, flow_map, in_single, oscillator
 
-# Most of these trainings are too short, and say so.
-pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
+# Most of these trainings are too short, and say so; no library may warn of anything.
+pytestmark = [
+    pytest.mark.filterwarnings("error"),
+    pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution"),
+]
 LAYER = dfc.learned.ConservativeLayer(RADIUS, steps=2)
 KEY = jr.key(5)
 
