@@ -138,7 +138,7 @@ def layer(name, seed, smoke):
     )  # fmt: skip
     drift = dfc.drift(solution, manifold)
     return {
-        "error": float(error), "ratio": float(log.error / error),
+        "error": float(error), "estimate over error": float(log.error / error),
         "drift": max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(drift)),
         "windows": network.windows, "said": said, "seconds": round(seconds, 1),
     }  # fmt: skip
@@ -183,10 +183,14 @@ def float32(name, seed, smoke):
 
 # What is measured of which systems, and the columns of its table: of these the largest.
 KINDS = {
-    "layer": (layer, SOLUTIONS, ("error", "ratio", "drift", "windows", "seconds")),
+    "layer": (layer, SOLUTIONS, ("error", "estimate over error", "drift", "windows", "seconds")),
     "logarithm": (logarithm, MEASURED, ("nan", "skipped", "epochs", "error", "seconds")),
     "float32": (float32, FLOW_MAPS, ("skipped", "epochs", "error", "seconds")),
 }
+
+
+def shown(x):
+    return f"{x:.1e}" if 0 < x < 0.01 else f"{x:.4g}"
 
 
 def tables(records):
@@ -199,7 +203,7 @@ def tables(records):
             rows = [r for r in records if (r["kind"], r["system"]) == (kind, name)]
             if rows:
                 cells = [[r[c] for r in rows] for c in columns]
-                cells = [f"{np.median(x):.2g} / {max(x):.2g}" for x in cells]
+                cells = [f"{shown(np.median(x))} / {shown(max(x))}" for x in cells]
                 said = sum(bool(r["said"]) for r in rows)
                 lines.append(f"| {name} | {len(rows)} | {said} | {' | '.join(cells)} |")
     return "\n".join(lines[1:])
