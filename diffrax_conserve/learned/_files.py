@@ -329,7 +329,7 @@ def _slope(network: DeepONet) -> np.ndarray:
 
 def _check_slope(network: DeepONet, slope: np.ndarray) -> None:
     found = _slope(network)
-    if np.max(np.abs(found - slope)) > 1e-3 * np.max(np.abs(slope)):
+    if not np.max(np.abs(found - slope)) <= 1e-3 * np.max(np.abs(slope)):
         raise _NotGiven(
             f"The vector field of `taylor` is {found} at a state where that of the saved network "
             f"is {slope}. Pass the field, and its `args`, for which the network was trained."

@@ -49,12 +49,12 @@ def recipe(
     - `as_printed`: whether to make none of these changes. Give the network a layer
         `ConservativeLayer(manifold, steps=P, as_printed=True)` too.
     """
+    if points is None:
+        points = 2000 if isinstance(model, PINN) else 5000
     if as_printed:
-        count = points or (2000 if isinstance(model, PINN) else 5000)
-        return Recipe(epochs, count, optax.adam(1e-3), schedule=_printed)
+        return Recipe(epochs, points, optax.adam(1e-3), schedule=_printed)
     if isinstance(model, PINN):
-        return Recipe(epochs=epochs, points=2000 if points is None else points, schedule=_projected)
-    points = 5000 if points is None else points
+        return Recipe(epochs=epochs, points=points, schedule=_projected)
     return Recipe(epochs=epochs, points=points, schedule=_staged, loss=_bounded)
 
 

@@ -116,8 +116,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         refused = refused_from_start(
             self.flow_map, known, terms, t0, t1, y0, args, self.check_field
         )
-        known = self._has_domain or self.max_error is not None
-        return _State(refused, StepsOutside.zero(t0) if known else None)
+        counts = self._has_domain or self.max_error is not None
+        return _State(refused, StepsOutside.zero(t0) if counts else None)
 
     def step(
         self,
