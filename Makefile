@@ -126,7 +126,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 COSTS := core forms overhead gradients work_precision scaling balance learned_solvers sweeps \
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
-  defaults
+  defaults hard_cases
 STUDIES := claims long_run units
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
@@ -148,7 +148,7 @@ comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/chemistry learned/equal_cost learned/defaults \
+	  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 

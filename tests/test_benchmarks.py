@@ -39,6 +39,7 @@ def trained(name, table):
 
 TABLES = {
     "learning from data": ("learning-from-data", lambda: lines_of("learning_from_data", "OUT")),
+    "hard cases": ("training", lambda: lines_of("hard_cases", "OUT", "tables")),
     "long run": ("performance", lambda: lines_of("long_run", "RESULTS")),
     "worth": ("../zoo", lambda: lines_of("worth", "RESULTS")),
     "zoo": ("zoo", lambda: trained("zoo", "tables")),

@@ -4,6 +4,7 @@ Bit for bit: a lane is computed by the same instructions wherever it is. The num
 fixed when JAX starts, so each test starts its own interpreters, which run a function of this file.
 """
 
+import dataclasses
 import json
 import os
 import socket
@@ -71,6 +72,30 @@ def one_of_two_processes(port, index):
     assert largest == np.max(alone)
 
 
+def train_over_two_devices():
+    """Prints the losses of a training on one device, and with its points shared by two."""
+    mesh = jax.make_mesh((2,), ("points",), axis_types=(jax.sharding.AxisType.Auto,))
+    system = dfc.systems.HarmonicOscillator()
+    y0s = jax.vmap(system.sample)(jax.random.split(jax.random.key(0), LANES))
+    flow_map = dfc.DeepONet(y0s, 0.5, width=8, depth=1, key=jax.random.key(1))
+    recipe = dfc.learned.second_order(flow_map, epochs=5)
+    losses, spread = [], NamedSharding(mesh, PartitionSpec("points"))
+    for sharding in (None, spread):
+        trained, log = dfc.fit(
+            flow_map, system.vector_field, key=jax.random.key(2), recipe=recipe, sharding=sharding
+        )
+        losses.append(log.losses.tolist())
+    (weight, *_) = jax.tree.leaves(trained)
+    uneven = dataclasses.replace(recipe, points=31)
+    try:
+        dfc.fit(
+            flow_map, system.vector_field, key=jax.random.key(2), recipe=uneven, sharding=spread
+        )
+    except ValueError as error:
+        refused = str(error)
+    print(json.dumps([*losses, len(weight.sharding.device_set), refused]))
+
+
 def start(devices, *arguments):
     # Optimised: else products are added with one rounding or with two, as the batch is long.
     flags = f"{OPTIMISED} --xla_force_host_platform_device_count={devices}"
@@ -93,6 +118,14 @@ def answer(process):
 def test_a_batch_over_eight_devices_is_the_batch_on_one():
     found = answer(start(8, "spread_over_eight_devices"))
     assert found == {"equal": True, "devices": 8, "all-reduces": 0}
+
+
+def test_a_training_over_two_devices_is_that_on_one():
+    alone, spread, devices, refused = answer(start(2, "train_over_two_devices"))
+    assert devices == 2
+    np.testing.assert_allclose(spread, alone, rtol=1e-6)
+    assert spread != alone  # each device summed its share
+    assert "cannot share out the 31 points" in refused
 
 
 @pytest.mark.slow

@@ -202,10 +202,12 @@ def test_a_projection_that_fails_costs_the_other_solver_nothing(tmp_path, capsys
 
 
 @pytest.mark.slow
+@pytest.mark.draws
 def test_training_anew(tmp_path):
     arguments = ("rigid-body", "--train", "--epochs", "3", "--seed", "1", "--t1", "0.1")
     status, metrics = reproduce(tmp_path, *arguments)
     assert status == 0
+    assert {"loss.png", "schedule.png"} <= {file.name for file in (tmp_path / "out").iterdir()}
     for kind in ("standard", "conservative"):
         file = tmp_path / "out" / f"{kind}.network"
         assert dfc.learned.read_info(file)["info"]["seed"] == 1

@@ -104,6 +104,18 @@ def test_what_is_the_users_own_is_given_again(path, given, wrong, match):
     assert eqx.tree_equal(dfc.load(path, **given), network)
 
 
+def test_another_vector_field_is_told(path):
+    def spring(t, y, stiffness):
+        return stiffness * oscillator(t, y, None)
+
+    given = dfc.learned.Taylor(spring, 2, args=1.0)
+    network = dfc.DeepONet(jr.normal(jr.key(1), (9, 2)), 1.0, taylor=given, key=jr.key(0), **SMALL)
+    dfc.save(path, dfc.learned.Repeated(network, 2))
+    with pytest.raises(ValueError, match="Pass the field, and its `args`, for which the network"):
+        dfc.load(path, taylor=dfc.learned.Taylor(spring, 2, args=1.01))
+    dfc.load(path, taylor=dfc.learned.Taylor(oscillator, 2))
+
+
 def test_the_info(path):
     dfc.save(path, NETWORKS["deeponet"], info={"system": "lorenz", "errors": [1.0, 2.0]})
     found = dfc.learned.read_info(path)

@@ -17,9 +17,7 @@ from ._networks.wrappers import Repeated as Repeated
 from ._networks.wrappers import Transformed as Transformed
 from ._pretrained import pretrained_path as pretrained_path
 from ._solvers.flow_map_solver import FlowMapSolver as FlowMapSolver
-from ._solvers.policies import Refuse as Refuse
-from ._solvers.policies import Report as Report
-from ._solvers.policies import domain_statistics as domain_statistics
+from ._solvers.policies import steps_outside as steps_outside
 from ._training.data import reachable_states as reachable_states
 from ._training.data import trajectories as trajectories
 from ._training.loop import FitLog as FitLog

@@ -18,7 +18,7 @@ from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
-from ._networks.flat import as_states, check_scalars, stacked_vectors
+from ._networks.flat import as_states, check_scalars, check_within, stacked_vectors
 from ._networks.flow_map import args_domain_of, as_flow_map, known_args
 from ._solvers.flow_map_solver import FlowMapSolver
 
@@ -63,15 +63,27 @@ class Comparison(eqx.Module):
     @property
     def verdict(self) -> str:
         """In words, which step is better at an equal error."""
+        if not np.isfinite(self.error[0]):
+            return "The step of the network is not finite, or that of the reference is not."
         found = []
-        for name, times in (("alone", self.alone), ("in the batch", self.batch)):
+        for name, times in (
+            ("Alone", self.alone),
+            ("In the batch", self.batch),
+            ("Alone and projected", self.alone_projected),
+            ("In the batch and projected", self.batch_projected),
+        ):
             usable = np.where(self.substeps > 0, times, np.inf)
             best = int(np.argmin(usable[1:])) + 1
+            if np.isnan(times[0]):
+                continue
+            if np.isinf(usable[best]):
+                found.append("No classical step is as accurate with 128 substeps.")
+                break
             ratio, other = times[0] / usable[best], self.methods[best]
             if ratio > 1:
-                found.append(f"{name.capitalize()}, {other} is better: {ratio:.1f} times as fast.")
+                found.append(f"{name}, {other} is better: {ratio:.1f} times as fast.")
             else:
-                found.append(f"{name.capitalize()}, the network is {1 / ratio:.1f} times as fast.")
+                found.append(f"{name}, the network is {1 / ratio:.1f} times as fast as {other}.")
         if self.outside:
             found.append(f"{self.outside} of {self.count} steps leave the domain of the flow map.")
         if self.args_error > 0.1:
@@ -143,7 +155,9 @@ def compare(
     check_scalars(step=step, above=0.0)
     if manifold is not None:
         check_manifold(manifold)
-    h = jnp.asarray(flow_map.max_step if step is None else step, jnp.result_type(float))
+    step = float(flow_map.max_step if step is None else step)
+    check_within("step", step, 0.0, float(flow_map.max_step))
+    h = jnp.asarray(step, jnp.result_type(float))
     known = known_args(flow_map, args)
     term = dfx.ODETerm(vector_field)
     with one_of(states):

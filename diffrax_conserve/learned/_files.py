@@ -29,6 +29,7 @@ from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
 from ._networks.deeponet import DeepONet
 from ._networks.domain import Box, FramedBox, MakeFrame
+from ._networks.flat import flatten
 from ._networks.layer import ConservativeLayer
 from ._networks.pinn import PINN
 from ._networks.taylor import Taylor
@@ -88,6 +89,10 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     path, arrays = _file(path), []
     header = {"network": _describe(model, arrays), "info": info or {}}
     _check(model)
+    network: Any = _unwrapped(model)
+    if isinstance(network, DeepONet) and network.taylor is not None:
+        slope = _slope(network)
+        header["slope"] = slope.tolist() if np.all(np.isfinite(slope)) else None
     text = json.dumps(header, allow_nan=False).encode()
     rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
     first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
@@ -111,7 +116,8 @@ def load(
     **Raises:**
 
     `ValueError` if the file is not of this version, is truncated or damaged, or needs a `layer`,
-    `taylor` or `frame`; `OSError` if it cannot be read.
+    `taylor` or `frame`, or if the vector field of `taylor` is not that of the saved network, at a
+    state of its domain; `OSError` if it cannot be read.
     """
     given = {"layer": layer, "taylor": taylor, "make": frame}
 
@@ -120,6 +126,8 @@ def load(
         if body.read(1):
             raise ValueError("it has data after the last array")
         _check(model)
+        if taylor is not None and header.get("slope") is not None:
+            _check_slope(_unwrapped(model), np.asarray(header["slope"], float))
         return model
 
     model = _read(path, build)
@@ -161,7 +169,7 @@ def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
     text, _, body = rest.partition(b"\n")
     try:
         header = json.loads(text)
-        if set(header) != {"network", "info"}:
+        if set(header) - {"slope"} != {"network", "info"}:
             raise ValueError("its second line does not describe a network")
         return use(header, io.BytesIO(body))
     except _NotGiven:
@@ -181,7 +189,7 @@ def _file(path: Any) -> Path:
 
 
 class _NotGiven(ValueError):
-    """A part of the network is neither in the file nor passed to `load`."""
+    """A part of the network is neither in the file nor passed to `load`, or is another one."""
 
 
 def _describe(x: Any, arrays: list[np.ndarray]) -> Any:
@@ -269,8 +277,11 @@ def _array(body: io.BytesIO, name: str, *shape: int) -> jax.Array:
 
 
 def _module(kind: Any, fields: dict[str, Any]) -> Any:
-    # Files of earlier versions tell that the inputs are normalised, as they always are.
+    # Files of earlier versions tell that the inputs are normalised, as they always are, and do not
+    # know the algorithm as printed.
     names = [field.name for field in dataclasses.fields(kind)]
+    if kind is ConservativeLayer:
+        fields.setdefault("as_printed", False)
     if fields.pop("normalise", True) is not True or list(fields) != names:
         raise ValueError(f"a {kind.__name__} has other fields")
     module = object.__new__(kind)
@@ -285,8 +296,7 @@ def _module(kind: Any, fields: dict[str, Any]) -> Any:
 
 def _check(model: Any) -> None:
     """Raises unless `model` is a network whose arrays fit together. Nothing is computed."""
-    while isinstance(model, Repeated | Transformed):
-        model = model.flow_map
+    model = _unwrapped(model)
     if isinstance(model, PINN):
         if any(len(x) != model.windows for x in jax.tree.leaves((model.nets, model.y0s))):
             raise ValueError("it has not one network for each window")
@@ -298,3 +308,29 @@ def _check(model: Any) -> None:
         eqx.filter_eval_shape(DeepONet.candidate, model, model.state, *known, model.max_step)
     else:
         raise TypeError(f"`model` is a {type(model).__name__}, but must be a `PINN` or `DeepONet`")
+
+
+def _unwrapped(model: Any) -> Any:
+    while isinstance(model, Repeated | Transformed):
+        model = model.flow_map
+    return model
+
+
+def _slope(network: DeepONet) -> np.ndarray:
+    """The vector field of the Taylor polynomial at one state of the domain, not its centre, where
+    fields often vanish."""
+    taylor, domain, y = network.taylor, network.domain, network.state
+    assert taylor is not None
+    if isinstance(domain, Box):
+        y = jax.tree.map(lambda a, b: 0.6 * a + 0.4 * b, domain.lower, domain.upper)
+    args = taylor.args if network.args_domain is None else network.args_domain.lower
+    return np.asarray(flatten(taylor.vector_field(0.0, y, args)), float)
+
+
+def _check_slope(network: DeepONet, slope: np.ndarray) -> None:
+    found = _slope(network)
+    if not np.max(np.abs(found - slope)) <= 1e-3 * np.max(np.abs(slope)):
+        raise _NotGiven(
+            f"The vector field of `taylor` is {found} at a state where that of the saved network "
+            f"is {slope}. Pass the field, and its `args`, for which the network was trained."
+        )

@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float
 
 from .._custom_types import RealScalarLike, Y
@@ -31,7 +32,9 @@ def deeponet(states: Y, max_step: RealScalarLike, **options: Any) -> DeepONet:
     return DeepONet(states, max_step, **(sizes | options))
 
 
-def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) -> Recipe:
+def recipe(
+    model: eqx.Module, *, epochs: int = 5000, points: int | None = None, as_printed: bool = False
+) -> Recipe:
     """The recipe of the paper, with changes where it fails as published.
 
     From the paper: Adam at 1e-3, 5,000 full-batch epochs, 2,000 times for a PINN, and for a flow
@@ -43,11 +46,20 @@ def recipe(model: eqx.Module, *, epochs: int = 5000, points: int | None = None) 
 
     - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
     - `epochs`, `points`: as for [`diffrax_conserve.learned.Recipe`][].
+    - `as_printed`: whether to make none of these changes. Give the network a layer
+        `ConservativeLayer(manifold, steps=P, as_printed=True)` too.
     """
+    if points is None:
+        points = 2000 if isinstance(model, PINN) else 5000
+    if as_printed:
+        return Recipe(epochs, points, optax.adam(1e-3), schedule=_printed)
     if isinstance(model, PINN):
-        return Recipe(epochs=epochs, points=2000 if points is None else points, schedule=_projected)
-    points = 5000 if points is None else points
+        return Recipe(epochs=epochs, points=points, schedule=_projected)
     return Recipe(epochs=epochs, points=points, schedule=_staged, loss=_bounded)
+
+
+def _printed(epoch: Array, epochs: int, steps: int) -> LayerSchedule:
+    return jnp.minimum(steps, epoch * (steps + 1) // epochs), epoch / epochs
 
 
 def _staged(epoch: Array, epochs: int, steps: int) -> LayerSchedule:

@@ -28,6 +28,7 @@ from ._trained import (
     is_learned,
     learned_solvers,
     pretrained,
+    projection_schedule,
     train,
 )
 
@@ -93,7 +94,8 @@ def reproduce(
         _say(f"the reference failed: {reason(error)}")
     numbers = metrics(system, runs, errors, t1, dt, states)
     if plot is not None:
-        plot.draw(out, system, runs, errors, networks)
+        schedule = projection_schedule(networks["conservative"][0], epochs) if anew else {}
+        plot.draw(out, system, runs, errors, networks, schedule)
     text = json.dumps(numbers, indent=2, allow_nan=False) + "\n"
     replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
     print(table(system, numbers))

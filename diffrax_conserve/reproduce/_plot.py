@@ -60,12 +60,15 @@ def draw(
     runs: dict[str, Run],
     errors: dict[str, np.ndarray],
     networks: dict[str, Learned],
+    schedule: _Pairs,
 ) -> None:
     """Writes the figures for what there is, as `.png` and as `.pdf`."""
     figures = {}
     if networks:
         losses = {kind: (epochs, found) for kind, (_, epochs, found) in networks.items()}
         figures["loss"] = _one_panel(losses, "epoch", "training loss")
+    if schedule:
+        figures["schedule"] = _schedule(schedule)
     succeeded = {name: run for name, run in runs.items() if run.failure is None}
     if succeeded:
         ts = next(iter(succeeded.values())).ts
@@ -116,6 +119,18 @@ def _one_panel(curves: _Pairs, x: str, y: str) -> Figure:
     return figure
 
 
+def _schedule(curves: _Pairs) -> Figure:
+    """One panel for the iterations of the layer, one for the weight of the last one."""
+    figure = Figure(figsize=(3.5, 2.7), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True)
+    for ax, (name, pair) in zip(panels, curves.items(), strict=True):
+        ax.plot(*pair, color=_LOOKS["conservative"][1])
+        ax.set(ylabel=name)
+        ax.set_ylim(bottom=0)
+    panels[-1].set_xlabel("epoch e")
+    return figure
+
+
 def _trajectory(
     paths: dict[str, Any], reference: dict[str, Any] | None, axis_labels: tuple[str, ...]
 ) -> Figure:
@@ -144,7 +159,7 @@ def _trajectory(
         ax.set(**dict(zip(("xlabel", "ylabel", "zlabel"), axis_labels[:dimension], strict=False)))
         if dimension == 3:
             ax.set_box_aspect((1, 1, 0.8), zoom=0.82)  # leaves room for the labels
-        elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq"):
+        elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq", "qp"):
             ax.set_aspect("equal", adjustable="datalim")
         ax.locator_params(nbins=4)
         if len(parts) > 1:

@@ -115,6 +115,18 @@ def history(log: FitLog, points: int = 250) -> tuple[np.ndarray, np.ndarray]:
     return (np.arange(count) + 0.5) * width, np.nanmedian(blocks, axis=1)
 
 
+def projection_schedule(network: Network, epochs: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """For a conservative network the iterations p(e) of its layer and the weight s(e) of the last
+    one, against the epoch."""
+    schedule, layer = paper.recipe(network).schedule, network.layer
+    assert schedule is not None
+    assert layer is not None
+    assert layer.steps is not None
+    es, steps = jnp.arange(epochs), layer.steps
+    p, s = jax.vmap(lambda e: schedule(e, epochs, steps))(es)
+    return {"p(e)": (np.asarray(es), np.asarray(p)), "s(e)": (np.asarray(es), np.asarray(s))}
+
+
 def learned_solvers(
     system: AbstractSystem, networks: dict[str, Network]
 ) -> dict[str, dfx.AbstractSolver]:

@@ -53,6 +53,7 @@ def solve(flow_map, args, check_field=False, **options):
 def test_it_starts_at_its_state_and_sees_all_args(core, order):
     flow_map = family(order, core=core)
     np.testing.assert_array_equal(flow_map(Y0, ARGS, 0.0), Y0)
+    np.testing.assert_array_equal(flow_map(Y0, 0.3, args=ARGS), flow_map(Y0, ARGS, 0.3))
     slopes = jax.jit(jax.jacfwd(lambda args: flow_map(Y0, args, 0.3)))(ARGS)
     assert all(jnp.all(jnp.abs(leaf) > 0) for leaf in jax.tree.leaves(slopes))
 
@@ -95,10 +96,9 @@ def test_args_outside_their_domain_are_steps_outside():
             TERM, solver, 0.0, 2.0, 0.5, Y0, args, saveat=statistics, throw=False
         )
 
-    report = dfc.learned.Report()
-    assert dfc.learned.domain_statistics(run(ARGS, report)).num_outside < 4
-    assert dfc.learned.domain_statistics(run(OUTSIDE, report)).num_outside == 4
-    refused = run(OUTSIDE, dfc.learned.Refuse())
+    assert dfc.learned.steps_outside(run(ARGS, "count")).number < 4
+    assert dfc.learned.steps_outside(run(OUTSIDE, "count")).number == 4
+    refused = run(OUTSIDE, "fail")
     assert "starts outside the domain" in dfx.RESULTS[refused.result]
     replaced = run(OUTSIDE, dfx.Tsit5())
     exact = dfx.diffeqsolve(TERM, dfx.Tsit5(), 0.0, 2.0, 0.5, Y0, OUTSIDE).ys

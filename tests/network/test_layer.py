@@ -94,6 +94,22 @@ def test_a_schedule_blends_successive_iterates():
         np.testing.assert_allclose(scheduled(p, 0.25), blend, rtol=1e-14)
 
 
+def test_the_algorithm_as_printed():
+    """Simplified Newton, `λ ← λ - (G Gᵀ)⁻¹ g` with `G` at the candidate, and its schedule."""
+    layer = dfc.learned.ConservativeLayer(RADIUS, steps=3, as_printed=True)
+    candidate, multiplier = jnp.array([1.1, 0.3]), 0.0
+    for _ in range(3):
+        y = candidate + multiplier * 2 * candidate
+        multiplier -= (y @ y - 1.0) / (4 * candidate @ candidate)
+    y = candidate + multiplier * 2 * candidate
+    np.testing.assert_allclose(moved(layer, candidate, EAST), y, rtol=1e-14)
+    recipe = dfc.learned.paper.recipe(flow_map(layer=layer), epochs=80, as_printed=True)
+    found = [recipe.schedule(jnp.asarray(e), 80, 3) for e in (0, 19, 20, 45, 60, 80)]
+    np.testing.assert_allclose(
+        found, [(0, 0), (0, 19 / 80), (1, 1 / 4), (2, 9 / 16), (3, 3 / 4), (3, 1)]
+    )
+
+
 def test_derivatives_with_respect_to_the_manifold_and_the_start():
     @jax.jit
     def moved_to(omega, start):
@@ -181,5 +197,7 @@ def test_second_derivatives_are_those_of_differences(steps):
 def test_what_is_refused():
     with pytest.raises(ValueError, match=r"`steps` .*must be a positive integer"):
         dfc.learned.ConservativeLayer(RADIUS, steps=0)
+    with pytest.raises(ValueError, match="`as_printed` needs the number of iterations"):
+        dfc.learned.ConservativeLayer(RADIUS, as_printed=True)
     with pytest.raises(TypeError, match="neither a `FirstIntegral`"):
         dfc.learned.ConservativeLayer(lambda t, y, args: y)

@@ -62,55 +62,55 @@ def test_a_box_contains_what_it_was_built_around_and_nothing_beyond(seed):
     assert not box.contains({**highest, "p": (jnp.array(jnp.nan),)})
 
 
-def test_the_report_counts_steps_and_knows_the_first_time():
-    solver, t0 = unchecked(KNOWS, outside=dfc.learned.Report()), -3.0
+def test_by_default_steps_outside_are_counted_and_the_first_time_is_known():
+    solver, t0 = unchecked(KNOWS), -3.0
     sol = solve(solver, t0=t0, t1=t0 + 5.0, saveat=STATE)
     starts = jnp.concatenate([EAST[None], sol.ys[:9]])
     outside = ~jax.vmap(EASTERN.contains)(starts)
-    found = dfc.learned.domain_statistics(sol)
-    assert 0 < found.num_outside == outside.sum() < sol.stats["num_accepted_steps"] == 10
-    np.testing.assert_allclose(found.first_outside, t0 + 0.5 * jnp.argmax(outside))
-    bare = solve(unchecked(BARE), saveat=STATE).ys
-    np.testing.assert_allclose(sol.ys, bare, rtol=0, atol=1e-14)
-    assert (
-        dfc.learned.domain_statistics(solve(solver, t1=1.0, saveat=STATE)).first_outside == jnp.inf
-    )
+    found = dfc.learned.steps_outside(sol)
+    assert 0 < found.number == outside.sum() < sol.stats["num_accepted_steps"] == 10
+    np.testing.assert_allclose(found.first_time, t0 + 0.5 * jnp.argmax(outside))
+    bare = solve(unchecked(BARE), saveat=STATE)
+    np.testing.assert_allclose(sol.ys, bare.ys, rtol=0, atol=1e-14)
+    with pytest.raises(ValueError, match="holds no `StepsOutside`"):
+        dfc.learned.steps_outside(bare)
+    assert dfc.learned.steps_outside(solve(solver, t1=1.0, saveat=STATE)).first_time == jnp.inf
 
 
 def test_rejected_steps_do_not_count():
-    solver = unchecked(KNOWS, outside=dfc.learned.Report(), corrections=1)
+    solver = unchecked(KNOWS, corrections=1)
     controller = dfx.PIDController(rtol=1e-4, atol=1e-4)
     sol = solve(solver, stepsize_controller=controller, saveat=STATE)
     assert sol.stats["num_rejected_steps"] > 0
     starts = jnp.concatenate([EAST[None], sol.ys[: int(sol.stats["num_accepted_steps"]) - 1]])
     outside = jnp.sum(~jax.vmap(EASTERN.contains)(starts))
-    assert 0 < dfc.learned.domain_statistics(sol).num_outside == outside
+    assert 0 < dfc.learned.steps_outside(sol).number == outside
 
 
 def test_leaving_the_domain_fails_at_a_time(errors_raise):
-    solver = unchecked(KNOWS, outside=dfc.learned.Refuse())
+    solver = unchecked(KNOWS, outside="fail")
     sol = solve(solver, t0=-20.0, t1=-15.0, throw=False, saveat=STATE)
     assert "a step starts outside the domain" in message(sol)
-    assert dfc.learned.domain_statistics(sol).first_outside == -18.0
+    assert dfc.learned.steps_outside(sol).first_time == -18.0
     with pytest.raises(eqx.EquinoxRuntimeError, match=r"outside=diffrax\.Tsit5"):
         jax.block_until_ready(solve(solver, t0=-20.0, t1=-15.0).ys)
     assert solve(solver, t1=2.0).result == dfx.RESULTS.successful
 
 
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
-    solver = unchecked(BARE, outside=dfc.learned.Refuse(), max_error=3e-4)
+    solver = unchecked(BARE, outside="fail", max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
-    report = unchecked(BARE, outside=dfc.learned.Report(), max_error=3e-4)
+    counts = unchecked(BARE, max_error=3e-4)
     for length, outside in ((0.5, 10), (0.25, 0)):  # errors of 1e-3 √2 times it
-        sol = solve(report, dt0=length, saveat=STATE)
-        assert dfc.learned.domain_statistics(sol).num_outside == outside
+        sol = solve(counts, dt0=length, saveat=STATE)
+        assert dfc.learned.steps_outside(sol).number == outside
     loose = dfx.PIDController(rtol=1.0, atol=1.0)
     sol = solve(solver, stepsize_controller=loose, saveat=STATE)
     assert sol.result == dfx.RESULTS.successful
     assert sol.stats["num_rejected_steps"] > 0
     assert sol.stats["num_accepted_steps"] > 14  # each at most 0.3 long
-    found = dfc.learned.domain_statistics(sol)
-    assert found.num_outside == 0
+    found = dfc.learned.steps_outside(sol)
+    assert found.number == 0
 
 
 def test_another_solver_takes_all_steps_outside_and_none_inside():
@@ -123,7 +123,7 @@ def test_another_solver_takes_all_steps_outside_and_none_inside():
         else:
             y, taken = solve(solver, y, t1=0.5).ys[-1], taken + 1
         np.testing.assert_allclose(sol.ys[i], y, rtol=0, atol=1e-14)
-    assert 0 < taken == dfc.learned.domain_statistics(sol).num_outside
+    assert 0 < taken == dfc.learned.steps_outside(sol).number
 
 
 def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
@@ -148,7 +148,7 @@ def test_derivatives():
     dct.assert_gradients(f, jnp.array(0.1), jnp.array([0.9, 0.2]), rtol=1e-6, forward=False)
 
 
-Box, REPORT = dfc.learned.Box, dfc.learned.Report()
+Box = dfc.learned.Box
 NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
 
 
@@ -159,14 +159,14 @@ NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
         (lambda: Box.around({"q": jnp.array(1.0)}), ValueError, "stacked along a leading axis"),
         (lambda: Box.around(states()).contains(DRIVEN0), ValueError, "for states of the structure"),
         (lambda: Box.around(1j * jnp.ones((3, 2))), TypeError, "real"),
-        (lambda: unchecked(Still(), outside=REPORT), ValueError, NO_DOMAIN),
+        (lambda: unchecked(Still(), outside="fail"), ValueError, NO_DOMAIN),
         (lambda: unchecked(Still(), outside=dfx.Tsit5()), ValueError, NO_DOMAIN),
-        (lambda: unchecked(KNOWS, max_error=1e-3), ValueError, "but these are ignored"),
-        (lambda: unchecked(KNOWS, outside=REPORT, max_error=0.0), ValueError, "must be positive"),
+        (lambda: unchecked(KNOWS, max_error=0.0), ValueError, "must be positive"),
         (lambda: unchecked(KNOWS, outside=dfx.SemiImplicitEuler()), ValueError, "several terms"),
         (lambda: unchecked(KNOWS, outside=dfx.Kvaerno5()), ValueError, "takes its tolerances from"),
-        (lambda: unchecked(KNOWS, outside="report"), TypeError, "`outside` is 'report'"),
-        (lambda: unchecked(Within(Still(), 1.0), outside=REPORT), TypeError, "no method `contains"),
+        (lambda: unchecked(KNOWS, outside="refuse"), TypeError, "`outside` is 'refuse', but"),
+        (lambda: unchecked(KNOWS, outside=None), TypeError, "must be 'count', 'fail', or a solver"),
+        (lambda: unchecked(Within(Still(), 1.0)), TypeError, "no method `contains"),
     ],
 )
 def test_mistakes_are_named(make, error, text):

@@ -3,6 +3,7 @@
 import dataclasses
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -14,8 +15,11 @@ import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, Still, Within, flow_map, in_single, oscillator
 
-# Most of these trainings are too short, and say so.
-pytestmark = pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution")
+# Most of these trainings are too short, and say so; no library may warn of anything.
+pytestmark = [
+    pytest.mark.filterwarnings("error"),
+    pytest.mark.filterwarnings("ignore:The trained `PINN` is not the solution"),
+]
 LAYER = dfc.learned.ConservativeLayer(RADIUS, steps=2)
 KEY = jr.key(5)
 
@@ -105,6 +109,31 @@ def test_new_points_are_drawn_when_the_recipe_says_so():
     _, fresh = train(circle(), refresh=3, **still)
     assert len(np.unique(fixed.losses)) == 1
     np.testing.assert_array_equal(np.diff(fresh.losses) != 0, [0, 0, 1, 0, 0, 1, 0, 0])
+
+
+@pytest.mark.parametrize("kind", ["flow map", "data", "windows"])
+def test_the_second_of_several_seeds_compiles_nothing(kind, caplog):
+    y0s = jnp.stack([EAST, -EAST, 0.5 * EAST[::-1]])
+    ts, ys = jnp.linspace(0, 1, 4), jax.vmap(lambda y: jnp.outer(jnp.ones(4), y))(y0s)
+    data = jnp.broadcast_to(ts, (3, 4)), ys + ts[:, None]
+
+    def of_seed(seed):
+        net_key, fit_key = jr.split(jr.key(seed))
+        if kind == "windows":  # one of which is cut
+            network = dfc.PINN(EAST, 0.0, 6.0, key=net_key, width=6)
+            chosen = dataclasses.replace(dfc.learned.second_order(network, epochs=3), retries=1)
+            return dfc.fit(network, oscillator, key=fit_key, recipe=chosen)
+        network = dfc.DeepONet(y0s, 0.5, key=net_key, **SMALL)
+        given = dict(data=data) if kind == "data" else dict(vector_field=oscillator, sample=y0s)
+        chosen = dfc.learned.second_order(network, epochs=3)
+        return dfc.fit(network, key=fit_key, recipe=chosen, **given)
+
+    first, _ = of_seed(0)
+    with jax.log_compiles():
+        caplog.clear()
+        second, _ = of_seed(1)
+    assert [r.message for r in caplog.records if "Compiling" in r.message] == []
+    assert not eqx.tree_equal(first, second)
 
 
 def test_progress():

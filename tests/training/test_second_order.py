@@ -10,6 +10,10 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._training.second_order import (
+    _by_gram_matrix,
+    _by_triangular_factor,
+)
 
 from ..learned import EAST, LORENZ, flow_map, oscillator, states
 
@@ -66,6 +70,15 @@ def test_an_update_solves_the_damped_problem(method, damping):
     normal = matrix.T @ matrix + damping(r @ r, columns) * np.eye(3)
     update = np.linalg.solve(normal, -matrix.T @ r)
     np.testing.assert_allclose(trained.weights - model.weights, update, rtol=1e-8)
+
+
+@pytest.mark.parametrize("shape", [(30, 7), (7, 30)])
+def test_the_update_in_single_precision_is_that_in_double(shape):
+    matrix, rhs = jr.normal(KEY, shape), jr.normal(KEY, shape[:1])
+    double = _by_gram_matrix(matrix, rhs, jnp.asarray(1e-3))
+    np.testing.assert_allclose(
+        _by_triangular_factor(matrix, rhs, jnp.asarray(1e-3)), double, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-20, 1e15])

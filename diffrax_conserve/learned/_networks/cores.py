@@ -58,7 +58,7 @@ class MLP(eqx.Module):
         dtype: jnp.dtype,
         *,
         key: PRNGKeyArray,
-        slope: float | None = None,
+        slope: float | Float[Array, ""] | None = None,
     ):
         sizes = [in_size, *([width] * depth), out_size]
         keys = jr.split(key, len(sizes) - 1)
@@ -83,15 +83,17 @@ class MLP(eqx.Module):
         return x
 
 
-def initial_slope(net: MLP) -> float | None:
+def initial_slope(net: MLP) -> Float[Array, ""] | None:
     """The `slope` with which a network was initialised, estimated from its weights."""
     if not any(bool(jnp.any(bias != 0)) for bias in net.biases):
         return None
-    return float(jnp.sqrt(jnp.mean(jnp.square(net.weights[0]))))
+    return jnp.sqrt(jnp.mean(jnp.square(net.weights[0])))
 
 
 @eqx.filter_jit
-def fresh(net: MLP, slope: float | None, size: Float[Array, ""], key: PRNGKeyArray) -> MLP:
+def fresh(
+    net: MLP, slope: Float[Array, ""] | None, size: Float[Array, ""], key: PRNGKeyArray
+) -> MLP:
     """A network of the shape of `net`, with other random weights and outputs of about `size`."""
     first, last = net.weights[0], net.weights[-1]
     (in_size, width), out_size, depth = first.shape, last.shape[1], len(net.weights) - 1

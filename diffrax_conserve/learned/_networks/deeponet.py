@@ -124,8 +124,12 @@ class DeepONet(AbstractFlowMap):
         self.max_step, deviation = float(max_step), jnp.std(seen, axis=0)
         self.shift, self.scale = jnp.mean(seen, axis=0), jnp.where(deviation > 0, deviation, 1)
 
-    def __call__(self, y0: Y, *step: Any, schedule: LayerSchedule | None = None) -> Y:
-        """The state a time `h` after the state `y0`, with `step` = `h`, or `args, h`."""
+    def __call__(
+        self, y0: Y, *step: Any, args: Args = None, schedule: LayerSchedule | None = None
+    ) -> Y:
+        """The state a time `h` after the state `y0`, with `step` = `h`. A family is called as
+        `(y0, args, h)`, or `(y0, h, args=args)`."""
+        step = step if args is None else (args, *step)
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
             raise TypeError(f"This `DeepONet` is called as `{expected}`.")

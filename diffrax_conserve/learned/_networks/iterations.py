@@ -15,7 +15,7 @@ from .trainable import LayerSchedule
 def iterated(
     equations: Equations,
     candidate: Float[Array, " n"],
-    radius: Float[Array, ""],
+    radius: Float[Array, ""] | None,
     steps: int,
     schedule: LayerSchedule | None,
 ) -> Float[Array, " n"]:
@@ -23,8 +23,8 @@ def iterated(
     `λ` after all `steps`. Iterations beyond the `p`-th are not computed.
 
     Newton's method in `λ`, with rows scaled to norm one, a damping `μ = min(1e-2, |g|²)` that
-    vanishes with the residual relative to its scale, and moves of at most `radius`. As printed, the
-    algorithm also freezes `G(y)` at `ŷ` and does not damp, and so needs an output that is close.
+    vanishes with the residual relative to its scale, and moves of at most `radius`. Without one it
+    is the algorithm as printed: `G(y)` is `G(ŷ)`, and nothing is damped.
     """
     dtype = candidate.dtype
     p, s = (jnp.asarray(steps), jnp.ones(())) if schedule is None else schedule
@@ -33,6 +33,8 @@ def iterated(
     def improve(multipliers: Array) -> Array:
         y = candidate + combined(multipliers, rows)
         g, jacobian = equations.linearise(y)
+        if radius is None:
+            return multipliers - gram_solve(gram_matrix(rows, rows), g)
         ratio = relative(g, equations.scale(jacobian, y))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         gram = gram_matrix(jacobian, rows)

@@ -61,12 +61,15 @@ class ConservativeLayer(eqx.Module):
     manifold: Manifold
     steps: int | None = eqx.field(static=True, kw_only=True, default=None)
     args: Args = eqx.field(kw_only=True, default=None)
+    as_printed: bool = eqx.field(static=True, kw_only=True, default=False)
 
     def __check_init__(self):
         check_manifold(self.manifold)
         refuse_rates(self.manifold, "a `ConservativeLayer`")
         if self.steps is not None:
             check_counts(steps=self.steps)
+        elif self.as_printed:
+            raise ValueError("`as_printed` needs the number of iterations: `steps=5`.")
 
     def __call__(
         self,
@@ -82,7 +85,8 @@ class ConservativeLayer(eqx.Module):
         if self.steps is None:
             y, _, _ = _projected(equations, vector, ravel(start[1]).astype(vector.dtype))
         else:
-            y = iterated(equations, vector, jnp.linalg.norm(scale), self.steps, schedule)
+            radius = None if self.as_printed else jnp.linalg.norm(scale)
+            y = iterated(equations, vector, radius, self.steps, schedule)
         return unravel(y, candidate)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
@@ -105,6 +109,8 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 - `steps`: for the recipe of the paper, the number $P$ of iterations, exactly; the result is then
     near the manifold, not on it. Default: as many as the tolerance takes.
 - `args`: passed to the functions of the manifold.
+- `as_printed`: with `steps`, whether these are the simplified Newton iteration that the paper
+    prints, with $G(\hat y)$ frozen and without damping, which converges only nearby.
 
 An invalid `manifold` or number raises a `TypeError` or `ValueError`.
 """

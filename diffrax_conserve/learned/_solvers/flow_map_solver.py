@@ -17,13 +17,13 @@ from .._networks.flat import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import Refused, check_learned_terms, check_output, judged, refused_from_start
-from .policies import DomainStatistics, Policy, StepResult, check_policy, outcome, step_of
+from .policies import Policy, StepResult, StepsOutside, as_policy, check_policy, outcome, step_of
 from .sweeps import Increment, correct, estimate, increment
 
 
 class _State(NamedTuple):
     refused: Refused  # why the solve was refused from the start
-    statistics: DomainStatistics | None
+    outside: StepsOutside | None  # None if there is nothing to tell them by
 
 
 @final
@@ -73,7 +73,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
     nodes: int = option(12, static=True)
     corrections: int = option(0, static=True)
-    outside: Policy | None = option(None)
+    outside: Policy = option("count", converter=as_policy)
     max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
 
@@ -85,8 +85,12 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         for name, value, least in (("nodes", self.nodes, 2), ("corrections", self.corrections, 0)):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` is {value!r}, but must be an integer from {least} on.")
+        check_policy(self.outside, self.max_error, self._has_domain)
+
+    @property
+    def _has_domain(self) -> bool:
         domains = self.flow_map.domain, args_domain_of(self.flow_map)
-        check_policy(self.outside, self.max_error, any(d is not None for d in domains))
+        return any(domain is not None for domain in domains)
 
     def order(self, terms: dfx.AbstractTerm) -> int | None:
         del terms
@@ -112,7 +116,8 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         refused = refused_from_start(
             self.flow_map, known, terms, t0, t1, y0, args, self.check_field
         )
-        return _State(refused, None if self.outside is None else DomainStatistics.zero(t0))
+        counts = self._has_domain or self.max_error is not None
+        return _State(refused, StepsOutside.zero(t0) if counts else None)
 
     def step(
         self,
@@ -126,19 +131,19 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     ) -> tuple[Y, Y, DenseInfo, _State, dfx.RESULTS]:
         del made_jump
         flow_map, known = self.flow_map, known_args(self.flow_map, args)
-        h, (refused, statistics) = jnp.asarray(t1 - t0), solver_state
+        h, (refused, counted) = jnp.asarray(t1 - t0), solver_state
         step = self._learned(known, h, y0, increment(terms, t0, t1, y0, args))
-        if self.outside is not None and statistics is not None:
+        if counted is not None:
             inside = flow_map.inside(y0, *known, h)
             if (box := args_domain_of(flow_map)) is not None:
                 inside &= box.contains(*known)
             accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
-            statistics = statistics.add(t0, inside & accurate)
+            counted = counted.add(t0, inside & accurate)
             by = lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args)  # noqa: E731
             step = outcome(self.outside, step, inside, accurate, by)
         step = judged(step, refused, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
-        return step.y1, step.error, dense_info, _State(refused, statistics), step.result
+        return step.y1, step.error, dense_info, _State(refused, counted), step.result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
@@ -168,11 +173,10 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
     [`diffrax_conserve.DeepONet`][], or a Module `(y0, h) -> y` with an attribute `max_step`.
 - `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
-- `outside`: the policy for steps that start outside `flow_map.domain`, or with `args` outside its
-    `args_domain`. [`diffrax_conserve.learned.Report`][]`()` counts them, for
-    [`diffrax_conserve.learned.domain_statistics`][]; [`diffrax_conserve.learned.Refuse`][]`()`
-    fails at the first; a diffrax solver takes them itself (in a batch of lanes both compute every
-    step). Default: nothing happens.
+- `outside`: what is done with steps that start outside `flow_map.domain`, or with `args` outside
+    its `args_domain`. `"count"`: they are counted, for
+    [`diffrax_conserve.learned.steps_outside`][], the default; `"fail"`: the solve fails at the
+    first; a diffrax solver takes them itself (in a batch of lanes both compute every step).
 - `max_error`: a step with a larger estimated error of a component counts as outside too.
 - `check_field`: whether to fail if the vector field at the initial state differs from the slope of
     the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order` at least 1). A

@@ -16,7 +16,7 @@ from ..._options import check_number, found_in
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
-_WHEN = "`diffrax_conserve.learned.domain_statistics` tells at which time."
+_WHEN = "`diffrax_conserve.learned.steps_outside` tells at which time."
 _OUTSIDE = register(
     f"a step starts outside the domain of the flow map. {_WHEN} Train the flow map on states from "
     "there, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
@@ -27,20 +27,20 @@ _INACCURATE = register(
 )
 
 
-class DomainStatistics(NamedTuple):
-    """What `domain_statistics` returns."""
+class StepsOutside(NamedTuple):
+    """What `steps_outside` returns."""
 
-    num_outside: Int[Array, "..."]
-    first_outside: Float[Array, "..."]
+    number: Int[Array, "..."]
+    first_time: Float[Array, "..."]
 
     @classmethod
-    def zero(cls, t0: RealScalarLike) -> "DomainStatistics":
+    def zero(cls, t0: RealScalarLike) -> "StepsOutside":
         return cls(jnp.asarray(0), jnp.full((), jnp.inf, jnp.result_type(t0, np.float16)))
 
-    def add(self, t0: RealScalarLike, trusted: BoolScalarLike) -> "DomainStatistics":
-        time = jnp.where(trusted, jnp.inf, t0).astype(self.first_outside.dtype)
-        count = self.num_outside + jnp.where(trusted, 0, 1)
-        return DomainStatistics(count, jnp.minimum(self.first_outside, time))
+    def add(self, t0: RealScalarLike, trusted: BoolScalarLike) -> "StepsOutside":
+        time = jnp.where(trusted, jnp.inf, t0).astype(self.first_time.dtype)
+        number = self.number + jnp.where(trusted, 0, 1)
+        return StepsOutside(number, jnp.minimum(self.first_time, time))
 
 
 class StepResult(eqx.Module):
@@ -53,17 +53,34 @@ class StepResult(eqx.Module):
 
 
 @final
-class Report(eqx.Module):
-    """Counts such steps, for [`diffrax_conserve.learned.domain_statistics`][]."""
+class _Count(eqx.Module):
+    """Counts such steps."""
+
+    def __repr__(self) -> str:
+        return "'count'"
 
 
 @final
-class Refuse(eqx.Module):
+class _Fail(eqx.Module):
     """Fails at the first such step, an inaccurate one after an adaptive controller rejected it."""
+
+    def __repr__(self) -> str:
+        return "'fail'"
 
 
 # A solver takes the step itself.
-Policy = Report | Refuse | dfx.AbstractSolver
+Policy = _Count | _Fail | dfx.AbstractSolver
+
+
+def as_policy(policy: Any) -> Policy:
+    """The policy with this name, or a solver; raises if it is neither."""
+    found = dict(count=_Count(), fail=_Fail()).get(policy) if isinstance(policy, str) else policy
+    if not isinstance(found, Policy):
+        raise TypeError(f"`outside` is {policy!r}, but it must be {_CHOICES}.")
+    return found
+
+
+_CHOICES = "'count', 'fail', or a solver: `diffrax.Tsit5()`"
 
 
 def outcome(
@@ -74,9 +91,9 @@ def outcome(
     take: Callable[[dfx.AbstractSolver], StepResult],
 ) -> StepResult:
     """The result of a step, given that of the flow map, and `take`, the same step by a solver."""
-    if isinstance(policy, Report):
+    if isinstance(policy, _Count):
         return step
-    if isinstance(policy, Refuse):
+    if isinstance(policy, _Fail):
         index = jnp.where(inside, _INACCURATE, _OUTSIDE)
         result = dfx.RESULTS.where(inside & accurate, step.result, member(index))
         # The error is infinite only for an inaccurate step: a smaller step may be more accurate,
@@ -110,19 +127,9 @@ def step_of(
     return StepResult(y1, error, coefficients, result)
 
 
-def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
+def check_policy(policy: Policy, max_error: Any, has_domain: bool) -> None:
     check_number("max_error", max_error, above=0.0)
-    choices = "`diffrax_conserve.learned.Report()`, `Refuse()`, or a solver: `diffrax.Tsit5()`"
-    if policy is None and max_error is not None:
-        raise ValueError(
-            "`max_error` says which steps count as outside, but these are ignored: pass "
-            f"`outside`, {choices}, too."
-        )
-    if policy is None:
-        return
-    if not isinstance(policy, Policy):
-        raise TypeError(f"`outside` is {policy!r}, but it must be {choices}.")
-    if max_error is None and not has_domain:
+    if max_error is None and not has_domain and not isinstance(policy, _Count):
         raise ValueError(
             f"`outside` is {policy!r}, but the flow map cannot tell: it has no `domain`. "
             "Give it `diffrax_conserve.learned.Box.around(states)`, with the states that it was "
@@ -142,19 +149,20 @@ def check_policy(policy: Any, max_error: Any, has_domain: bool) -> None:
         )
 
 
-def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
+def steps_outside(sol: dfx.Solution) -> StepsOutside:
     """The number of steps of a learned solver outside its flow map's domain.
 
     **Arguments:**
 
-    - `sol`: the solution of a solver with a policy `outside`, solved with
-        `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
+    - `sol`: the solution of a [`diffrax_conserve.DeepONetSolver`][] whose flow map has a `domain`,
+        or that has a `max_error`, solved with `saveat=SaveAt(..., solver_state=True)`; or a batch
+        of them from `jax.vmap`.
 
     **Returns:**
 
-    A named tuple of `num_outside`, the number of accepted steps that count as outside, and
-    `first_outside`, the time at which the first of them started; infinity if there is none. Raises
-    a `ValueError` if `sol` holds no such statistics.
+    A named tuple of `number`, how many accepted steps count as outside, and `first_time`, the time
+    at which the first of them started; infinity if there is none. Raises a `ValueError` if `sol`
+    does not hold them.
 
     !!! example
 
@@ -163,12 +171,12 @@ def domain_statistics(sol: dfx.Solution) -> DomainStatistics:
         import diffrax_conserve as dfc
 
         system = dfc.systems.get("conservative-lorenz")
-        flow_map = dfc.load_pretrained("conservative-lorenz")
-        solver = dfc.DeepONetSolver(flow_map, outside=dfc.learned.Report())
+        solver = dfc.DeepONetSolver(dfc.load_pretrained("conservative-lorenz"))
         term = diffrax.ODETerm(system.vector_field)
         saveat = diffrax.SaveAt(t1=True, solver_state=True)
         sol = diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.25, system.y0, saveat=saveat)
-        assert dfc.learned.domain_statistics(sol).num_outside == 0
+        assert dfc.learned.steps_outside(sol).number == 0
         ```
     """
-    return found_in(sol, DomainStatistics, "domain_statistics", "a solver with `outside=`")
+    solver = "a `DeepONetSolver` whose flow map has a `domain`, or that has a `max_error`"
+    return found_in(sol, StepsOutside, "steps_outside", solver)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
+from jax.sharding import NamedSharding
 from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
@@ -38,6 +39,20 @@ def check_types(key: Any, recipe: Any, state: Any, progress: Any, **limits: Any)
     if not (isinstance(progress, bool) or callable(progress)):
         raise TypeError(f"`progress` is {progress!r}, but it must be a boolean or a function.")
     check_scalars(above=0.0, **limits)
+
+
+def checked_sharding(sharding: Any, recipe: Recipe) -> NamedSharding | None:
+    """`sharding`; raises unless it can share out the points of the recipe evenly."""
+    checked_part("sharding", sharding, NamedSharding)
+    if sharding is not None:
+        try:
+            sharding.shard_shape((recipe.points,))
+        except ValueError as error:
+            raise ValueError(
+                f"`sharding` cannot share out the {recipe.points} points of the recipe evenly. "
+                "Give one of another number: `dataclasses.replace(recipe, points=...)`."
+            ) from error
+    return sharding
 
 
 def checked(

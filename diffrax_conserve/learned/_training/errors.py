@@ -87,7 +87,7 @@ def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArra
     if problem.vector_field is None:
         assert problem.data is not None
         pairs = problem.data.draw(16 * _STATES, key)
-        ends = eqx.filter_jit(jax.vmap(flow_map))(pairs.y0s, pairs.hs)
+        ends = _ends(flow_map, pairs.y0s, pairs.hs)
         y0s, sizes = pairs.y0s, jnp.abs(stacked_vectors(pairs.y1s))
         errors = stacked_vectors(ends) - stacked_vectors(pairs.y1s)
     else:
@@ -102,6 +102,11 @@ def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArra
     example = jtu.tree_map(lambda x: x[0], y0s)
     squares = jnp.mean(jnp.square(errors), axis=0)
     return relative(jnp.sqrt(squares), jnp.max(sizes, axis=0), example)
+
+
+@eqx.filter_jit
+def _ends(flow_map: AbstractFlowMap, y0s: Y, hs: Array) -> Y:
+    return jax.vmap(flow_map)(y0s, hs)
 
 
 @eqx.filter_jit

@@ -1,18 +1,20 @@
 """`fit`: trains a network from the vector field alone, or from data."""
 
+import dataclasses
 import math
 import time
 import warnings
 from typing import Any, TypeVar
 
 import equinox as eqx
+from jax.sharding import NamedSharding
 from jaxtyping import PRNGKeyArray
 
 from ..._custom_types import Args, Manifold
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
-from .checks import check_types, checked
+from .checks import check_types, checked, checked_sharding
 from .errors import flow_map_error, warn_off_manifold
 from .loop import FitLog, Loop, Progress
 from .objective import Carry, VectorField
@@ -37,6 +39,7 @@ def fit(
     target: float | None = None,
     seconds: float | None = None,
     progress: bool | Progress = False,
+    sharding: NamedSharding | None = None,
 ) -> tuple[_Model, FitLog]:
     r"""Trains a network from the vector field alone, or a flow map from data, or from both.
 
@@ -88,6 +91,8 @@ def fit(
     - `progress`: whether to print lines on standard error, or a function of the number of epochs
         done, the total number, the last loss and the best criterion, which may return `True` to
         end the training.
+    - `sharding`: spreads the collocation points, along their leading axis, over several devices,
+        each of which has all weights.
 
     **Returns:**
 
@@ -119,6 +124,7 @@ def fit(
     created = time.perf_counter()
     check_types(key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
+    problem = dataclasses.replace(problem, sharding=checked_sharding(sharding, problem.recipe))
     target = None if target is None else float(target)
     loop = Loop(problem, key, target, seconds or math.inf, progress, created)
     if isinstance(model, PINN):

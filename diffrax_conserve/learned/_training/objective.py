@@ -15,6 +15,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import optax
 from jax.flatten_util import ravel_pytree
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..._custom_types import Args, RealScalarLike
@@ -36,6 +37,7 @@ class Problem(eqx.Module):
     sample: Sampler | None
     data: Data | None
     recipe: Recipe
+    sharding: NamedSharding | None = eqx.field(static=True, default=None)  # of the points
 
     def field(self, t: Any, y: Any) -> Any:
         assert self.vector_field is not None
@@ -50,6 +52,20 @@ class Problem(eqx.Module):
         if self.sample is None:
             return Points(pairs.hs, pairs.y0s, pairs)
         return model.draw(times, self.sample, count, key)._replace(pairs=pairs)
+
+    def spread(self, points: Points) -> Points:
+        """The points, each device of `sharding` with its share of them."""
+        if self.sharding is None:
+            return points
+        return lax.with_sharding_constraint(points, self.sharding)
+
+    def everywhere(self, carry: "Carry") -> "Carry":
+        """The carry, the same on each device of `sharding`."""
+        if self.sharding is None:
+            return carry
+        return lax.with_sharding_constraint(
+            carry, NamedSharding(self.sharding.mesh, PartitionSpec())
+        )
 
     def defects(
         self, model: AbstractTrainable, points: Points, schedule: LayerSchedule | None
@@ -133,7 +149,7 @@ class Objective(eqx.Module):
             return self.first_points
         drawn = epoch - epoch % refresh
         fresh = self.problem.draw(self.static, jr.fold_in(self.key, drawn))
-        return _where(drawn == 0, self.first_points, fresh)
+        return self.problem.spread(_where(drawn == 0, self.first_points, fresh))
 
     def best(self, carry: Carry) -> Any:
         return eqx.combine(carry.best_weights, self.static)
@@ -144,7 +160,7 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     points_key, key = jr.split(key)
     trained = _marked(model, "weights", eqx.is_inexact_array)
     weights, static = eqx.partition(model, trained)
-    points = problem.draw(model, points_key)
+    points = problem.spread(problem.draw(model, points_key))
     last = eqx.filter(_marked(model, "linear_weights", lambda _: True), trained)
     linear, _ = ravel_pytree(jtu.tree_map(lambda w, x: jnp.full(w.shape, x), weights, last))
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
@@ -160,7 +176,7 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     # No array is weakly typed, because the compiled epochs return none that is.
     carry = jtu.tree_map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), carry)
     typical = problem.typical(model, points)
-    return Objective(problem, static, points, typical, linear, key), carry
+    return Objective(problem, static, points, typical, linear, key), problem.everywhere(carry)
 
 
 def _marked(model: AbstractTrainable, method: str, mark: Callable[[Any], bool]) -> Any:
@@ -184,11 +200,12 @@ def advance(
     criterion = objective.criterion(carry.weights)
     better = compare & (criterion < carry.best)
     found = jnp.where(compare, criterion, carry.criteria[stop]).astype(carry.criteria.dtype)
-    return carry._replace(
+    carry = carry._replace(
         best_weights=_where(better, carry.weights, carry.best_weights),
         best=jnp.where(better, criterion, carry.best),
         criteria=carry.criteria.at[stop].set(found),
     )
+    return objective.problem.everywhere(carry)
 
 
 def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:

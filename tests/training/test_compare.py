@@ -1,0 +1,135 @@
+"""The verdict on a learned step: its numbers are those of other computations, and it is plain."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+import scipy.linalg
+
+import diffrax_conserve as dfc
+
+from ..learned import RADIUS, Within, oscillator
+
+STEP, OFF = 0.5, 1e-3
+CLOCK = "diffrax_conserve.learned._compare._seconds"
+STATES = jr.normal(jr.key(0), (40, 2))
+
+
+class Rotation(eqx.Module):
+    """The exact flow map of a spring of some stiffness, but for an error in proportion to the step;
+    with `bend` = -1 its derivative by the stiffness points the wrong way at 1."""
+
+    off: float = OFF
+    bend: float = 1.0
+    max_step: float = STEP
+    args_domain: Any = None
+
+    def __call__(self, y0, *step):
+        *stiffness, h = step
+        w = jnp.sqrt(1 + self.bend * (stiffness[0] - 1)) if stiffness else 1.0
+        c, s = jnp.cos(w * h), jnp.sin(w * h)
+        return jnp.stack([c * y0[0] + s / w * y0[1], c * y0[1] - w * s * y0[0]]) + self.off * h
+
+
+def spring(t, y, stiffness):
+    return jnp.stack([y[1], -stiffness * y[0]])
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Of a flow map whose domain is one half of the plane, without the clock."""
+    half = dfc.learned.Box(jnp.array([0.0, -9.0]), jnp.array([9.0, 9.0]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CLOCK, lambda *args: 1.0)
+        return dfc.learned.compare(Within(Rotation(), half), oscillator, STATES)
+
+
+def rk4(count):
+    """The matrix of so many steps of the oscillator."""
+    matrix = STEP / count * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    terms = [np.linalg.matrix_power(matrix, k) / np.prod(np.arange(1, k + 1)) for k in range(5)]
+    return np.linalg.matrix_power(sum(terms), count)
+
+
+def test_errors_and_substeps_are_those_of_formulas(found):
+    exact = scipy.linalg.expm(STEP * np.array([[0.0, 1.0], [-1.0, 0.0]]))
+    unit = np.max(np.abs(STATES @ exact.T))
+    np.testing.assert_allclose(found.error[0], OFF * STEP / unit, rtol=1e-9)
+    np.testing.assert_allclose(found.error_99[0], OFF * STEP / unit, rtol=1e-9)
+
+    def error(count):
+        return np.median(np.max(np.abs(STATES @ (rk4(count) - exact).T), axis=1)) / unit
+
+    assert found.methods == ("network", "RK4", "Tsit5", "Dopri8")
+    assert found.substeps[0] == found.substeps[3] == 1
+    needed = next(n for n in (1, 2, 3, 4) if error(n) <= found.error[0])
+    assert found.substeps[1] == needed
+    np.testing.assert_allclose(found.error[1], error(needed), rtol=1e-9)
+    assert np.all(found.error[1:] <= found.error[0])
+
+
+def test_states_outside_are_counted(found):
+    assert (found.outside, found.count) == (np.sum(STATES[:, 0] < 0), 40)
+    assert np.all(np.isnan(found.batch_projected))
+    assert np.isnan(found.args_error)
+
+
+def planted(found, **changes):
+    times = dict(alone=np.array([1.0, 3.0, 2.0, 5.0]), batch=np.array([8.0, 3.0, 2.0, 1.0]))
+    return dataclasses.replace(found, **(times | dict(outside=0) | changes))
+
+
+def test_the_verdict_is_plain(found):
+    assert planted(found).verdict == (
+        "Alone, the network is 2.0 times as fast as Tsit5. "
+        "In the batch, Dopri8 is better: 8.0 times as fast."
+    )
+    projected = planted(found, batch_projected=np.array([9.0, 3.0, 4.0, 5.0]))
+    assert "In the batch and projected, RK4 is better: 3.0 times as fast." in projected.verdict
+    few = planted(found, substeps=np.array([1, 0, 16, 0]), outside=3)
+    assert "In the batch, Tsit5 is better: 4.0 times as fast." in few.verdict
+    assert "3 of 40 steps leave the domain of the flow map." in few.verdict
+    assert str(few).count(">128") == 2
+    none = planted(found, substeps=np.array([1, 0, 0, 0]))
+    assert none.verdict == "No classical step is as accurate with 128 substeps."
+    wrong = planted(found, error=np.full(4, np.nan)).verdict
+    assert wrong == "The step of the network is not finite, or that of the reference is not."
+    assert "70% point the wrong way" in planted(found, args_error=2.0, args_wrong_sign=0.7).verdict
+
+
+@pytest.mark.slow
+def test_it_prints_what_it_returns_also_projected(capsys):
+    found = dfc.learned.compare(Rotation(), oscillator, STATES, manifold=RADIUS, step=STEP / 2)
+    assert capsys.readouterr().out == f"{found}\n"
+    for name in ("alone", "batch", "alone_projected", "batch_projected"):
+        assert np.all(getattr(found, name) > 0)
+    assert found.verdict.count("projected") == 2
+
+
+@pytest.mark.parametrize("bend", [1.0, -1.0])
+def test_derivatives_by_args_are_judged(bend, monkeypatch, capsys):
+    monkeypatch.setattr(CLOCK, lambda *args: 1.0)
+    family = Rotation(0.0, bend, args_domain=dfc.learned.Box(0.5, 1.5))
+    found = dfc.learned.compare(family, spring, STATES[:5], args=1.0)
+    assert found.args_wrong_sign == (bend == -1)
+    np.testing.assert_allclose(found.args_error, 1 - bend, atol=1e-8)
+    assert ("do not estimate parameters" in capsys.readouterr().out) == (bend == -1)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        (dict(step=2 * STEP), "`step` is 1.0, but the network was trained from 0 to 0.5"),
+        (dict(step=-1.0), "`step` .*must be positive"),
+        (dict(states=STATES[0, 0]), "stacked along a leading axis"),
+        (dict(manifold=1.0), "neither a `FirstIntegral`"),
+    ],
+)
+def test_mistakes_are_named(options, match):
+    given = dict(flow_map=Rotation(), vector_field=oscillator, states=STATES) | options
+    with pytest.raises((TypeError, ValueError), match=match):
+        dfc.learned.compare(**given)
