@@ -16,9 +16,9 @@ import measuring
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [DOCS / "performance.md", measuring.RESULTS.parent / "README.md"]
+PAGES = [DOCS / "performance.md", DOCS / "many-constraints.md", measuring.RESULTS.parent / "README.md"]
 UNROLLED = ", unrolled"
-NAMES = ("overhead", "gradients", "work_precision", "scaling")
+NAMES = ("overhead", "gradients", "work_precision", "scaling", "many_constraints")
 
 # One trajectory without the option of XLA that the documentation recommends.
 DEFAULT_FLAGS = "overhead-default-flags"
@@ -240,6 +240,18 @@ def integrals_table(results: Results) -> list[str]:
     return lines
 
 
+def many_table(results: Results) -> list[str]:
+    """A step with many constraints, plain and projected, and the memory of a solve."""
+    heads = ("", "plain step, ms", "projected over plain", "memory, plain", "memory, projected")
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for row in results["many_constraints"]["rows"]:
+        plain, projected = (row[f"{kind} s/step"] for kind in ("plain", "projected"))
+        memory = [f"{row[f'{kind} memory/state']:.0f}" for kind in ("plain", "projected")]
+        cells = [row["problem"], f"{1e3 * plain:.2g}", f"{projected / plain:.1f}", *memory]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
 def times_table(results: Results, part: str) -> list[str]:
     found = results["work_precision"]["parts"][part]
     lines = [
@@ -276,6 +288,7 @@ def tables(results: Results) -> dict[str, list[str]]:
         "kepler": times_table(results, "kepler"),
         "batch": times_table(results, "batch"),
         "machine": machine_lines(results),
+        "many constraints": many_table(results),
     }
 
 
