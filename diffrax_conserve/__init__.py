@@ -47,6 +47,9 @@ from ._solver.rk4 import RK4 as RK4
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
+from ._symmetric.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
+from ._symmetric.rattle import RATTLE as RATTLE
+from ._symmetric.symmetric_projection import SymmetricProjection as SymmetricProjection
 from .learned._files import load as load
 from .learned._files import save as save
 from .learned._networks.deeponet import DeepONet as DeepONet
