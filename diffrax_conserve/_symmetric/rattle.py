@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._interpolation import PackedTarget
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
-from .._options import check_counts, check_numbers
+from .._options import check_counts, check_number
 from .._projection.base import Target
 from .._projection.chord import after_test, counter
 from .._projection.elimination import (
@@ -33,6 +33,8 @@ from .._solver.terms import is_backsolve, is_ode, time_direction
 from .._tree import ravel, tree_shapes, tree_stop_gradient, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf, root
 
+# Up to this many numbers of the positions sums over them are written out.
+_WRITTEN_OUT_COLUMNS = 32
 # Solves of the linear system for the velocities: the first, and one that removes its roundoff.
 _SOLVES = 2
 
@@ -119,7 +121,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
                     f"`{name}` of `RATTLE` is a `FirstIntegral`, but positions have constraints: "
                     "pass `Constraint(lambda t, q, args: ...)`, a function of the positions alone."
                 )
-        check_numbers("masses", self.masses, least=0.0)
+        for mass in jax.tree.leaves(self.masses):
+            check_number("masses", mass, above=0.0, optional=False)
         check_counts(max_steps=self.max_steps)
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
@@ -145,7 +148,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
         """
         q, v = (jax.tree.map(jnp.asarray, x) for x in y)
         t = jnp.asarray(t, jnp.result_type(float, t))
-        equations = self._equations(t, q, args, jnp.zeros(()), jnp.asarray(1, t.dtype))
+        values = conserved_values(self.constraint, t, q, args)
+        hidden = ravel(values).astype(ravel(q).dtype)
+        equations = self._equations(t, q, args, hidden, jnp.asarray(1, t.dtype))
         drift, kick = terms[0].vf, terms[1].vf(t, q, args)
 
         def slope(t: Array, q: Y, v: Y) -> Values:
@@ -155,10 +160,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         start, along = (t, q, v), (jnp.ones_like(t), drift(t, v, args), kick)
         wrong = jax.jvp(slope, start, along)[1]
         _, jacobian = equations.linearise(ravel(q))
-        gram = self._gram(
-            equations, jacobian, lambda p: ravel(drift(t, unravel(p, v), args)), ravel(v)
-        )
-        values = jax.eval_shape(lambda: evaluate(self.constraint, t, q, args))
+        gram = self._gram(equations, jacobian, self._drift(terms, t, v, args), ravel(v))
         return unflatten(gram_solve(gram, -wrong), values)
 
     def init(
@@ -183,6 +185,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
                 f"The positions have the shapes {tree_shapes(q)}, the velocities "
                 f"{tree_shapes(v)}. `RATTLE` needs a state `(q, v)` of two parts that are alike."
             )
+        spread("masses", self.masses, q)
         direction = time_direction(terms, t0)
         values = conserved_values(self.constraint, t0 * direction, q, args)
         values, hidden = started(values, self.constraint, t0 * direction, q, args)
@@ -192,11 +195,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
         # By the Cauchy-Schwarz inequality no rate is larger than the product of these lengths.
         lengths = jnp.linalg.norm(equations.scaled(at.jacobian), axis=1)
         speeds = drift(ravel(v)) / jnp.where(equations.units > 0, equations.units, jnp.inf)
-        limit = float(jnp.finfo(rate.dtype).eps) ** 0.5 * lengths * jnp.linalg.norm(speeds)
-        moves = rate + combined(drift(ravel(v)), at.jacobian.T)
-        off = ~jnp.all(
-            jnp.abs(moves) <= limit + float(jnp.finfo(rate.dtype).eps) ** 0.5 * jnp.abs(rate)
-        )
+        limit = lengths * jnp.linalg.norm(speeds) + jnp.abs(rate)
+        moves = rate + _times(at.jacobian, drift(ravel(v)))
+        off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | violated(equations, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
         return _State(at, slope, jnp.zeros_like(hidden), hidden, off)
@@ -224,11 +225,11 @@ class RATTLE(dfx.AbstractSolver[Any]):
         )
 
         equations = self._equations(t1, q0, args, state.hidden, direction)
-        kicked = v + h / 2 * ravel(slope)
+        kicked = _once(v + h / 2 * ravel(slope))
 
         # The unknown is the displacement that a multiplier causes, `h² λ / 2`.
         def halfway(displacement: Array) -> Array:
-            force = combined(displacement, at.jacobian)
+            force = _combined(displacement, at.jacobian)
             return kicked + per_step * equations.scaled(equations.scaled(force))
 
         def position(displacement: Array) -> Array:
@@ -240,10 +241,10 @@ class RATTLE(dfx.AbstractSolver[Any]):
             ft.partial(_iterated, equations, position, tree_stop_gradient(at), q, self.max_steps),
             gram_solve,
         )
-        half, q1 = halfway(displacement), position(displacement)
+        half, q1 = _once((halfway(displacement), position(displacement)))
         y1 = unravel(q1, q0)
         slope = terms[1].vf(t1, y1, args)
-        kicked = half + h / 2 * ravel(slope)
+        kicked = _once(half + h / 2 * ravel(slope))
         drift = self._drift(terms, t1, v0, args)
         at, rate = self._linear(equations, t1, y1, args, direction, drift, kicked)
         v1, settled = _on_tangent(equations, at, rate, drift, kicked)
@@ -273,7 +274,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear."""
         forces = equations.scaled(equations.scaled(jacobian))
         along = jax.vmap(lambda x: jax.jvp(drift, (p,), (x,))[1])(forces)
-        return gram_matrix(jacobian, along)
+        return _gram_matrix(jacobian, along)
 
     def _linear(
         self,
@@ -286,12 +287,12 @@ class RATTLE(dfx.AbstractSolver[Any]):
         p: Array,
     ) -> tuple[_Linear, Float[Array, " m"]]:
         """The constraints at a position, and their partial derivative in time."""
-        _, jacobian = equations.linearise(ravel(q))
+        jacobian = _once(equations.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
         t = t * direction
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(jacobian.dtype)
-        gram = lax.stop_gradient(self._gram(equations, jacobian, drift, p))
-        return _Linear(jacobian, _inverse(gram)), rate
+        gram = _once(lax.stop_gradient(self._gram(equations, jacobian, drift, p)))
+        return _Linear(jacobian, _once(_inverse(gram))), rate
 
 
 RATTLE.__init__.__doc__ = r"""**Arguments:**
@@ -322,19 +323,42 @@ def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     return jnp.sum(right[:, :, None] * left[:, None, :], axis=0) / sizes[:, None] / sizes
 
 
+# Otherwise XLA evaluates it for each use.
+_once = lax.optimization_barrier
+
+
+def _combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """`rowsᵀ multiplier`. In a batch of small systems XLA is fastest if short sums are written out."""
+    if len(rows) > WRITTEN_OUT_MAX:
+        return combined(multiplier, rows)
+    return sum(x * row for x, row in zip(multiplier, rows, strict=True))  # pyright: ignore
+
+
+def _times(rows: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+    if len(rows) > WRITTEN_OUT_MAX:
+        return combined(x, rows.T)
+    return jnp.sum(rows * x, axis=1)
+
+
+def _gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
+    if len(rows) > WRITTEN_OUT_MAX or rows.shape[1] > _WRITTEN_OUT_COLUMNS:
+        return gram_matrix(rows, others)
+    return sum(a[:, None] * b[None] for a, b in zip(rows.T, others.T, strict=True))  # pyright: ignore
+
+
 def _iterated(
     equations: Equations, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
 ) -> tuple[Float[Array, " m"], Array]:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
     step: an iteration evaluates the constraint and nothing else."""
-    sizes = jnp.abs(q) + jnp.abs(position(jnp.zeros_like(guess)))
+    sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
 
     def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         x, left = carry
-        g = equations.residual(position(x))
+        g = _once(equations.residual(_once(position(x))))
         level, _ = equations.level(g, at.jacobian, sizes)
         left = after_test(level, left, extra=1, gives_up=left > 0)
-        return jnp.where(left > 0, x - combined(g, at.inverse), x), left
+        return jnp.where(left > 0, x - _combined(g, at.inverse), x), left
 
     carry = guess, counter(max_steps)
     return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)
@@ -347,17 +371,19 @@ def _on_tangent(
     inverse = lax.stop_gradient(at.inverse)
 
     def moved(x: Array) -> Array:
-        return p + equations.scaled(equations.scaled(combined(x, at.jacobian)))
+        return p + equations.scaled(equations.scaled(_combined(x, at.jacobian)))
 
     def residual(x: Array) -> Array:
-        return rate + combined(drift(moved(x)), at.jacobian.T)
+        return rate + _times(at.jacobian, drift(moved(x)))
 
     def iterate(x: Array) -> tuple[Array, None]:
         for _ in range(_SOLVES):
-            x = x - combined(residual(x), inverse)
+            x = _once(x - _combined(residual(x), inverse))
         return x, None
 
     x, _ = root(residual, jnp.zeros_like(rate), iterate, gram_solve)
-    sizes = jnp.abs(drift(p)) + jnp.abs(drift(moved(x)))
+    # Multipliers of neighbours, as in a taut chain, are large and cancel: the terms are rounded.
+    terms = equations.scaled(equations.scaled(_combined(jnp.abs(x), jnp.abs(at.jacobian))))
+    sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
     limit = equations.tolerance(jnp.abs(rate) + shown_terms(at.jacobian, sizes))
     return moved(x), jnp.all(jnp.abs(residual(x)) <= limit)

@@ -63,7 +63,16 @@ def root(
         matrix = jax.jacfwd(lambda x: _flat(linear(unflatten(x, like))))(jnp.zeros_like(flat))
         return unflatten(solve(matrix, flat), like)
 
-    return lax.custom_root(residual, guess, lambda _, x: iterate(x), tangent, has_aux=True)
+    # JAX gives what else is returned a tangent of its own type, which integers cannot have.
+    _, like = jax.eval_shape(iterate, guess)
+    dtype = jax.tree.leaves(guess)[0].dtype
+
+    def solution(_: Any, x: Any) -> tuple[Any, Any]:
+        x, more = iterate(x)
+        return x, jax.tree.map(lambda a: a.astype(dtype), more)
+
+    found, more = lax.custom_root(residual, guess, solution, tangent, has_aux=True)
+    return found, jax.tree.map(lambda a, b: a.astype(b.dtype), more, like)
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:

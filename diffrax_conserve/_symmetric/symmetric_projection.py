@@ -35,6 +35,10 @@ from .shorter_step import ShorterStep, StepOf, root
 _NEARLY_SOLVED, _SOLVED = 64, 2
 
 
+def _of_innermost(name: str) -> Any:
+    return property(lambda self: getattr(innermost(self.solver), name))
+
+
 class _State(eqx.Module):
     inner: Any
     values: Float[Array, " m"]
@@ -131,21 +135,11 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
                 )
 
     # diffrax forwards `isinstance` to the innermost solver, then reads these attributes here.
-    @property
-    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.solver.term_structure
-
-    @property
-    def term_compatible_contr_kwargs(self) -> Any:  # pyright: ignore
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def root_finder(self) -> Any:
-        return innermost(self.solver).root_finder
-
-    @property
-    def root_find_max_steps(self) -> int:
-        return innermost(self.solver).root_find_max_steps
+    term_structure = _of_innermost("term_structure")
+    term_compatible_contr_kwargs = _of_innermost("term_compatible_contr_kwargs")
+    root_finder = _of_innermost("root_finder")
+    root_find_max_steps = _of_innermost("root_find_max_steps")
+    scan_kind = _of_innermost("scan_kind")
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
         return self.solver.order(terms)
@@ -300,8 +294,7 @@ def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) 
     """Solves for the tangents of the state, of the given size, and of the multiplier."""
     (a, b), (c, d) = (jnp.split(rows, [size], axis=1) for rows in jnp.split(matrix, [size]))
     above, below = jnp.split(right, [size])
-    eliminated = jnp.linalg.solve(a, jnp.concatenate([b, above[:, None]], axis=1))
-    along, at = eliminated[:, :-1], eliminated[:, -1]
+    along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
     multiplier = gram_solve(d - c @ along, below - c @ at)
     return jnp.concatenate([at - along @ multiplier, multiplier])
 
