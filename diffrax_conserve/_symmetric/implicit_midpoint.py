@@ -23,9 +23,9 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 
     $$y_{n+1} = y_n + h f(t_n + \tfrac{h}{2}, \tfrac{1}{2} (y_n + y_{n+1}))$$
 
-    is of second order, symmetric (a step backwards undoes a step) and symplectic, and it keeps every
-    quadratic first integral. All this holds as far as the equation is solved. By default that is to
-    roundoff, by a chord iteration whose Jacobian is that at the start of the step.
+    is of second order, symmetric (a step backwards undoes a step) and symplectic, and it keeps
+    every quadratic first integral. All this holds as far as the equation is solved. By default that
+    is to roundoff, by a chord iteration whose Jacobian is that at the start of the step.
 
     It has no error estimate, because a step size that follows the error is not symmetric. Dense
     output is the cubic Hermite polynomial through both ends.
@@ -61,8 +61,9 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
             return
         if not isinstance(self.root_finder, optx.AbstractRootFinder):
             raise TypeError(
-                f"`root_finder` is {self.root_finder!r}, which is no root finder of optimistix or "
-                "diffrax. Leave it out, or pass for example `optimistix.Newton(rtol=0, atol=1e-15)`."
+                f"`root_finder` is {self.root_finder!r}, which is not a root finder of "
+                "optimistix or diffrax. Leave it out, or pass for example "
+                "`optimistix.Newton(rtol=0, atol=4e-15)`."
             )
         if not eqx.is_array_like(getattr(self.root_finder, "rtol", 0.0)):
             raise ValueError(
@@ -125,8 +126,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 
 - `root_finder`: a root finder of optimistix or diffrax with tolerances of its own. Its unknown is
-    the increment $h f$, each component divided by $|y_n| + |h f(t_n, y_n)|$, so that both tolerances
-    are relative to the state. Default: `optimistix.Chord` with four units of roundoff.
+    the increment $h f$, each component divided by $|y_n| + |h f(t_n, y_n)|$, so that both
+    tolerances are relative to the state. Default: `optimistix.Chord` with four units of roundoff.
 - `root_find_max_steps`: the largest number of its iterations. If they are not enough, the solve
     ends, and its `result` says so.
 

@@ -24,8 +24,8 @@ from .._projection.elimination import (
     gram_solve,
     inverse_factor,
 )
-from .._projection.equations import Equations, any_lane, shown_terms
-from .._projection.options import check_state, option
+from .._projection.equations import ON, Equations, any_lane, shown_terms
+from .._projection.options import check_state, option, spread
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
@@ -328,7 +328,8 @@ _once = lax.optimization_barrier
 
 
 def _combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """`rowsᵀ multiplier`. In a batch of small systems XLA is fastest if short sums are written out."""
+    """`rowsᵀ multiplier`. XLA is fastest in a batch of small systems if short sums are written
+    out."""
     if len(rows) > WRITTEN_OUT_MAX:
         return combined(multiplier, rows)
     return sum(x * row for x, row in zip(multiplier, rows, strict=True))  # pyright: ignore
@@ -357,6 +358,10 @@ def _iterated(
         x, left = carry
         g = _once(equations.residual(_once(position(x))))
         level, _ = equations.level(g, at.jacobian, sizes)
+        # Iterations end with one more, which is cheap and leaves only roundoff. But there is none
+        # where the guess is a solution, as in a shorter step of hardly any length, in which the
+        # roundoff of the positions would be a large velocity.
+        level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
         left = after_test(level, left, extra=1, gives_up=left > 0)
         return jnp.where(left > 0, x - _combined(g, at.inverse), x), left
 

@@ -251,9 +251,11 @@ def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Fl
 def _iterated(
     start: Equations, end: Equations, inner: Any, y0: Array, multiplier: Array, max_steps: int
 ) -> _Iterate:
-    """Simplified Newton's method for `μ`. Its matrix is `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`: the derivative of
-    `g` along the inner step, `G₁ Φ' M⁻¹ G₀ᵀ`, is the second term up to the error of the step, because
-    the exact flow keeps the manifold and its neighbours. So no step is differentiated."""
+    """Simplified Newton's method for `μ`, with the matrix `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`.
+
+    The exact one has the derivative of `g` along the inner step, `G₁ Φ' M⁻¹ G₀ᵀ`, for the second
+    term. The exact flow keeps integrals off the manifold too, so both agree up to the error of the
+    step, and no step is differentiated."""
     sizes, first = scaled_rows(start.scaled(start.linearise(y0)[1]))
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 

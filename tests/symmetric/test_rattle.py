@@ -74,7 +74,10 @@ def difference(a, b):
 def off(constraint, y):
     """Of positions and velocities, in units of roundoff of the terms that are added."""
     q, v = y
-    fn = lambda q: constraint(0.0, q, None)
+
+    def fn(q):
+        return constraint(0.0, q, None)
+
     rows = jnp.abs(jax.jacobian(fn)(q)).reshape(-1, q.size)
     rate = jax.jvp(fn, (q,), (v,))[1]
     scales = rows @ jnp.abs(q).ravel(), rows @ jnp.abs(v).ravel() + largest(v)
@@ -96,7 +99,8 @@ def test_a_chain_and_a_closed_loop_stay_on_the_constraint_without_drift(constrai
     sol = solve(terms(fall), solver, y0, 0.0, 10.0, 0.01)
     assert dfx.is_okay(sol.result)
     position, velocity = off(constraint, final(sol))
-    assert position <= (4 if constraint is rods else 16) and velocity <= 16
+    assert position <= (4 if constraint is rods else 16)
+    assert velocity <= 16
     q, v = final(sol)
     total = jnp.sum(v**2) / 2 - jnp.sum(q * GRAVITY)
     start = jnp.sum(y0[1] ** 2) / 2 - jnp.sum(y0[0] * GRAVITY)
@@ -106,7 +110,8 @@ def test_a_chain_and_a_closed_loop_stay_on_the_constraint_without_drift(constrai
 def test_backwards_undoes_forwards():
     there = solve(TERMS, THREE, chain(3), 0.0, 5.0, 0.01)
     back = solve(TERMS, THREE, final(there), 5.0, 0.0, -0.01)
-    assert dfx.is_okay(back.result) and difference(final(back), chain(3)) < 1e-12
+    assert dfx.is_okay(back.result)
+    assert difference(final(back), chain(3)) < 1e-12
     assert abs(energy(final(there)) - energy(chain(3))) < 1e-3
 
 
@@ -126,7 +131,8 @@ def test_second_order_against_the_equations_of_motion():
     )  # fmt: skip
     ends = [final(solve(TERMS, THREE, chain(3), 0.0, 1.0, h)) for h in (0.02, 0.01)]
     coarse, fine = (difference(y, exact) for y in ends)
-    assert fine < 1e-3 and 3.7 < coarse / fine < 4.3
+    assert fine < 1e-3
+    assert 3.7 < coarse / fine < 4.3
     # The multipliers, forces in the rods.
     found = THREE.multipliers(TERMS, 0.0, exact)
     assert difference(found, field.multipliers(0.0, exact)) < 1e-12
@@ -165,7 +171,8 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     position, velocity = jax.vmap(lambda q, v: (
         rods(0.0, q, None), jax.jvp(lambda q: rods(0.0, q, None), (q,), (v,))[1]
     ))(*ys)  # fmt: skip
-    assert largest(position) < 1e-14 and largest(velocity) < 1e-14
+    assert largest(position) < 1e-14
+    assert largest(velocity) < 1e-14
     save = dfx.SaveAt(dense=True, steps=True)
     dense = dfx.diffeqsolve(
         TERMS,
@@ -178,7 +185,7 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     )
     at = jax.vmap(dense.evaluate)(dense.ts[:20])
     assert difference(at, jax.tree.map(lambda y: y[:20], dense.ys)) < 1e-13
-    q, v = dense.evaluate(0.52)
+    _q, v = dense.evaluate(0.52)
     assert difference(dense.derivative(0.52)[0], v) < 0.01
 
 
@@ -197,36 +204,50 @@ def test_derivatives_in_both_modes_against_finite_differences():
     forward = jax.jit(lambda s: jax.jvp(lambda s: end(s, dfx.ForwardMode()), (s,), (1.0,)))
     numeric = (forward(at + e)[0] - forward(at - e)[0]) / (2 * e)
     reverse = jax.jit(jax.grad(lambda s: end(s, dfx.RecursiveCheckpointAdjoint())))(at)
-    assert abs(reverse - numeric) < 1e-8 and abs(reverse - forward(at)[1]) < 1e-11
+    assert abs(reverse - numeric) < 1e-8
+    assert abs(reverse - forward(at)[1]) < 1e-11
 
 
 def test_a_lane_is_that_lane_alone_and_float32_works():
     speeds = jnp.array([0.0, 0.5, -1.0])
-    run = lambda w: final(solve(TERMS, THREE, (chain(3)[0], w * spin()), 0.0, 1.0, 0.02))
-    spin = lambda: jnp.stack([jnp.zeros(3), jnp.arange(1.0, 4.0)], axis=1)
+
+    def run(w):
+        return final(solve(TERMS, THREE, (chain(3)[0], w * spin()), 0.0, 1.0, 0.02))
+
+    def spin():
+        return jnp.stack([jnp.zeros(3), jnp.arange(1.0, 4.0)], axis=1)
+
     together = jax.vmap(run)(speeds)
     for i, w in enumerate(speeds):
         assert difference(jax.tree.map(lambda y, i=i: y[i], together), run(w)) < 1e-13
     y0 = jax.tree.map(lambda y: y.astype(jnp.float32), chain(3))
     pair = terms(springs, MASSES.astype(jnp.float32))
     sol = solve(pair, THREE, y0, *(jnp.asarray(x, jnp.float32) for x in (0.0, 1.0, 0.02)))
-    assert dfx.is_okay(sol.result) and sol.ys[0].dtype == jnp.float32
+    assert dfx.is_okay(sol.result)
+    assert sol.ys[0].dtype == jnp.float32
     assert difference(final(sol), jax.tree.map(lambda y: y[0], together)) < 1e-4
 
 
 def test_a_moving_constraint_a_frozen_bead_and_a_plane():
     """A pendulum whose pivot goes up and down; a wall; `z = 0` has no scale of its own."""
-    pivot = lambda t: jnp.array([0.0, 0.3 * jnp.sin(2 * t)])
-    moving = lambda t, q, args: jnp.sum((q - pivot(t)) ** 2) - 1
+
+    def pivot(t):
+        return jnp.array([0.0, 0.3 * jnp.sin(2 * t)])
+
+    def moving(t, q, args):
+        return jnp.sum((q - pivot(t)) ** 2) - 1
+
     solver, pair = dfc.RATTLE(dfc.Constraint(moving), 1.0), terms(fall)
     y0 = jnp.array([1.0, 0.0]), jnp.array([0.0, 0.6])
     there = solve(pair, solver, y0, 0.0, 3.0, 0.01)
-    assert dfx.is_okay(there.result) and abs(moving(3.0, final(there)[0], None)) < 4e-15
+    assert dfx.is_okay(there.result)
+    assert abs(moving(3.0, final(there)[0], None)) < 4e-15
     assert difference(final(solve(pair, solver, final(there), 3.0, 0.0, -0.01)), y0) < 1e-12
     walls = dfc.RATTLE(dfc.Constraint(rods), jnp.array([[jnp.inf], [1.0], [1.0]]))
     still = terms(lambda t, q, args: fall(t, q, args).at[0].set(0.0))
     q, v = final(solve(still, walls, chain(3), 0.0, 1.0, 0.01))
-    assert (q[0] == chain(3)[0][0]).all() and largest(rods(0.0, q, None)[1:]) < 4e-15
+    assert (q[0] == chain(3)[0][0]).all()
+    assert largest(rods(0.0, q, None)[1:]) < 4e-15
     plane = dfc.RATTLE(dfc.Constraint(lambda t, q, args: q[1]), 1.0)
     q, v = final(solve(pair, plane, (jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0])), 0.0, 1.0, 0.1))
     assert difference((q, v), (jnp.array([2.0, 0.0]), jnp.array([1.0, 0.0]))) < 1e-14
@@ -243,7 +264,8 @@ def test_failures_are_results():
         (terms(fall), THREE, (q, v), 5.0, ""),
     ):  # fmt: skip
         sol = solve(pair, solver, y0, 0.0, 1.0 if h < 1 else 10.0, h)
-        assert not dfx.is_okay(sol.result) and message in dfx.RESULTS[sol.result]
+        assert not dfx.is_okay(sol.result)
+        assert message in dfx.RESULTS[sol.result]
         assert not np.isfinite(final(sol)[0]).any()
 
 

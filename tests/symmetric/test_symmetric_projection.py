@@ -50,8 +50,10 @@ def drift(y, y0):
 def test_there_and_back_on_the_manifold(periods):
     there = solve(kepler, SYMMETRIC, Y0, 0.0, periods * 200 * H, H)
     back = solve(kepler, SYMMETRIC, final(there), periods * 200 * H, 0.0, -H)
-    assert dfx.is_okay(there.result) and dfx.is_okay(back.result)
-    assert drift(final(there), Y0) <= 4 and drift(final(back), Y0) <= 4
+    assert dfx.is_okay(there.result)
+    assert dfx.is_okay(back.result)
+    assert drift(final(there), Y0) <= 4
+    assert drift(final(back), Y0) <= 4
     assert difference(final(back), Y0) < 1e-10
     assert dfc.statistics(there).num_iterations < 4 * periods * 200
     # A projection at one end is not symmetric.
@@ -67,7 +69,10 @@ def test_one_step_solves_the_equations():
 
     def residual(unknowns, _):
         y1, mu = unknowns[:3], unknowns[3:]
-        fn = lambda y: jnp.stack([e.fn(0.0, y, None) for e in RIGID_BODY.values()])
+
+        def fn(y):
+            return jnp.stack([e.fn(0.0, y, None) for e in RIGID_BODY.values()])
+
         start = y0 + mu @ jax.jacobian(fn)(y0)
         end = y1 - mu @ jax.jacobian(fn)(y1)
         inner = end - start - 0.1 * rigid_body(0.0, (start + end) / 2, None)
@@ -106,7 +111,9 @@ def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
 
 def test_derivatives_in_both_modes_against_finite_differences():
     def end(y0, scale):
-        field = lambda t, w, args: args * rigid_body(t, w, None)
+        def field(t, w, args):
+            return args * rigid_body(t, w, None)
+
         sol = dfx.diffeqsolve(
             dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, scale, max_steps=8,
         )  # fmt: skip
@@ -114,7 +121,9 @@ def test_derivatives_in_both_modes_against_finite_differences():
 
     def forward(y0, scale):
         def fn(s):
-            field = lambda t, w, args: args * rigid_body(t, w, None)
+            def field(t, w, args):
+                return args * rigid_body(t, w, None)
+
             options = dict(max_steps=8, adjoint=dfx.ForwardMode())
             y = dfx.diffeqsolve(dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, s, **options).ys[-1]
             return jnp.sum(jnp.sin(y) * jnp.array([1.0, 2.0, 3.0]))
@@ -133,18 +142,25 @@ def test_derivatives_in_both_modes_against_finite_differences():
 
 def test_a_lane_is_that_lane_alone_and_float32_works():
     lanes = jnp.stack([W0, 2 * W0, W0[::-1]])
-    run = lambda y0: solve(rigid_body, BODY, y0, 0.0, 1.0, 0.1).ys[-1]
+
+    def run(y0):
+        return solve(rigid_body, BODY, y0, 0.0, 1.0, 0.1).ys[-1]
+
     together = jax.vmap(run)(lanes)
     assert all(difference(together[i], run(lanes[i])) < 1e-14 for i in range(3))
     single = [jnp.asarray(x, jnp.float32) for x in (0.0, 1.0, 0.1)]
     sol = solve(rigid_body, BODY, W0.astype(jnp.float32), *single)
-    assert dfx.is_okay(sol.result) and sol.ys.dtype == jnp.float32
+    assert dfx.is_okay(sol.result)
+    assert sol.ys.dtype == jnp.float32
     assert difference(sol.ys[-1], together[0]) < 1e-5
 
 
 def test_time_dependent_constraint_and_a_repeated_one_backwards_in_time():
     """`|y| = 1 + t / 2` along `y' = y / (2 + t)`, turned."""
-    field = lambda t, y, args: y / (2 + t) + jnp.array([-y[1], y[0]])
+
+    def field(t, y, args):
+        return y / (2 + t) + jnp.array([-y[1], y[0]])
+
     radius = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - (1 + t / 2) ** 2)
     y0 = jnp.array([0.6, 0.8])
     once, twice = (
@@ -160,7 +176,10 @@ def test_failures_are_results():
     off = dfc.SymmetricProjection(
         dfc.ImplicitMidpoint(), dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
     )
-    broken = lambda t, y, args: jnp.where(t > 0.5, jnp.nan, 1.0) * rigid_body(t, y, args)
+
+    def broken(t, y, args):
+        return jnp.where(t > 0.5, jnp.nan, 1.0) * rigid_body(t, y, args)
+
     few = dfc.SymmetricProjection(dfc.ImplicitMidpoint(root_find_max_steps=1), RIGID_BODY)
     wrong = dfc.SymmetricProjection(
         dfc.ImplicitMidpoint(), dfc.FirstIntegral(lambda t, y, args: jnp.exp(-(y[0] ** 2) - 5 * t))
@@ -199,8 +218,8 @@ def test_what_is_admissible():
             dfc.SymmetricProjection(solver, KEPLER)
     with pytest.raises(TypeError, match="not a diffrax solver"):
         dfc.SymmetricProjection(dfc.ImplicitMidpoint, KEPLER)
+    gains = dfc.FirstIntegral(lambda t, y, args: y[0], rate=lambda t, y, args: 0 * y[0])
     with pytest.raises(ValueError, match="rate"):
-        gains = dfc.FirstIntegral(lambda t, y, args: y[0], rate=lambda t, y, args: 0 * y[0])
         dfc.SymmetricProjection(dfc.ImplicitMidpoint(), gains)
     with pytest.raises(ValueError, match="tolerances"):
         dfc.ImplicitMidpoint(root_finder=dfx.with_stepsize_controller_tols(dfx.VeryChord)())
@@ -215,7 +234,12 @@ def test_what_is_admissible():
 
 def test_the_midpoint_rule_keeps_quadratic_integrals_in_any_units():
     for unit in (1.0, 1e-12, 1e12):
-        momentum = lambda w: jnp.sum((jnp.asarray(INERTIA) * w) ** 2)
-        slow = lambda t, w, args, unit=unit: rigid_body(t, w / unit, args) * unit
+
+        def momentum(w):
+            return jnp.sum((jnp.asarray(INERTIA) * w) ** 2)
+
+        def slow(t, w, args, unit=unit):
+            return rigid_body(t, w / unit, args) * unit
+
         end = final(solve(slow, dfc.ImplicitMidpoint(), W0 * unit, 0.0, 20.0, 0.1))
         assert abs(momentum(end / unit) / momentum(W0) - 1) < 1e-13
