@@ -11,6 +11,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
 
 What is conserved    FirstIntegral, Constraint, check_invariance, drift, off_manifold
 Solvers              ManifoldProjection, RK4, Unrolled, statistics
+Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
 Projections          SimplifiedNewton, Newton, ClosedForm, Directional, Staged, project
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()

@@ -24,7 +24,7 @@ from .._projection.elimination import (
     gram_solve,
     inverse_factor,
 )
-from .._projection.equations import ON, Equations, any_lane, shown_terms
+from .._projection.equations import ON, Equations, any_lane, length, shown_terms
 from .._projection.options import check_state, option, spread
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
@@ -194,8 +194,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         at, rate = self._linear(equations, t0, q, args, direction, drift, ravel(v))
         # By the Cauchy-Schwarz inequality no rate is larger than the product of these lengths.
         lengths = jnp.linalg.norm(equations.scaled(at.jacobian), axis=1)
-        speeds = drift(ravel(v)) / jnp.where(equations.units > 0, equations.units, jnp.inf)
-        limit = lengths * jnp.linalg.norm(speeds) + jnp.abs(rate)
+        limit = lengths * length(drift(ravel(v)), equations.units) + jnp.abs(rate)
         moves = rate + _times(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | violated(equations, self.constraint, ravel(q))

@@ -58,7 +58,7 @@ class _Iterate(NamedTuple):
     noise: Float[Array, " m"]
     rows: Float[Array, "m n"]
     left: Int[Array, ""]
-    count: Int[Array, ""]
+    num_steps: Int[Array, ""]
     result: dfx.RESULTS
 
 
@@ -118,11 +118,12 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
         manifold: Manifold,
         *,
         metric: PyTree[ArrayLike] = 1.0,
-        rtol: RealScalarLike | None = None,
-        atol: RealScalarLike | None = None,
+        rtol: float | Array | None = None,
+        atol: float | Array | None = None,
         max_steps: int = 50,
     ):
-        self.solver, self.manifold = solver, manifold
+        self.solver = solver  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.manifold = manifold
         self.projection = SimplifiedNewton(metric=metric, rtol=rtol, atol=atol, max_steps=max_steps)
         _check_symmetric(solver)
         check_nested(self)
@@ -207,7 +208,7 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
         )
         y1 = _differentiable(y1, certain(end, found.candidate, y1, end.linearise(y1)[1]))
         problem = target.problem(t1, y0)
-        info = problem.judge(found.candidate, y1, found.count, ok=found.left != -1)
+        info = problem.judge(found.candidate, y1, found.num_steps, ok=found.left != -1)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
         failed = cause_of_failure(info.ok, off, (vector, found.candidate, y1), None, None)
         inner_failed = found.result != dfx.RESULTS.successful
@@ -284,7 +285,7 @@ def _iterated(
         rows = last.rows / sizes[:, None]
         gram = gram0 + gram_matrix(rows, rows)
         change = gram_solve(gram, last.wrong / sizes, last.noise / sizes) / sizes
-        found = tested(last.multiplier - change, last.rows, last.left, last.count + 1)
+        found = tested(last.multiplier - change, last.rows, last.left, last.num_steps + 1)
         # A lane that is done waits for the others.
         return jtu.tree_map(lambda a, b: jnp.where(last.left > 0, a, b), found, last)
 
