@@ -281,7 +281,7 @@ def test_wrong_input():
         (THREE, (q, v[:2]), "alike"), (THREE, (q.astype(int), v), "dtype"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=message):
-            dfx.diffeqsolve(TERMS, solver, 0.0, 1.0, 0.1, y0)
+            dfx.diffeqsolve(terms(fall), solver, 0.0, 1.0, 0.1, y0)
     noise = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
     pair = TERMS[0], dfx.ControlTerm(lambda t, q, args: jnp.ones_like(q), noise)
     with pytest.raises(ValueError, match="ODETerm"):
