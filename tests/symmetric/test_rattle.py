@@ -278,7 +278,7 @@ def test_wrong_input():
     q, v = chain(3)
     for solver, y0, message in (
         (dfc.RATTLE(dfc.Constraint(rods), jnp.ones((2, 1))), (q, v), "masses"),
-        (THREE, (q, v[:2]), "alike"), (THREE, (q.astype(int), v), "dtype"),
+        (THREE, (q, v[:2]), "alike"),
     ):  # fmt: skip
         with pytest.raises((TypeError, ValueError), match=message):
             dfx.diffeqsolve(terms(fall), solver, 0.0, 1.0, 0.1, y0)
