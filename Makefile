@@ -127,7 +127,7 @@ COSTS := core forms overhead gradients work_precision scaling balance learned_so
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
   defaults hard_cases
-STUDIES := claims long_run units
+STUDIES := claims long_run symmetric units
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done

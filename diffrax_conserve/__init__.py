@@ -12,6 +12,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
 What is conserved    FirstIntegral, Constraint, find_invariants
 Diagnostics          check_invariance, drift, off_manifold, statistics
 Solvers              ManifoldProjection, RK4, Unrolled
+Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
 Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
 Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
@@ -52,6 +53,9 @@ from ._solver.rk4 import RK4 as RK4
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
+from ._symmetric.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
+from ._symmetric.rattle import RATTLE as RATTLE
+from ._symmetric.symmetric_projection import SymmetricProjection as SymmetricProjection
 from .learned._files import load as load
 from .learned._files import save as save
 from .learned._networks.deeponet import DeepONet as DeepONet

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.base import Target, has_bounds
+from ._projection.base import has_bounds
 from ._projection.descent import descend
 from ._projection.equations import any_lane, length
 from ._projection.within_bounds import AbstractNewton
@@ -32,17 +32,18 @@ _DAMPED_STEPS = 100
 
 @final
 class PackedTarget(eqx.Module):
-    """A `Target` in the form in which `dense_info` stores it: only arrays are leaves."""
+    """A `Target`, or another module, in the form in which `dense_info` stores it: only arrays are
+    leaves."""
 
     arrays: PyTree[Array]
-    static: Target = eqx.field(static=True)
+    static: Any = eqx.field(static=True)
 
-    def __init__(self, target: Target):
+    def __init__(self, target: Any):
         # Python numbers are kept static, because a function may use them as a shape or an index.
         arrays, self.static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
 
-    def unpack(self) -> Target:
+    def unpack(self) -> Any:
         return eqx.combine(self.arrays, self.static)
 
 

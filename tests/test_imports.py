@@ -38,10 +38,11 @@ MAY_IMPORT = {
     "_interpolation": _PROJECTION,
     "_solver": _PROJECTION | {"_interpolation"},
     "_diagnostics": _PROJECTION,
+    "_symmetric": _PROJECTION | {"_interpolation", "_solver"},
     "learned": _CORE | {"systems"},
     "systems": _CORE,
     "testing": _CORE | {"systems"},
-    PACKAGE: _CORE | _GUESTS,
+    PACKAGE: _CORE | _GUESTS | {"_symmetric"},
     "reproduce": _CORE | _GUESTS | {PACKAGE},
     "__main__": _CORE | _GUESTS | {"reproduce", PACKAGE},
 }

@@ -1,0 +1,143 @@
+"""The implicit midpoint rule, the symmetric one-step method that diffrax lacks."""
+
+from typing import Any, ClassVar, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+
+from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._options import check_counts
+from .._projection.options import option
+
+# The largest change of the midpoint, in units of roundoff, after which the iteration stops. It
+# converges fast, so what is left is much smaller: less than the rounding of the state.
+_ACCEPTED = 4
+
+
+@final
+class ImplicitMidpoint(dfx.AbstractSolver[None]):
+    r"""The implicit midpoint rule, for fixed steps.
+
+    $$y_{n+1} = y_n + h f(t_n + \tfrac{h}{2}, \tfrac{1}{2} (y_n + y_{n+1}))$$
+
+    is of second order, symmetric (a step backwards undoes a step) and symplectic, and it keeps
+    every quadratic first integral. All this holds as far as the equation is solved. By default that
+    is to roundoff, by a chord iteration whose Jacobian is that at the start of the step.
+
+    It has no error estimate, because a step size that follows the error is not symmetric. Dense
+    output is the cubic Hermite polynomial through both ends.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        term = diffrax.ODETerm(lambda t, y, args: jnp.array([y[1], -jnp.sin(y[0])]))
+        y0 = jnp.array([1.0, 0.0])
+        there = diffrax.diffeqsolve(term, dfc.ImplicitMidpoint(), 0.0, 10.0, 0.1, y0).ys[-1]
+        back = diffrax.diffeqsolve(term, dfc.ImplicitMidpoint(), 10.0, 0.0, -0.1, there).ys[-1]
+        assert jnp.max(jnp.abs(back - y0)) < 1e-4  # float32
+        ```
+
+    ??? cite "Reference"
+
+        Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, II.1 and V.2.
+    """
+
+    root_finder: optx.AbstractRootFinder | None = option(None)
+    root_find_max_steps: int = option(30, static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
+
+    def __check_init__(self):
+        check_counts(root_find_max_steps=self.root_find_max_steps)
+        if self.root_finder is None:
+            return
+        if not isinstance(self.root_finder, optx.AbstractRootFinder):
+            raise TypeError(
+                f"`root_finder` is {self.root_finder!r}, which is not a root finder of "
+                "optimistix or diffrax. Leave it out, or pass for example "
+                "`optimistix.Newton(rtol=0, atol=4e-15)`."
+            )
+        if not eqx.is_array_like(getattr(self.root_finder, "rtol", 0.0)):
+            raise ValueError(
+                "`root_finder` takes its tolerances from a step size controller, but steps of "
+                "`ImplicitMidpoint` are fixed. Leave it out, or give it `rtol` and `atol`."
+            )
+
+    def order(self, terms: dfx.AbstractTerm) -> int:
+        del terms
+        return 2
+
+    def init(
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> None:
+        del terms, t0, t1, y0, args
+
+    def step(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: None,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, None, DenseInfo, None, dfx.RESULTS]:
+        del solver_state, made_jump
+        middle, control = t0 + (t1 - t0) / 2, terms.contr(t0, t1)
+        k0 = terms.vf_prod(t0, y0, args, control)
+        # The unknown is the increment in units of what is rounded in the step: then tolerances mean
+        # the same whatever the units of the state are.
+        units = jtu.tree_map(_size, y0, k0)
+
+        def increment(x: Y) -> Y:
+            return jtu.tree_map(lambda x, unit: x * unit, x, units)
+
+        def relation(x: Y, _: Any) -> Y:
+            k = increment(x)
+            y = jtu.tree_map(lambda y, k: y + k / 2, y0, k)
+            new = terms.vf_prod(middle, y, args, control)
+            return jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units)
+
+        finder = self.root_finder
+        if finder is None:
+            eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(units))).eps)
+            finder = optx.Chord(rtol=0.0, atol=_ACCEPTED * eps, norm=optx.max_norm)
+        guess = jtu.tree_map(lambda k, unit: k / unit, k0, units)
+        solved = optx.root_find(
+            relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
+        )
+        y1 = jtu.tree_map(lambda y, k: y + k, y0, increment(solved.value))
+        k1 = terms.vf_prod(t1, y1, args, control)
+        result = dfx.RESULTS.promote(solved.result)
+        return y1, None, dict(y0=y0, y1=y1, k0=k0, k1=k1), None, result
+
+    def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
+        return terms.vf(t0, y0, args)
+
+
+ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: a root finder of optimistix or diffrax with tolerances of its own. Its unknown is
+    the increment $h f$, each component divided by $|y_n| + |h f(t_n, y_n)|$, so that both
+    tolerances are relative to the state. Default: `optimistix.Chord` with four units of roundoff.
+- `root_find_max_steps`: the largest number of its iterations. If they are not enough, the solve
+    ends, and its `result` says so.
+
+**Raises:**
+
+`TypeError` if `root_finder` is none; `ValueError` if it has no tolerances of its own.
+"""
+
+
+def _size(y: Any, k: Any) -> Any:
+    size = jnp.abs(y) + jnp.abs(k)
+    size = jnp.where(size > 0, size, jnp.max(size, initial=0))
+    return jnp.where(size > 0, size, jnp.ones_like(size))

@@ -1,0 +1,288 @@
+"""RATTLE: on the constraint to roundoff, symplectic, symmetric."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import diffrax_conserve as dfc
+
+from ..problems import largest
+
+GRAVITY = jnp.array([0.0, -1.0])
+
+
+def links(t, q, args):
+    return jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2)))
+
+
+def rods(t, q, args):
+    return jnp.sum(links(t, q, args) ** 2, axis=1) - 1
+
+
+def loop(t, q, args):
+    """Also the distance of the last bead from the origin: a closed loop."""
+    return jnp.concatenate([rods(t, q, args), (jnp.sum(q[-1] ** 2) - 2)[None]])
+
+
+def fall(t, q, args):
+    return jnp.broadcast_to(GRAVITY, q.shape).astype(q.dtype)
+
+
+def springs(t, q, args):
+    """So that the motion is not that of a falling chain alone."""
+    return fall(t, q, args) - 0.3 * q
+
+
+def terms(force, masses=1.0):
+    return (
+        dfx.ODETerm(lambda t, v, args: v),
+        dfx.ODETerm(lambda t, q, args: force(t, q, args) / masses),
+    )
+
+
+def chain(beads):
+    q = jnp.stack([jnp.arange(1.0, beads + 1), jnp.zeros(beads)], axis=1)
+    return q, jnp.zeros_like(q)
+
+
+MASSES = jnp.array([[1.0], [2.0], [0.5]])
+THREE = dfc.RATTLE(dfc.Constraint(rods), MASSES)
+TERMS = terms(springs, MASSES)
+
+
+@eqx.filter_jit
+def solve(terms, solver, y0, t0, t1, h, ts=None):
+    save = dfx.SaveAt(t1=True) if ts is None else dfx.SaveAt(ts=ts)
+    return dfx.diffeqsolve(
+        terms, solver, t0, t1, h, y0, saveat=save, max_steps=None, throw=False,
+        adjoint=dfx.ForwardMode(),
+    )  # fmt: skip
+
+
+def final(sol):
+    return jax.tree.map(lambda y: y[-1], sol.ys)
+
+
+def difference(a, b):
+    return max(largest(x - y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def off(constraint, y):
+    """Of positions and velocities, in units of roundoff of the terms that are added."""
+    q, v = y
+
+    def fn(q):
+        return constraint(0.0, q, None)
+
+    rows = jnp.abs(jax.jacobian(fn)(q)).reshape(-1, q.size)
+    rate = jax.jvp(fn, (q,), (v,))[1]
+    scales = rows @ jnp.abs(q).ravel(), rows @ jnp.abs(v).ravel() + largest(v)
+    return [largest(x / scale) / 2.2e-16 for x, scale in zip((fn(q), rate), scales, strict=True)]
+
+
+def energy(y):
+    q, v = y
+    return jnp.sum(MASSES * v**2) / 2 - jnp.sum(q * GRAVITY) + 0.15 * jnp.sum(q**2)
+
+
+@pytest.mark.parametrize("constraint", [rods, loop])
+def test_a_chain_and_a_closed_loop_stay_on_the_constraint_without_drift(constraint):
+    """20 beads; the loop has two, where the rods fix what the third condition says again."""
+    y0 = chain(20)
+    if constraint is loop:
+        y0 = jnp.array([[1.0, 0.0], [1.0, 1.0]]), jnp.array([[0.0, 0.3], [-0.3, 0.3]])
+    solver = dfc.RATTLE(dfc.Constraint(constraint), 1.0)
+    sol = solve(terms(fall), solver, y0, 0.0, 10.0, 0.01)
+    assert dfx.is_okay(sol.result)
+    position, velocity = off(constraint, final(sol))
+    assert position <= (4 if constraint is rods else 16)
+    assert velocity <= 16
+    q, v = final(sol)
+    total = jnp.sum(v**2) / 2 - jnp.sum(q * GRAVITY)
+    start = jnp.sum(y0[1] ** 2) / 2 - jnp.sum(y0[0] * GRAVITY)
+    assert abs(total - start) < 1e-3 * len(q)
+
+
+def test_backwards_undoes_forwards():
+    there = solve(TERMS, THREE, chain(3), 0.0, 5.0, 0.01)
+    back = solve(TERMS, THREE, final(there), 5.0, 0.0, -0.01)
+    assert dfx.is_okay(back.result)
+    assert difference(final(back), chain(3)) < 1e-12
+    assert abs(energy(final(there)) - energy(chain(3))) < 1e-3
+
+
+def test_second_order_against_the_equations_of_motion():
+    """Solved in another way: the tangent field at tight tolerances."""
+
+    def free(t, y, args):
+        return y[1], springs(t, y[0], args) / MASSES
+
+    lengths = dfc.Constraint(lambda t, y, args: rods(t, y[0], args))
+    field = dfc.tangent(free, lengths.derivative(free), metric=(jnp.inf, MASSES))
+    exact = final(
+        dfx.diffeqsolve(
+            dfx.ODETerm(field), dfx.Dopri8(), 0.0, 1.0, None, chain(3),
+            stepsize_controller=dfx.PIDController(rtol=1e-13, atol=1e-13), max_steps=10_000,
+        )
+    )  # fmt: skip
+    ends = [final(solve(TERMS, THREE, chain(3), 0.0, 1.0, h)) for h in (0.02, 0.01)]
+    coarse, fine = (difference(y, exact) for y in ends)
+    assert fine < 1e-3
+    assert 3.7 < coarse / fine < 4.3
+    # The multipliers, forces in the rods.
+    found = THREE.multipliers(TERMS, 0.0, exact)
+    assert difference(found, field.multipliers(0.0, exact)) < 1e-12
+
+
+def test_momenta_in_the_place_of_velocities():
+    pair = dfx.ODETerm(lambda t, p, args: p / MASSES), dfx.ODETerm(springs)
+    momenta = dfc.RATTLE(dfc.Constraint(rods), 1.0)
+    q, p = final(solve(pair, momenta, chain(3), 0.0, 2.0, 0.01))
+    assert difference((q, p / MASSES), final(solve(TERMS, THREE, chain(3), 0.0, 2.0, 0.01))) < 1e-11
+
+
+def test_a_step_is_symplectic():
+    """Of a pendulum, in the angle and its rate: the area of a small triangle stays."""
+    solver, pair = (
+        dfc.RATTLE(dfc.Constraint(lambda t, q, args: jnp.sum(q**2) - 1), 1.0),
+        terms(fall),
+    )
+
+    @jax.jit
+    def step(x):
+        angle, rate = x
+        q = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        v = rate * jnp.stack([-q[1], q[0]])
+        options = dict(max_steps=2, adjoint=dfx.ForwardMode())
+        q, v = final(dfx.diffeqsolve(pair, solver, 0.0, 0.3, 0.3, (q, v), **options))
+        return jnp.stack([jnp.arctan2(q[1], q[0]), q[0] * v[1] - q[1] * v[0]])
+
+    for x in (jnp.array([0.3, 1.0]), jnp.array([-1.0, 0.0])):
+        assert abs(jnp.linalg.det(jax.jacfwd(step)(x)) - 1) < 1e-14
+
+
+def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
+    ts = jnp.linspace(0.0, 1.0, 33)
+    ys = solve(TERMS, THREE, chain(3), 0.0, 1.0, 0.05, ts).ys
+    position, velocity = jax.vmap(lambda q, v: (
+        rods(0.0, q, None), jax.jvp(lambda q: rods(0.0, q, None), (q,), (v,))[1]
+    ))(*ys)  # fmt: skip
+    assert largest(position) < 1e-14
+    assert largest(velocity) < 1e-14
+    save = dfx.SaveAt(dense=True, steps=True)
+    dense = dfx.diffeqsolve(
+        TERMS,
+        THREE,
+        1.0,
+        0.0,
+        -0.05,
+        final(solve(TERMS, THREE, chain(3), 0.0, 1.0, 0.05)),
+        saveat=save,
+    )
+    at = jax.vmap(dense.evaluate)(dense.ts[:20])
+    assert difference(at, jax.tree.map(lambda y: y[:20], dense.ys)) < 1e-13
+    _q, v = dense.evaluate(0.52)
+    assert difference(dense.derivative(0.52)[0], v) < 0.01
+
+
+def test_derivatives_in_both_modes_against_finite_differences():
+    """Of a closed loop, whose multipliers are not unique."""
+    y0 = jnp.array([[1.0, 0.0], [1.0, 1.0]]), jnp.array([[0.0, 0.3], [-0.3, 0.3]])
+    solver = dfc.RATTLE(dfc.Constraint(loop), jnp.array([[1.0], [2.0]]))
+
+    def end(strength, adjoint):
+        pair = terms(lambda t, q, args: fall(t, q, None) - args * q)
+        options = dict(max_steps=16, adjoint=adjoint)
+        sol = dfx.diffeqsolve(pair, solver, 0.0, 0.5, 0.05, y0, strength, **options)
+        return jnp.sum(jnp.sin(ravel_pytree(final(sol))[0]) * jnp.arange(8.0))
+
+    at, e = jnp.asarray(0.3), 1e-5
+    forward = jax.jit(lambda s: jax.jvp(lambda s: end(s, dfx.ForwardMode()), (s,), (1.0,)))
+    numeric = (forward(at + e)[0] - forward(at - e)[0]) / (2 * e)
+    reverse = jax.jit(jax.grad(lambda s: end(s, dfx.RecursiveCheckpointAdjoint())))(at)
+    assert abs(reverse - numeric) < 1e-8
+    assert abs(reverse - forward(at)[1]) < 1e-11
+
+
+def test_a_lane_is_that_lane_alone_and_float32_works():
+    speeds = jnp.array([0.0, 0.5, -1.0])
+
+    def run(w):
+        return final(solve(TERMS, THREE, (chain(3)[0], w * spin()), 0.0, 1.0, 0.02))
+
+    def spin():
+        return jnp.stack([jnp.zeros(3), jnp.arange(1.0, 4.0)], axis=1)
+
+    together = jax.vmap(run)(speeds)
+    for i, w in enumerate(speeds):
+        assert difference(jax.tree.map(lambda y, i=i: y[i], together), run(w)) < 1e-13
+    y0 = jax.tree.map(lambda y: y.astype(jnp.float32), chain(3))
+    pair = terms(springs, MASSES.astype(jnp.float32))
+    sol = solve(pair, THREE, y0, *(jnp.asarray(x, jnp.float32) for x in (0.0, 1.0, 0.02)))
+    assert dfx.is_okay(sol.result)
+    assert sol.ys[0].dtype == jnp.float32
+    assert difference(final(sol), jax.tree.map(lambda y: y[0], together)) < 1e-4
+
+
+def test_a_moving_constraint_a_frozen_bead_and_a_plane():
+    """A pendulum whose pivot goes up and down; a wall; `z = 0` has no scale of its own."""
+
+    def pivot(t):
+        return jnp.array([0.0, 0.3 * jnp.sin(2 * t)])
+
+    def moving(t, q, args):
+        return jnp.sum((q - pivot(t)) ** 2) - 1
+
+    solver, pair = dfc.RATTLE(dfc.Constraint(moving), 1.0), terms(fall)
+    y0 = jnp.array([1.0, 0.0]), jnp.array([0.0, 0.6])
+    there = solve(pair, solver, y0, 0.0, 3.0, 0.01)
+    assert dfx.is_okay(there.result)
+    assert abs(moving(3.0, final(there)[0], None)) < 4e-15
+    assert difference(final(solve(pair, solver, final(there), 3.0, 0.0, -0.01)), y0) < 1e-12
+    walls = dfc.RATTLE(dfc.Constraint(rods), jnp.array([[jnp.inf], [1.0], [1.0]]))
+    still = terms(lambda t, q, args: fall(t, q, args).at[0].set(0.0))
+    q, v = final(solve(still, walls, chain(3), 0.0, 1.0, 0.01))
+    assert (q[0] == chain(3)[0][0]).all()
+    assert largest(rods(0.0, q, None)[1:]) < 4e-15
+    plane = dfc.RATTLE(dfc.Constraint(lambda t, q, args: q[1]), 1.0)
+    q, v = final(solve(pair, plane, (jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0])), 0.0, 1.0, 0.1))
+    assert difference((q, v), (jnp.array([2.0, 0.0]), jnp.array([1.0, 0.0]))) < 1e-14
+
+
+def test_failures_are_results():
+    q, v = chain(3)
+    broken = terms(lambda t, q, args: jnp.where(t > 0.5, jnp.nan, 1.0) * fall(t, q, args))
+    one = dfc.RATTLE(dfc.Constraint(rods), 1.0, max_steps=1)
+    for pair, solver, y0, h, message in (
+        (TERMS, THREE, (q + 0.1, v), 0.01, "cannot start"),
+        (TERMS, THREE, (q, v + jnp.array([1.0, 0.0])), 0.01, "cannot start"),
+        (broken, THREE, (q, v), 0.01, "not finite"), (TERMS, one, (q, v), 0.01, "not reached"),
+        (terms(fall), THREE, (q, v), 5.0, ""),
+    ):  # fmt: skip
+        sol = solve(pair, solver, y0, 0.0, 1.0 if h < 1 else 10.0, h)
+        assert not dfx.is_okay(sol.result)
+        assert message in dfx.RESULTS[sol.result]
+        assert not np.isfinite(final(sol)[0]).any()
+
+
+def test_wrong_input():
+    with pytest.raises(TypeError, match="positions"):
+        dfc.RATTLE(dfc.FirstIntegral(rods), 1.0)
+    for masses in ("one", -1.0, 0.0):
+        with pytest.raises((TypeError, ValueError), match="masses"):
+            dfc.RATTLE(dfc.Constraint(rods), masses)
+    q, v = chain(3)
+    for solver, y0, message in (
+        (dfc.RATTLE(dfc.Constraint(rods), jnp.ones((2, 1))), (q, v), "masses"),
+        (THREE, (q, v[:2]), "alike"),
+    ):  # fmt: skip
+        with pytest.raises((TypeError, ValueError), match=message):
+            dfx.diffeqsolve(terms(fall), solver, 0.0, 1.0, 0.1, y0)
+    noise = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
+    pair = TERMS[0], dfx.ControlTerm(lambda t, q, args: jnp.ones_like(q), noise)
+    with pytest.raises(ValueError, match="ODETerm"):
+        dfx.diffeqsolve(pair, THREE, 0.0, 1.0, 0.1, (q, v))

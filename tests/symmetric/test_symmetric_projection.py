@@ -1,0 +1,245 @@
+"""Symmetric projection and the implicit midpoint rule: steps back undo steps."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import INERTIA, RIGID_BODY, kepler, kepler_energy, largest, rigid_body
+
+KEPLER = {
+    "energy": dfc.FirstIntegral(kepler_energy),
+    "momentum": dfc.FirstIntegral(lambda t, y, args: y[0][0] * y[1][1] - y[0][1] * y[1][0]),
+}
+Y0 = jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])  # e = 0.6
+H = 2 * np.pi / 200
+SYMMETRIC = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), KEPLER)
+BODY = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), RIGID_BODY)
+W0 = jnp.array([1.0, 0.7, -0.4])
+
+
+@eqx.filter_jit
+def solve(field, solver, y0, t0, t1, h, args=None, ts=None):
+    save = dfx.SaveAt(t1=True, solver_state=True) if ts is None else dfx.SaveAt(ts=ts)
+    return dfx.diffeqsolve(
+        dfx.ODETerm(field), solver, t0, t1, h, y0, args, saveat=save, max_steps=None, throw=False,
+        adjoint=dfx.ForwardMode(),
+    )  # fmt: skip
+
+
+def final(sol):
+    return jax.tree.map(lambda y: y[-1], sol.ys)
+
+
+def difference(a, b):
+    return max(largest(x - y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def drift(y, y0):
+    """The largest, in units of roundoff of the terms of the energy at the perihelion, about 7."""
+    off = [entry.fn(0.0, y, None) - entry.fn(0.0, y0, None) for entry in KEPLER.values()]
+    return largest(jnp.stack(off)) / 7 / 2.2e-16
+
+
+@pytest.mark.parametrize("periods", [20, pytest.param(1000, marks=pytest.mark.slow)])
+def test_there_and_back_on_the_manifold(periods):
+    there = solve(kepler, SYMMETRIC, Y0, 0.0, periods * 200 * H, H)
+    back = solve(kepler, SYMMETRIC, final(there), periods * 200 * H, 0.0, -H)
+    assert dfx.is_okay(there.result)
+    assert dfx.is_okay(back.result)
+    assert drift(final(there), Y0) <= 4
+    assert drift(final(back), Y0) <= 4
+    assert difference(final(back), Y0) < 1e-10
+    assert dfc.statistics(there).num_iterations < 4 * periods * 200
+    # A projection at one end is not symmetric.
+    one_end = dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER)
+    there = solve(kepler, one_end, Y0, 0.0, 20 * 200 * H, H)
+    back = solve(kepler, one_end, final(there), 20 * 200 * H, 0.0, -H)
+    assert difference(final(back), Y0) > 1e-6
+
+
+def test_one_step_solves_the_equations():
+    """The step in the book, solved by another method for state and multiplier together."""
+    y0 = W0
+
+    def residual(unknowns, _):
+        y1, mu = unknowns[:3], unknowns[3:]
+
+        def fn(y):
+            return jnp.stack([e.fn(0.0, y, None) for e in RIGID_BODY.values()])
+
+        start = y0 + mu @ jax.jacobian(fn)(y0)
+        end = y1 - mu @ jax.jacobian(fn)(y1)
+        inner = end - start - 0.1 * rigid_body(0.0, (start + end) / 2, None)
+        return jnp.concatenate([inner, fn(y1) - fn(y0)])
+
+    guess = jnp.concatenate([y0, jnp.zeros(2)])
+    exact = optx.root_find(residual, optx.Newton(1e-14, 1e-14), guess, max_steps=100).value
+    assert difference(final(solve(rigid_body, BODY, y0, 0.0, 0.1, 0.1)), exact[:3]) < 1e-15
+
+
+def test_second_order_against_another_solver():
+    exact = dfx.diffeqsolve(
+        dfx.ODETerm(rigid_body), dfx.Dopri8(), 0.0, 2.0, None, W0,
+        stepsize_controller=dfx.PIDController(rtol=1e-13, atol=1e-13), max_steps=10_000,
+    ).ys[-1]  # fmt: skip
+    for solver in (dfc.ImplicitMidpoint(), BODY):
+        ends = [final(solve(rigid_body, solver, W0, 0.0, 2.0, h)) for h in (0.05, 0.025)]
+        coarse, fine = (difference(y, exact) for y in ends)
+        assert 3.7 < coarse / fine < 4.3
+
+
+def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
+    ts = jnp.linspace(0.0, 1.0, 38)
+    ys = solve(rigid_body, BODY, W0, 0.0, 1.0, 0.1, None, ts).ys
+    for entry in RIGID_BODY.values():
+        values = jax.vmap(lambda y, e=entry: e.fn(0.0, y, None))(ys)
+        assert largest(values / entry.fn(0.0, W0, None) - 1) < 4e-15
+    dense = dfx.diffeqsolve(
+        dfx.ODETerm(rigid_body), BODY, 1.0, 0.0, -0.1, W0, saveat=dfx.SaveAt(dense=True, steps=True)
+    )  # fmt: skip
+    assert difference(jax.vmap(dense.evaluate)(dense.ts[:10]), dense.ys[:10]) < 1e-14
+    assert difference(dense.evaluate(1.0), W0) < 1e-14
+    slope = dense.derivative(0.55)
+    assert difference(slope, rigid_body(0.0, dense.evaluate(0.55), None)) < 0.05
+
+
+def test_derivatives_in_both_modes_against_finite_differences():
+    def end(y0, scale):
+        def field(t, w, args):
+            return args * rigid_body(t, w, None)
+
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, scale, max_steps=8,
+        )  # fmt: skip
+        return jnp.sum(jnp.sin(sol.ys[-1]) * jnp.array([1.0, 2.0, 3.0]))
+
+    def forward(y0, scale):
+        def fn(s):
+            def field(t, w, args):
+                return args * rigid_body(t, w, None)
+
+            options = dict(max_steps=8, adjoint=dfx.ForwardMode())
+            y = dfx.diffeqsolve(dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, s, **options).ys[-1]
+            return jnp.sum(jnp.sin(y) * jnp.array([1.0, 2.0, 3.0]))
+
+        return jax.jvp(fn, (scale,), (jnp.ones(()),))[1]
+
+    one = jnp.ones(())
+    end = jax.jit(end)
+    by_y0, by_scale = jax.jit(jax.grad(end, argnums=(0, 1)))(W0, one)
+    e = 1e-6
+    numeric = [(end(W0 + d, one) - end(W0 - d, one)) / (2 * e) for d in e * jnp.eye(3)]
+    assert difference(by_y0, jnp.stack(numeric)) < 1e-8
+    assert difference(by_scale, (end(W0, one + e) - end(W0, one - e)) / (2 * e)) < 1e-8
+    assert difference(jax.jit(forward)(W0, one), by_scale) < 1e-12
+
+
+def test_a_lane_is_that_lane_alone_and_float32_works():
+    lanes = jnp.stack([W0, 2 * W0, W0[::-1]])
+
+    def run(y0):
+        return solve(rigid_body, BODY, y0, 0.0, 1.0, 0.1).ys[-1]
+
+    together = jax.vmap(run)(lanes)
+    assert all(difference(together[i], run(lanes[i])) < 1e-14 for i in range(3))
+    single = [jnp.asarray(x, jnp.float32) for x in (0.0, 1.0, 0.1)]
+    sol = solve(rigid_body, BODY, W0.astype(jnp.float32), *single)
+    assert dfx.is_okay(sol.result)
+    assert sol.ys.dtype == jnp.float32
+    assert difference(sol.ys[-1], together[0]) < 1e-5
+
+
+def test_time_dependent_constraint_and_a_repeated_one_backwards_in_time():
+    """`|y| = 1 + t / 2` along `y' = y / (2 + t)`, turned."""
+
+    def field(t, y, args):
+        return y / (2 + t) + jnp.array([-y[1], y[0]])
+
+    radius = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - (1 + t / 2) ** 2)
+    y0 = jnp.array([0.6, 0.8])
+    once, twice = (
+        dfc.SymmetricProjection(dfc.ImplicitMidpoint(), m) for m in (radius, [radius] * 2)
+    )
+    there = solve(field, once, y0, 0.0, 2.0, 0.1)
+    assert largest(radius.fn(2.0, final(there), None)) < 8e-15
+    assert difference(final(solve(field, twice, y0, 0.0, 2.0, 0.1)), final(there)) < 1e-13
+    assert difference(final(solve(field, once, final(there), 2.0, 0.0, -0.1)), y0) < 1e-13
+
+
+def test_failures_are_results():
+    off = dfc.SymmetricProjection(
+        dfc.ImplicitMidpoint(), dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+    )
+
+    def broken(t, y, args):
+        return jnp.where(t > 0.5, jnp.nan, 1.0) * rigid_body(t, y, args)
+
+    few = dfc.SymmetricProjection(dfc.ImplicitMidpoint(root_find_max_steps=1), RIGID_BODY)
+    wrong = dfc.SymmetricProjection(
+        dfc.ImplicitMidpoint(), dfc.FirstIntegral(lambda t, y, args: jnp.exp(-(y[0] ** 2) - 5 * t))
+    )
+    for field, solver, message in (
+        (rigid_body, off, "cannot start"), (broken, BODY, ""), (rigid_body, few, "steps"),
+        (rigid_body, wrong, "not reached"),
+    ):  # fmt: skip
+        sol = solve(field, solver, W0, 0.0, 1.0, 0.1)
+        assert not dfx.is_okay(sol.result), message
+        assert message in dfx.RESULTS[sol.result]
+        assert not np.isfinite(final(sol)).any()
+
+
+class Trapezoidal(dfx.AbstractESDIRK):
+    tableau = dfx.ButcherTableau(
+        c=np.array([1.0]), b_sol=np.array([0.5, 0.5]), b_error=np.array([0.5, -0.5]),
+        a_lower=(np.array([0.5]),), a_diagonal=np.array([0.0, 0.5]),
+        a_predictor=(np.array([1.0]),),
+    )  # fmt: skip
+    interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+    root_finder: optx.AbstractRootFinder = optx.Newton(rtol=1e-14, atol=1e-15)
+    root_find_max_steps: int = 20
+
+    def order(self, terms):
+        return 2
+
+
+def test_what_is_admissible():
+    for solver in (
+        dfx.Tsit5(), dfx.Euler(), dfx.Kvaerno3(), dfx.SemiImplicitEuler(), dfx.LeapfrogMidpoint(),
+        dfx.ReversibleHeun(), dfx.ImplicitEuler(), dfx.HalfSolver(dfx.Heun()), dfc.RK4(),
+        dfc.Unrolled(dfx.Tsit5()), dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="not symmetric"):
+            dfc.SymmetricProjection(solver, KEPLER)
+    with pytest.raises(TypeError, match="not a diffrax solver"):
+        dfc.SymmetricProjection(dfc.ImplicitMidpoint, KEPLER)
+    gains = dfc.FirstIntegral(lambda t, y, args: y[0], rate=lambda t, y, args: 0 * y[0])
+    with pytest.raises(ValueError, match="rate"):
+        dfc.SymmetricProjection(dfc.ImplicitMidpoint(), gains)
+    with pytest.raises(ValueError, match="tolerances"):
+        dfc.ImplicitMidpoint(root_finder=dfx.with_stepsize_controller_tols(dfx.VeryChord)())
+    with pytest.raises(TypeError, match="root_finder"):
+        dfc.ImplicitMidpoint(root_finder=1e-8)
+    trapezoidal = dfc.SymmetricProjection(Trapezoidal(), RIGID_BODY)
+    there = solve(rigid_body, trapezoidal, W0, 0.0, 2.0, 0.1)
+    assert dfx.is_okay(there.result)
+    back = solve(rigid_body, trapezoidal, final(there), 2.0, 0.0, -0.1)
+    assert difference(final(back), W0) < 1e-13
+
+
+def test_the_midpoint_rule_keeps_quadratic_integrals_in_any_units():
+    for unit in (1.0, 1e-12, 1e12):
+
+        def momentum(w):
+            return jnp.sum((jnp.asarray(INERTIA) * w) ** 2)
+
+        def slow(t, w, args, unit=unit):
+            return rigid_body(t, w / unit, args) * unit
+
+        end = final(solve(slow, dfc.ImplicitMidpoint(), W0 * unit, 0.0, 20.0, 0.1))
+        assert abs(momentum(end / unit) / momentum(W0) - 1) < 1e-13
