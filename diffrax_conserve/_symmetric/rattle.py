@@ -1,6 +1,7 @@
 """RATTLE: velocity Verlet for positions and velocities with constraints."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
@@ -20,13 +21,16 @@ from .._projection.elimination import (
     WRITTEN_OUT_MAX,
     combined,
     eliminated,
+    factored,
     gram_matrix,
     gram_solve,
-    inverse_factor,
+    times,
 )
-from .._projection.equations import ON, Equations, any_lane, length, shown_terms
-from .._projection.options import check_state, option, spread
+from .._projection.equations import ON, Equations, Jacobian, any_lane, length, shown_terms
+from .._projection.metric import spread
+from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
+from .._projection.sparse import BlockGram, SparseRows
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
@@ -41,10 +45,18 @@ _SOLVES = 2
 
 class _Linear(eqx.Module):
     """The constraints at one position: the Jacobian `G`, and the inverse of `G M⁻¹ Gᵀ`, by which
-    both the velocities there and the positions of the next step are found."""
+    both the velocities there and the positions of the next step are found; of many constraints the
+    blocks of that matrix."""
 
-    jacobian: Float[Array, "m n"]
-    inverse: Float[Array, "m m"]
+    jacobian: Jacobian
+    inverse: Float[Array, "m m"] | BlockGram
+
+    def factored(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
+        """The product with the inverse."""
+        inverse = lax.stop_gradient(self.inverse)
+        if isinstance(inverse, BlockGram):
+            return inverse.factored()
+        return lambda x: _combined(x, inverse)
 
 
 class _State(eqx.Module):
@@ -193,7 +205,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
         drift = self._drift(terms, t0, v, args)
         at, rate = self._linear(equations, t0, q, args, direction, drift, ravel(v))
         # By the Cauchy-Schwarz inequality no rate is larger than the product of these lengths.
-        lengths = jnp.linalg.norm(equations.scaled(at.jacobian), axis=1)
+        squares = jax.tree.map(jnp.square, equations.scaled(at.jacobian))
+        lengths = jnp.sqrt(_times(squares, jnp.ones_like(ravel(v))))
         limit = lengths * length(drift(ravel(v)), equations.units) + jnp.abs(rate)
         moves = rate + _times(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
@@ -269,9 +282,13 @@ class RATTLE(dfx.AbstractSolver[Any]):
         """`q'` of velocities, both as vectors."""
         return lambda p: ravel(terms[0].vf(t, unravel(p, v), args))
 
-    def _gram(self, equations: Equations, jacobian: Array, drift: Any, p: Array) -> Array:
-        """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear."""
+    def _gram(self, equations: Equations, jacobian: Jacobian, drift: Any, p: Array) -> Any:
+        """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear; with many
+        constraints it is taken as diagonal, which matters for the speed of the iteration alone."""
         forces = equations.scaled(equations.scaled(jacobian))
+        if isinstance(jacobian, SparseRows):
+            speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
+            return jacobian.gram(forces.times_columns(speeds))
         along = jax.vmap(lambda x: jax.jvp(drift, (p,), (x,))[1])(forces)
         return _gram_matrix(jacobian, along)
 
@@ -289,9 +306,11 @@ class RATTLE(dfx.AbstractSolver[Any]):
         jacobian = _once(equations.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
         t = t * direction
-        rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(jacobian.dtype)
+        rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
         gram = _once(lax.stop_gradient(self._gram(equations, jacobian, drift, p)))
-        return _Linear(jacobian, _once(_inverse(gram))), rate
+        return _Linear(
+            jacobian, gram if isinstance(gram, BlockGram) else _once(_inverse(gram))
+        ), rate
 
 
 RATTLE.__init__.__doc__ = r"""**Arguments:**
@@ -315,8 +334,7 @@ def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     sizes = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1))
     unit = gram / sizes[:, None] / sizes
     if len(gram) > WRITTEN_OUT_MAX:
-        factor = inverse_factor(unit, sizes)
-        return jnp.matmul(factor.T, factor, precision=lax.Precision.HIGHEST)
+        return jax.vmap(factored(unit, sizes))(jnp.eye(len(gram), dtype=gram.dtype))
     one = jnp.eye(len(gram), dtype=gram.dtype)
     left, right = eliminated(unit, one, one)
     return jnp.sum(right[:, :, None] * left[:, None, :], axis=0) / sizes[:, None] / sizes
@@ -326,7 +344,7 @@ def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
 _once = lax.optimization_barrier
 
 
-def _combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+def _combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
     """`rowsᵀ multiplier`. XLA is fastest in a batch of small systems if short sums are written
     out."""
     if len(rows) > WRITTEN_OUT_MAX:
@@ -334,9 +352,9 @@ def _combined(multiplier: Float[Array, " m"], rows: Float[Array, "m n"]) -> Floa
     return sum(x * row for x, row in zip(multiplier, rows, strict=True))  # pyright: ignore
 
 
-def _times(rows: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+def _times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
     if len(rows) > WRITTEN_OUT_MAX:
-        return combined(x, rows.T)
+        return times(rows, x)
     return jnp.sum(rows * x, axis=1)
 
 
@@ -352,17 +370,18 @@ def _iterated(
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
     step: an iteration evaluates the constraint and nothing else."""
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
+    scale, solve = equations.scale(at.jacobian, sizes), at.factored()
 
     def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         x, left = carry
         g = _once(equations.residual(_once(position(x))))
-        level, _ = equations.level(g, at.jacobian, sizes)
+        level, _ = equations.level(g, scale)
         # Iterations end with one more, which is cheap and leaves only roundoff. But there is none
         # where the guess is a solution, as in a shorter step of hardly any length, in which the
         # roundoff of the positions would be a large velocity.
         level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
         left = after_test(level, left, extra=1, gives_up=left > 0)
-        return jnp.where(left > 0, x - _combined(g, at.inverse), x), left
+        return jnp.where(left > 0, x - solve(g), x), left
 
     carry = guess, counter(max_steps)
     return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)
@@ -372,7 +391,7 @@ def _on_tangent(
     equations: Equations, at: _Linear, rate: Array, drift: Any, p: Array
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """Velocities that keep the constraint, and whether they do so to roundoff."""
-    inverse = lax.stop_gradient(at.inverse)
+    solve = at.factored()
 
     def moved(x: Array) -> Array:
         return p + equations.scaled(equations.scaled(_combined(x, at.jacobian)))
@@ -382,12 +401,14 @@ def _on_tangent(
 
     def iterate(x: Array) -> tuple[Array, None]:
         for _ in range(_SOLVES):
-            x = _once(x - _combined(residual(x), inverse))
+            x = _once(x - solve(residual(x)))
         return x, None
 
     x, _ = root(residual, jnp.zeros_like(rate), iterate, gram_solve)
     # Multipliers of neighbours, as in a taut chain, are large and cancel: the terms are rounded.
-    terms = equations.scaled(equations.scaled(_combined(jnp.abs(x), jnp.abs(at.jacobian))))
+    terms = equations.scaled(
+        equations.scaled(_combined(jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian)))
+    )
     sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
     limit = equations.tolerance(jnp.abs(rate) + shown_terms(at.jacobian, sizes))
     return moved(x), jnp.all(jnp.abs(residual(x)) <= limit)

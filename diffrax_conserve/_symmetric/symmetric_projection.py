@@ -1,5 +1,6 @@
 """Symmetric projection: a symmetric method stays symmetric on the manifold."""
 
+import dataclasses
 import functools as ft
 from typing import Any, NamedTuple, final
 
@@ -186,7 +187,8 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
         target = Target(
             self.projection, self.manifold, state.values, state.hidden, None, args, direction
         )
-        start, end = target.equations(t0, y0), target.equations(t1, y0)
+        dense = lambda t: dataclasses.replace(target.equations(t, y0), pattern=None)  # noqa: E731
+        start, end = dense(t0), dense(t1)
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
             # A symmetric method has no memory: what it keeps for the next step is not used.
@@ -246,7 +248,7 @@ and backwards. `TypeError` or `ValueError` if another argument does not fit.
 def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(equations.residual, y)
-    return equations.scaled(equations.scaled(vjp(multiplier)[0]))
+    return equations.moved(equations.scaled(vjp(multiplier)[0]))
 
 
 def _iterated(
@@ -261,13 +263,13 @@ def _iterated(
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 
     def tested(multiplier: Array, near: Array | None, left: Array, count: Array) -> _Iterate:
-        candidate, result = inner(y0 + start.scaled(combined(multiplier * sizes, first)))
+        candidate, result = inner(y0 + start.moved(combined(multiplier * sizes, first)))
         rows = end.scaled(end.linearise(candidate)[1]) if near is None else near
-        y = candidate + end.scaled(combined(multiplier, rows))
+        y = candidate + end.moved(combined(multiplier, rows))
         g, jacobian = end.linearise(y)
         rows = end.scaled(jacobian)
-        defect = candidate + end.scaled(combined(multiplier, rows)) - y
-        level, noise = end.level(g, jacobian, y)
+        defect = candidate + end.moved(combined(multiplier, rows)) - y
+        level, noise = end.level(g, end.scale(jacobian, y))
         off = length(defect, end.units) / length(jnp.abs(y0) + jnp.abs(y), end.units)
         solved = jnp.where(
             off <= _SOLVED * eps, SETTLED, jnp.where(off <= _NEARLY_SOLVED * eps, ON, OFF)
