@@ -34,6 +34,7 @@ from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
 from ._projection.base import Step as Step
+from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton

@@ -216,7 +216,7 @@ def _residual(
 
 def _solved(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Float[Array, " m"]:
     """The numbers of the `z` with `g = 0`, NaN if there is none."""
-    check_state((x, z), "`SemiExplicitDAE`", jnp.inexact)
+    check_state((x, z), "`SemiExplicitDAE`")
     found, wanted = eqx.filter_eval_shape(lambda: (ravel(g(t, x, z, args)), ravel(z)))
     if found.size != wanted.size:
         raise ValueError(
@@ -249,6 +249,8 @@ def _root_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def _divided(jacobian: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    if b.size == 1:
+        return b / jacobian[0]
     rows, columns = lax.stop_gradient(_sizes(jacobian))
     return jnp.linalg.solve(jacobian / rows[:, None] / columns, b / rows) / columns
 
@@ -260,7 +262,8 @@ def _sizes(jacobian: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Arr
 
 
 class _Factored(NamedTuple):
-    """The LU decomposition of a Jacobian in the units of its rows and columns."""
+    """The LU decomposition of a Jacobian in the units of its rows and columns. A single number is
+    its own: a call of LAPACK would take most of the time of a small solve."""
 
     lu: tuple[Float[Array, "m m"], Int[Array, " m"]]
     rows: Float[Array, " m"]
@@ -269,10 +272,16 @@ class _Factored(NamedTuple):
     @classmethod
     def of(cls, jacobian: Float[Array, "m m"]) -> "_Factored":
         rows, columns = _sizes(jacobian)
-        return cls(jsp.linalg.lu_factor(jacobian / rows[:, None] / columns), rows, columns)
+        scaled = jacobian / rows[:, None] / columns
+        one = scaled, jnp.zeros(1, jnp.int32)
+        return cls(one if rows.size == 1 else jsp.linalg.lu_factor(scaled), rows, columns)
 
     def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        return -jsp.linalg.lu_solve(self.lu, residual / self.rows) / self.columns
+        right = residual / self.rows
+        one = right.size == 1
+        return (
+            -(right / self.lu[0][0] if one else jsp.linalg.lu_solve(self.lu, right)) / self.columns
+        )
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
@@ -282,11 +291,9 @@ class _Factored(NamedTuple):
 
 class _Iterate(NamedTuple):
     z: Float[Array, " m"]
-    factored: _Factored
-    step: Float[Array, " m"]  # Newton's correction at `z`
     share: Float[Array, ""]  # of the correction to try next
     count: Int[Array, ""]
-    ok: Bool[Array, ""]
+    found: Bool[Array, ""]
     going: Bool[Array, ""]
 
 
@@ -295,29 +302,24 @@ def _newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Float[
     shorter, which does not depend on the units of the equations; NaN is not."""
     eps = float(jnp.finfo(z.dtype).eps)
 
-    def at(z: Array) -> tuple[_Factored, Array]:
-        factored = _Factored.of(jax.jacfwd(residual)(z))
-        return factored, factored.correction(residual(z))
-
     def body(now: _Iterate) -> _Iterate:
-        trial = now.z + now.share * now.step
-        after = now.factored.correction(residual(trial))
+        factored = _Factored.of(jax.jacfwd(residual)(now.z))
+        step = factored.correction(residual(now.z))
+        trial = now.z + now.share * step
+        after = factored.correction(residual(trial))
         size = jnp.maximum(jnp.abs(now.z), jnp.abs(trial))
         size = size + eps**0.5 * jnp.max(size, initial=0)
-        length = lambda d: jnp.max(jnp.abs(d) / jnp.where(size > 0, size, 1), initial=0)  # noqa: E731
-        before, then = length(now.step), length(after)
+        size = jnp.where(size > 0, size, 1)
+        before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         better = then <= (1 - now.share / 2) * before
-        # The corrections shrink by the same ratio again, to what is left then.
+        # The next corrections shrink at least by the same ratio, to what is left after both.
         settled = better & (now.share == 1) & (then * then <= eps * before)
-        at_roundoff = ~better & (before <= eps**0.5)
+        found = settled | (~better & (before <= eps**0.5))  # or no better because of roundoff
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
-        ok = settled | at_roundoff
-        going = ~ok & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.count < _MAX_STEPS)
-        factored, step = at(z)
-        return _Iterate(z, factored, step, share, now.count + 1, ok, going)
+        going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.count < _MAX_STEPS)
+        return _Iterate(z, share, now.count + 1, found & factored.regular(), going)
 
-    one = jnp.ones((), z.dtype)
-    start = _Iterate(z, *at(z), one, jnp.asarray(0), jnp.asarray(False), jnp.asarray(True))
-    end = lax.while_loop(lambda now: now.going, body, start)
-    return jnp.where(end.ok & end.factored.regular(), end.z, jnp.nan)
+    start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
+    end = lax.while_loop(lambda now: now.going, body, _Iterate(z, *start))
+    return jnp.where(end.found, end.z, jnp.nan)
