@@ -25,7 +25,7 @@ Algebraic = Callable[[RealScalarLike, Any, Any, Args], Values]
 
 # Newton's method ends after this many corrections: one for each thermal voltage by which the guess
 # of the voltage at a diode is too large, a few in a solve.
-_MAX_STEPS = 200
+_MAX_STEPS = 500
 # A correction is shortened to this share until it helps, at most down to the least share.
 _SHORTER, _LEAST_SHARE = 1 / 4, 1e-9
 # A pivot below this many units of roundoff for each unknown is one of roundoff.
@@ -41,8 +41,8 @@ class SemiExplicitDAE(eqx.Module):
     Wherever a solver evaluates the vector field, $z$ is first solved for by Newton's method, from
     the $z$ of the stage as a guess. So $x$ is the solution of $x' = f(t, x, Z(t, x))$ by any solver
     of diffrax, with its order and its stability, as if $Z$ were known as a formula. The guess
-    follows $z' = -g_z^{-1} (g_t + g_x f)$, by which $z$ also has an error estimate. `wrap` solves for
-    $z$ at the end of each step, at saved times, in dense output and at events too.
+    follows $z' = -g_z^{-1} (g_t + g_x f)$, by which $z$ has an error estimate too. `wrap` solves
+    for $z$ at the end of each step, at saved times, in dense output and at events.
 
     Derivatives in both modes follow from the implicit function theorem. Where $g_z$ is singular, or
     Newton's method finds no root, the vector field is NaN: a solve with fixed steps then fails, one

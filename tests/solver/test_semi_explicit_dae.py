@@ -25,7 +25,9 @@ def constant(t, z, a):
 
 @eqx.filter_jit
 def solve(dae, solver, x, guess, args, *, t1=1.0, controller=PRECISE, **options):
-    options = dict(saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 11)), max_steps=4096) | options
+    options = (
+        dict(saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype)), max_steps=4096) | options
+    )
     t1 = jnp.asarray(t1, jnp.result_type(x))
     dt0 = options.pop("dt0", None)
     return dfx.diffeqsolve(
@@ -43,7 +45,9 @@ def solve(dae, solver, x, guess, args, *, t1=1.0, controller=PRECISE, **options)
 
 
 def ends(x, a, adjoint):
-    found = solve(CUBIC, dfx.Tsit5(), x, jnp.array(1.0), a, adjoint=adjoint)
+    steps = dict(controller=dfx.ConstantStepSize(), dt0=0.01, max_steps=128)
+    saveat = dfx.SaveAt(t1=True)
+    found = solve(CUBIC, dfc.RK4(), x, x / 2, a, adjoint=adjoint, saveat=saveat, **steps)
     return jax.tree.map(lambda y: y[-1], found.ys)
 
 
@@ -64,7 +68,7 @@ def test_a_known_solution(solver):
 def test_derivatives_are_exact_in_both_modes():
     """Of the final `z` by `a` and by the initial `x`, from the constant."""
     x, a = jnp.array(2.0), jnp.array(0.7)
-    x1, z1 = ends(x, a, dfx.ForwardMode())
+    _, z1 = ends(x, a, dfx.ForwardMode())
     slope = lambda z: 3 * z + 1 / z  # noqa: E731
     by_x = slope(1.0) / 4 / slope(z1)  # `z = 1` and `dx/dz = 4` at the start
     by_a = -1 / slope(z1)
@@ -99,8 +103,8 @@ def test_an_event():
     """At `z = 1/2`, at a time known from the constant, on `g = 0`."""
     event = dfx.Event(lambda t, y, args, **_: y[1] - 0.5, optx.Newton(1e-12, 1e-12))
     x, a, saveat = jnp.array(2.0), jnp.array(0.7), dfx.SaveAt(t1=True)
-    options = dict(dt0=0.01, controller=dfx.ConstantStepSize())
-    found = solve(CUBIC, dfx.Dopri8(), x, x, a, t1=5.0, event=event, saveat=saveat, **options)
+    options = dict(dt0=0.002, controller=dfx.ConstantStepSize())
+    found = solve(CUBIC, dfc.RK4(), x, x, a, t1=5.0, event=event, saveat=saveat, **options)
     assert abs(found.ts[-1] - (constant(0, 1.0, a) - constant(0, 0.5, a)) / a) < 1e-11
     assert abs(found.ys[0][-1] - 0.625) < 4 * EPS
 
@@ -273,10 +277,10 @@ INDEX_2 = dfc.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: x - a)
 
 @pytest.mark.parametrize(
     ("dae", "x", "z"),
-    [(CIRCLE, 1.0, 0.0), (CIRCLE, 1.0, 0.3), (CIRCLE, 2.0, 1.0), (INDEX_2, 1.0, 1.0)],
-    ids=["singular", "singular, from elsewhere", "no root", "index 2"],
+    [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0), (INDEX_2, 1.0, 1.0)],
+    ids=["singular", "no root", "index 2"],
 )
-def test_a_singular_state_is_refused(dae, x, z):
+def test_a_singular_state_is_refused(dae, x, z, errors_raise):
     with pytest.raises(Exception, match=r"invertible `dg/dz`"):
         dae.consistent(jnp.array(x), jnp.array(z), args=jnp.array(1.0))
 
@@ -298,7 +302,6 @@ X = jnp.ones(2)
         (lambda: dfc.SemiExplicitDAE(lambda t, y, args: y, CUBIC.g), TypeError, "`f` of a"),
         (lambda: dfc.SemiExplicitDAE(CUBIC.f, 1.0), TypeError, "`g` of a"),
         (lambda: CUBIC.wrap(dfx.Tsit5), TypeError, "`solver` is"),
-        (lambda: CUBIC.consistent(X, jnp.ones(3)), (ValueError, TypeError), ""),
         (lambda: CUBIC.consistent(X, jnp.array(1.0)), ValueError, "returns 2 numbers, but `z` has"),
         (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
         (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
