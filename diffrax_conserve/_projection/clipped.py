@@ -25,9 +25,9 @@ def clipped(
 
     The stages of a step can lie outside of the bounds of the solution, even if its end does not:
     there a root or a logarithm is NaN. An exact solution that stays within the bounds is one of
-    this field too. Where the stages stay within, nothing changes; where one does not, the field is
-    continued constantly from the bound, and has a kink there. A method then has order two at least
-    in the steps that pass the kink, and its own order in the others.
+    this field too. If all stages stay within, nothing changes. Outside, the field is continued
+    constantly from the bound, so it has a kink there: a step across it has an error of second order
+    in its length, whatever the order of the method.
 
     The end of a step is not clipped. For that use the bounds of a projection: see [Bounds inside
     the stages][bounds-inside-the-stages].
