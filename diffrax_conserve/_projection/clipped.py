@@ -92,13 +92,9 @@ class _Clipped(eqx.Module):
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`clipped`", jnp.inexact)
         x = ravel(y)
+        lower = spread("lower", -jnp.inf if self.lower is None else self.lower, y)
+        upper = spread("upper", jnp.inf if self.upper is None else self.upper, y)
         # Not by `jnp.clip`, which has the derivative zero at a bound. NaN stays NaN.
-        if self.lower is not None:
-            lower = spread("lower", self.lower, y)
-            x = jnp.where(x < lower, lower, x)
-        if self.upper is not None:
-            upper = spread("upper", self.upper, y)
-            x = jnp.where(x > upper, upper, x)
-            if self.lower is not None:
-                x = jnp.where(lower > upper, jnp.nan, x)  # pyright: ignore[reportPossiblyUnbound]
+        x = jnp.where(x < lower, lower, jnp.where(x > upper, upper, x))
+        x = jnp.where(lower <= upper, x, jnp.nan)
         return self.vector_field(t, unravel(x, y), args)

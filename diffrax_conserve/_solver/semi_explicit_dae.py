@@ -116,7 +116,7 @@ class SemiExplicitDAE(eqx.Module):
 
         `TypeError` if `solver` is none.
         """
-        return ManifoldProjection(solver, {"g": self._constraint}, projection=_Root(self.g))
+        return ManifoldProjection(solver, {"g": self._constraint}, projection=_Root(g=self.g))
 
     def consistent(
         self, x: State, z: Any, *, t: RealScalarLike = 0.0, args: Args = None
@@ -210,7 +210,7 @@ def _pair(y: Any) -> tuple[Any, Any]:
 def _residual(
     g: Algebraic, t: RealScalarLike, x: Y, z: Float[Array, " m"], like: Any, args: Args
 ) -> Float[Array, " m"]:
-    of_pair = lambda t, y, args: g(t, *y, args)  # noqa: E731
+    of_pair = lambda t, y, args: g(t, y[0], y[1], args)  # noqa: E731
     return ravel(exactly(of_pair, t, (x, unravel(z, like)), args)).astype(z.dtype)
 
 
@@ -292,7 +292,7 @@ class _Factored(NamedTuple):
 class _Iterate(NamedTuple):
     z: Float[Array, " m"]
     share: Float[Array, ""]  # of the correction to try next
-    count: Int[Array, ""]
+    tries: Int[Array, ""]
     found: Bool[Array, ""]
     going: Bool[Array, ""]
 
@@ -317,8 +317,8 @@ def _newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Float[
         found = settled | (~better & (before <= eps**0.5))  # or no better because of roundoff
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
-        going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.count < _MAX_STEPS)
-        return _Iterate(z, share, now.count + 1, found & factored.regular(), going)
+        going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
+        return _Iterate(z, share, now.tries + 1, found & factored.regular(), going)
 
     start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
     end = lax.while_loop(lambda now: now.going, body, _Iterate(z, *start))
