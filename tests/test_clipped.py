@@ -16,7 +16,7 @@ SEEN = dfc.clipped(lambda t, y, args: (2 * y[0], y[1]), lower=(0.0, -1.0), upper
 SLOPE = jax.jit(lambda y: SEEN(0.0, y, None))
 
 
-@given(st.lists(st.floats(-3, 3), min_size=4, max_size=4))
+@given(st.lists(st.floats(-3, 3, width=16), min_size=4, max_size=4))
 def test_the_field_sees_the_nearest_admissible_state(numbers):
     a, b = np.array(numbers[:2]), np.array(numbers[2:])
     found = SLOPE((jnp.asarray(a), jnp.asarray(b)))
