@@ -116,7 +116,8 @@ class SemiExplicitDAE(eqx.Module):
 
         `TypeError` if `solver` is none.
         """
-        return ManifoldProjection(solver, {"g": self._constraint}, projection=_Root(g=self.g))
+        constraint = Constraint(_OfPair(self.g))
+        return ManifoldProjection(solver, {"g": constraint}, projection=_Root(g=self.g))
 
     def consistent(
         self, x: State, z: Any, *, t: RealScalarLike = 0.0, args: Args = None
@@ -152,10 +153,6 @@ class SemiExplicitDAE(eqx.Module):
         )
         return x, unravel(root, z)
 
-    @property
-    def _constraint(self) -> Constraint:
-        return Constraint(lambda t, y, args: self.g(t, *_pair(y), args))
-
     def _vector_field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
         x, guess = jtu.tree_map(jnp.asarray, _pair(y))
         t = jnp.asarray(t, jnp.result_type(float, t))
@@ -179,6 +176,17 @@ SemiExplicitDAE.__init__.__doc__ = r"""**Arguments:**
 `TypeError` if one cannot be called so. In a solve, before compilation, `ValueError` if the state is
 no pair, or if the numbers of equations and unknowns differ.
 """
+
+
+@final
+class _OfPair(eqx.Module):
+    """`g` as a function of the state. Not a closure, with which every `wrap` would compile anew."""
+
+    g: Algebraic
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        x, z = _pair(y)
+        return self.g(t, x, z, args)
 
 
 @final
@@ -210,8 +218,7 @@ def _pair(y: Any) -> tuple[Any, Any]:
 def _residual(
     g: Algebraic, t: RealScalarLike, x: Y, z: Float[Array, " m"], like: Any, args: Args
 ) -> Float[Array, " m"]:
-    of_pair = lambda t, y, args: g(t, y[0], y[1], args)  # noqa: E731
-    return ravel(exactly(of_pair, t, (x, unravel(z, like)), args)).astype(z.dtype)
+    return ravel(exactly(_OfPair(g), t, (x, unravel(z, like)), args)).astype(z.dtype)
 
 
 def _solved(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Float[Array, " m"]:
