@@ -143,15 +143,7 @@ class SemiExplicitDAE(eqx.Module):
         error if Newton's method finds no root, or if $g_z$ is singular there.
         """
         x, z = jtu.tree_map(jnp.asarray, (x, z))
-        root = _solved(self.g, t, x, z, args)
-        root = eqx.error_if(
-            root,
-            ~jnp.all(jnp.isfinite(root)),
-            "`consistent` found no `z` with `g(t, x, z, args) = 0` and an invertible `dg/dz`. "
-            "Give a better guess `z`. If `dg/dz` is singular at every state, the index is not 1: "
-            "for index 2 or 3 use `Constraint` and `tangent`.",
-        )
-        return x, unravel(root, z)
+        return x, unravel(_consistent(self.g, t, x, z, args), z)
 
     def _vector_field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
         x, guess = jtu.tree_map(jnp.asarray, _pair(y))
@@ -236,6 +228,18 @@ def _solved(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Float[
     # Arrays over which `g` closes become leaves, and can be differentiated.
     fn = eqx.filter_closure_convert(fn, t, x, ravel(z), args)
     return _root(fn, t, x, ravel(z), args)
+
+
+@eqx.filter_jit
+def _consistent(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Float[Array, " m"]:
+    root = _solved(g, t, x, z, args)
+    return eqx.error_if(
+        root,
+        ~jnp.all(jnp.isfinite(root)),
+        "`consistent` found no `z` with `g(t, x, z, args) = 0` and an invertible `dg/dz`. "
+        "Give a better guess `z`. If `dg/dz` is singular at every state, the index is not 1: "
+        "for index 2 or 3 use `Constraint` and `tangent`.",
+    )
 
 
 @eqx.filter_custom_jvp
