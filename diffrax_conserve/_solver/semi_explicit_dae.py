@@ -143,6 +143,7 @@ class SemiExplicitDAE(eqx.Module):
         error if Newton's method finds no root, or if $g_z$ is singular there.
         """
         x, z = jtu.tree_map(jnp.asarray, (x, z))
+        t = jnp.asarray(t, jnp.result_type(float, t))  # not a constant of what is compiled
         return x, unravel(_consistent(self.g, t, x, z, args), z)
 
     def _vector_field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
