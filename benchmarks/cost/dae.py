@@ -184,8 +184,13 @@ def ours(term, solver, start, times, args, controller, dt0=None):
     run()
     done = measuring.take_turns({"": run}, rounds=3)[""]
     found, steps = done.answer
-    columns = [np.column_stack([np.asarray(y) for y in jax.tree.leaves(ys)]) for ys in found]
+    columns = [_columns(ys) for ys in found]
     return np.concatenate(columns), int(steps), done.seconds
+
+
+def _columns(ys):
+    """The numbers of the states, a row for each time."""
+    return np.concatenate([np.reshape(y, (len(y), -1)) for y in jax.tree.leaves(ys)], axis=1)
 
 
 def dae_field(dae, n, args):
@@ -325,7 +330,7 @@ def falling(t, y, args):
 
 
 def rod(q):
-    return jnp.sum(q**2) - 1
+    return jnp.sum(q**2, keepdims=True) - 1
 
 
 def four_bars(q):
@@ -428,11 +433,28 @@ class Mechanism(eqx.Module):
                 k: jnp.max(jnp.where(done.reshape(-1, *[1] * (x.ndim - 1)), jnp.abs(x), 0))
                 for k, x in off.items()
             }
-            return worst, jnp.max(jnp.where(done, solution.ts, 0)), jnp.sum(done)
 
-        worst, t, count = run((self.q, self.v))
+            def terms(y):
+                """The sizes of what is added up, `sum |y_k dg/dy_k|`."""
+                found = {}
+                for k, entry in self.manifold.items():
+                    slopes = jax.tree.leaves(jax.jacfwd(lambda y, e=entry: e.fn(0, y, None))(y))
+                    parts = zip(slopes, y, strict=True)
+                    sizes = [
+                        jnp.abs(s * x).reshape(*s.shape[: s.ndim - x.ndim], -1) for s, x in parts
+                    ]
+                    found[k] = jnp.max(sum(jnp.sum(size, axis=-1) for size in sizes))
+                return found
+
+            size = jax.tree.map(
+                lambda x: jnp.max(jnp.where(done, x, 0)), jax.vmap(terms)(solution.ys)
+            )
+            return worst, size, jnp.max(jnp.where(done, solution.ts, 0)), jnp.sum(done)
+
+        worst, size, t, count = run((self.q, self.v))
         units = {k: float(x) / measuring.EPS for k, x in worst.items()}
-        return dict(in_eps=units, t=float(t), accepted=int(count))
+        relative = {k: x / float(size[k]) for k, x in units.items()}
+        return dict(in_eps=units, of_terms=relative, t=float(t), accepted=int(count))
 
 
 PENDULUM = Mechanism(rod, jnp.array([1.0, 0.0]), jnp.zeros(2))
