@@ -123,7 +123,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := core forms overhead gradients work_precision scaling balance learned_solvers sweeps \
+COSTS := core forms overhead gradients work_precision scaling balance dae learned_solvers sweeps \
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
   defaults hard_cases

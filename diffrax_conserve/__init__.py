@@ -39,6 +39,7 @@ from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
 from ._projection.base import Step as Step
+from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
@@ -50,6 +51,7 @@ from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
 from ._solver.rk4 import RK4 as RK4
+from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled

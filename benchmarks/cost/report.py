@@ -247,7 +247,7 @@ def many_table(results: Results) -> list[str]:
     for row in results["many_constraints"]["rows"]:
         plain, projected = (row[f"{kind} s/step"] for kind in ("plain", "projected"))
         memory = [f"{row[f'{kind} memory/state']:.0f}" for kind in ("plain", "projected")]
-        cells = [row["problem"], f"{1e3 * plain:.2g}", f"{projected / plain:.1f}", *memory]
+        cells = [row["problem"], f"{1e3 * plain:.3g}", f"{projected / plain:.1f}", *memory]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

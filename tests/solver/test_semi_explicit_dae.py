@@ -1,0 +1,312 @@
+"""Index-1 equations: solutions that are known, another form of the same equations, and IDA."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import largest
+
+EPS = np.finfo(np.float64).eps
+
+# `x = z³ + z` and `x' = -a z`: so `3/2 z² + log z + a t` is constant.
+CUBIC = dfc.SemiExplicitDAE(lambda t, x, z, a: -a * z, lambda t, x, z, a: z**3 + z - x)
+PRECISE = dfx.PIDController(rtol=1e-11, atol=1e-11)
+
+
+def constant(t, z, a):
+    return 1.5 * z**2 + jnp.log(z) + a * t
+
+
+@eqx.filter_jit
+def solve(dae, solver, x, guess, args, *, t1=1.0, controller=PRECISE, **options):
+    options = (
+        dict(saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype)), max_steps=4096) | options
+    )
+    t1 = jnp.asarray(t1, jnp.result_type(x))
+    dt0 = options.pop("dt0", None)
+    return dfx.diffeqsolve(
+        dae.term,
+        dae.wrap(solver),
+        0,
+        t1,
+        dt0,
+        dae.consistent(x, guess, args=args),
+        args,
+        stepsize_controller=controller,
+        throw=False,
+        **options,
+    )
+
+
+def ends(x, a, adjoint):
+    steps = dict(controller=dfx.ConstantStepSize(), dt0=0.01, max_steps=128)
+    saveat = dfx.SaveAt(t1=True)
+    found = solve(CUBIC, dfc.RK4(), x, x / 2, a, adjoint=adjoint, saveat=saveat, **steps)
+    return jax.tree.map(lambda y: y[-1], found.ys)
+
+
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Kvaerno5()], ids=lambda s: type(s).__name__)
+def test_a_known_solution(solver):
+    """At saved times too, where Kvaerno5 has a dense output of order 3."""
+    a, start = jnp.array(0.7), jnp.array(2.0)
+    every = dfx.SaveAt(t0=True, steps=True)
+    found = solve(CUBIC, solver, start, jnp.array(1.0), a, saveat=every)
+    x, z = (y[jnp.isfinite(found.ts)] for y in found.ys)
+    ts = found.ts[jnp.isfinite(found.ts)]
+    assert found.result == dfx.RESULTS.successful
+    assert largest(constant(ts, z, a) - constant(0, z[0], a)) < 1e-9
+    x, z = solve(CUBIC, solver, start, jnp.array(1.0), a).ys
+    assert largest((z**3 + z - x) / x) < 4 * EPS
+
+
+def test_derivatives_are_exact_in_both_modes():
+    """Of the final `z` by `a` and by the initial `x`, from the constant."""
+    x, a = jnp.array(2.0), jnp.array(0.7)
+    _, z1 = ends(x, a, dfx.ForwardMode())
+    slope = lambda z: 3 * z + 1 / z  # noqa: E731
+    by_x = slope(1.0) / 4 / slope(z1)  # `z = 1` and `dx/dz = 4` at the start
+    by_a = -1 / slope(z1)
+    modes = ((jax.jacfwd, dfx.ForwardMode()), (jax.jacrev, dfx.RecursiveCheckpointAdjoint()))
+    for mode, adjoint in modes:
+        found = mode(lambda *p, adjoint=adjoint: ends(*p, adjoint), argnums=(0, 1))(x, a)
+        assert np.allclose(found[1], (by_x, by_a), rtol=1e-8)
+        factor = 3 * z1**2 + 1
+        assert np.allclose(found[0], (by_x * factor, by_a * factor), rtol=1e-8)
+
+
+def test_a_derivative_of_the_consistent_state():
+    """The second one too, by what `g` closes over: `z³ + z = c`."""
+
+    def root(c):
+        dae = dfc.SemiExplicitDAE(lambda *_: 0.0, lambda t, x, z, args: z**3 + z - c)
+        return dae.consistent(jnp.array(0.0), jnp.array(0.1))[1]
+
+    z, first, second = (f(2.0) for f in (root, jax.grad(root), jax.jacfwd(jax.grad(root))))
+    assert np.allclose((z, first, second), (1, 1 / 4, -6 / 4**3), rtol=1e-14)
+
+
+def test_one_lane_equals_that_lane_alone():
+    x, a = jnp.linspace(0.5, 3, 5), jnp.linspace(0.2, 1, 5)
+    both = lambda x, a: ends(x, a, dfx.ForwardMode())  # noqa: E731
+    for k in (0, 4):
+        lane = jax.tree.map(lambda y: y[k], jax.vmap(both)(x, a))  # noqa: B023
+        assert largest(jax.tree.map(jnp.subtract, lane, both(x[k], a[k]))) < 4 * EPS
+
+
+def test_an_event():
+    """At `z = 1/2`, at a time known from the constant, on `g = 0`."""
+    event = dfx.Event(lambda t, y, args, **_: y[1] - 0.5, optx.Newton(1e-12, 1e-12))
+    x, a, saveat = jnp.array(2.0), jnp.array(0.7), dfx.SaveAt(t1=True)
+    options = dict(dt0=0.002, controller=dfx.ConstantStepSize())
+    found = solve(CUBIC, dfc.RK4(), x, x, a, t1=5.0, event=event, saveat=saveat, **options)
+    assert abs(found.ts[-1] - (constant(0, 1.0, a) - constant(0, 0.5, a)) / a) < 1e-11
+    assert abs(found.ys[0][-1] - 0.625) < 4 * EPS
+
+
+def test_float32():
+    x, a = jnp.float32(2), jnp.float32(0.7)
+    controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+    found = solve(CUBIC, dfx.Tsit5(), x, jnp.float32(1), a, controller=controller)
+    (x, z), ts = found.ys, found.ts
+    assert z.dtype == jnp.float32
+    assert largest((z**3 + z - x) / x) < 4 * np.finfo(np.float32).eps
+    assert largest(constant(ts, z, a) - constant(0, 1.0, a)) < 1e-5
+
+
+# ---- Robertson ----
+
+# By IDA of SUNDIALS at `rtol=1e-12`, `atol=1e-16` (`benchmarks/cost/dae.py`).
+ROBERTSON = {
+    0.4: (0.985172113861, 3.38639537897e-05, 0.0147940221852),
+    40: (0.715827068724, 9.18553476473e-06, 0.284163745741),
+    4000: (0.18320225778, 8.942371253e-07, 0.816796847982),
+    400000: (0.00493827452118, 1.98499408801e-08, 0.995061705629),
+    4e07: (5.20307184469e-05, 2.08133573212e-10, 0.999947969073),
+    4e09: (5.20827661748e-07, 2.08331171902e-12, 0.99999947917),
+    1e11: (2.08334023727e-08, 8.33336112063e-14, 0.999999979167),
+}
+
+
+def robertson(t, x, z, args):
+    a, b = x
+    return jnp.stack([-0.04 * a + 1e4 * b * z, 0.04 * a - 1e4 * b * z - 3e7 * b**2])
+
+
+def test_robertson_agrees_with_ida():
+    dae = dfc.SemiExplicitDAE(robertson, lambda t, x, z, args: jnp.sum(x) + z - 1)
+    ts = jnp.array([0.0, *ROBERTSON])
+    solver = dfx.Kvaerno5(root_finder=optx.Chord(rtol=1e-9, atol=1e-17))
+    controller = dfx.PIDController(rtol=1e-8, atol=1e-16)
+    found = solve(
+        dae,
+        solver,
+        jnp.array([1.0, 0.0]),
+        jnp.array(0.0),
+        None,
+        t1=1e11,
+        dt0=1e-6,
+        saveat=dfx.SaveAt(ts=ts),
+        controller=dfx.ClipStepSizeController(controller, step_ts=ts),
+    )
+    ys = np.column_stack(found.ys)[1:]
+    assert largest(ys / np.array([*ROBERTSON.values()]) - 1) < 1e-6
+    assert largest(np.sum(ys, axis=1) - 1) < 2 * EPS
+
+
+# ---- A power system, whose network changes twice ----
+
+EMF, REACTANCE = np.array([1.05, 1.1]), np.array([0.2, 0.3])
+INERTIA, INPUT, DAMPING = np.array([0.05, 0.03]), np.array([0.8, 0.6]), 0.02
+
+
+def network(lines, fault=0.0):
+    """The admittances between two machines and a load, which a line joins to a rigid bus."""
+    matrix = np.diag([1 / 0.2j, 1 / 0.3j + fault, 1 / 0.25j + 0.9 - 0.3j])
+    for a, b, reactance in lines:
+        ends = np.ix_([a, b], [a, b])
+        matrix[ends] += np.array([[1, -1], [-1, 1]]) / (1j * reactance)
+    return matrix
+
+
+LINES = [(0, 2, 0.3), (1, 2, 0.4), (0, 1, 0.5)]
+NETWORKS = jnp.stack([network(LINES), network(LINES, -50j), network(LINES[:2])])
+TIMES = jnp.array([[0.0, 0.1], [0.1, 0.25], [0.25, 3.0]])
+
+
+def machines(t, x, v, matrix):
+    angle, speed = x
+    emf = EMF * jnp.exp(1j * angle)
+    power = jnp.real(emf * jnp.conj((emf - v[:2]) / (1j * REACTANCE)))
+    return speed, (INPUT - power - DAMPING * speed) / INERTIA
+
+
+def currents(angle):
+    return jnp.append(EMF * jnp.exp(1j * angle) / (1j * REACTANCE), 1 / 0.25j)
+
+
+def balance(t, x, z, matrix):
+    off = matrix @ jax.lax.complex(*z) - currents(x[0])
+    return off.real, off.imag
+
+
+SWING = dfc.SemiExplicitDAE(
+    lambda t, x, z, args: machines(t, x, jax.lax.complex(*z), args), balance
+)
+REDUCED = dfx.ODETerm(
+    lambda t, x, args: machines(t, x, jnp.linalg.solve(args, currents(x[0])), args)
+)
+SWING0 = (jnp.array([0.57, 0.58]), jnp.zeros(2))
+FLAT = (jnp.ones(3), jnp.zeros(3))
+
+
+def through(solver, term, start, controller, x):
+    """The states at the ends of the three phases, and the steps."""
+
+    @eqx.filter_jit
+    def run(y):
+        def phase(y, given):
+            (t0, t1), matrix = given
+            found = dfx.diffeqsolve(
+                term, solver, t0, t1, None, start(y, matrix), matrix, stepsize_controller=controller
+            )
+            y = jax.tree.map(lambda y: y[-1], found.ys)
+            return y, (y, found.stats["num_steps"])
+
+        return jax.lax.scan(phase, y, (TIMES, NETWORKS))[1]
+
+    return run(x)
+
+
+def test_a_fault_of_a_power_system():
+    """The same equations with the voltages eliminated, `x` alone deciding the steps of both."""
+    of_x = dfx.PIDController(rtol=1e-7, atol=1e-7, norm=lambda e: optx.rms_norm(e[0]))
+    consistent = lambda y, matrix: SWING.consistent(*y, args=matrix)  # noqa: E731
+    (x, z), steps = through(SWING.wrap(dfx.Tsit5()), SWING.term, consistent, of_x, (SWING0, FLAT))
+    plain = lambda x, matrix: x  # noqa: E731
+    controllers = [dfx.PIDController(rtol=tol, atol=tol) for tol in (1e-7, 1e-13)]
+    (known, same), (exact, _) = (
+        through(solver, REDUCED, plain, controller, SWING0)
+        for solver, controller in zip((dfx.Tsit5(), dfx.Dopri8()), controllers, strict=True)
+    )
+    assert np.array_equal(steps, same)
+    errors = [largest(jax.tree.map(jnp.subtract, y, exact)) for y in (x, known)]
+    assert errors[0] <= (1 + 1e-6) * errors[1]
+    off = jax.vmap(lambda x, z, args: balance(0, x, z, args))(x, z, NETWORKS)
+    assert largest(off) / largest(NETWORKS) < 4 * EPS
+
+
+# ---- Poor guesses, and failures ----
+
+DIODE = dfc.SemiExplicitDAE(
+    lambda t, x, z, args: 0 * x, lambda t, x, z, args: x - z - 1e-6 * jnp.expm1(z / 0.025)
+)
+
+
+def test_newton_finds_the_voltage_at_a_diode():
+    """From guesses at which the current is 1e80 A, or at which it is the least current."""
+    x, guess = jnp.meshgrid(jnp.linspace(-5, 5, 9), jnp.linspace(-5, 5, 11))
+    x, z = jax.vmap(DIODE.consistent)(x.ravel(), guess.ravel())
+    off = DIODE.g(0, x, z, None)
+    scale = jnp.abs(x) + jnp.abs(z) + 1e-6 * jnp.exp(z / 0.025) * jnp.abs(z) / 0.025
+    assert largest(off / (scale + 1e-6)) < 4 * EPS
+
+
+def test_units_change_nothing():
+    """Equations and unknowns in other units: `A z + z³ = b`, with `A` not diagonally dominant."""
+    key = jax.random.key(1)
+    matrix, b = jax.random.normal(key, (4, 4)), jnp.arange(1.0, 5.0)
+    rows, columns = 2.0 ** jnp.array([30, 0, -30, 7]), 2.0 ** jnp.array([-40, 20, 0, 5])
+
+    def root(rows, columns):
+        g = lambda t, x, z, args: rows * (matrix @ (z * columns) + (z * columns) ** 3 - b)  # noqa: E731
+        dae = dfc.SemiExplicitDAE(lambda *_: 0.0, g)
+        return dae.consistent(jnp.array(0.0), 0.1 * jnp.ones(4) / columns)[1] * columns
+
+    assert np.allclose(root(rows, columns), root(jnp.ones(4), jnp.ones(4)), rtol=1e-13)
+
+
+CIRCLE = dfc.SemiExplicitDAE(lambda t, x, z, a: a, lambda t, x, z, a: x**2 + z**2 - 1)
+INDEX_2 = dfc.SemiExplicitDAE(lambda t, x, z, a: z, lambda t, x, z, a: x - a)
+
+
+@pytest.mark.parametrize(
+    ("dae", "x", "z"),
+    [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0), (INDEX_2, 1.0, 1.0)],
+    ids=["singular", "no root", "index 2"],
+)
+def test_a_singular_state_is_refused(dae, x, z, errors_raise):
+    with pytest.raises(Exception, match=r"invertible `dg/dz`"):
+        dae.consistent(jnp.array(x), jnp.array(z), args=jnp.array(1.0))
+
+
+@pytest.mark.parametrize("controller", [PRECISE, dfx.ConstantStepSize()])
+def test_a_solve_into_a_singular_state_fails(controller):
+    """On a circle `z` ends at `x = 1`, which is reached at `t = 1`."""
+    start = jnp.array(0.0), jnp.array(1.0), jnp.array(1.0)
+    found = solve(CIRCLE, dfx.Tsit5(), *start, t1=2.0, controller=controller, dt0=0.01)
+    assert found.result != dfx.RESULTS.successful
+
+
+X = jnp.ones(2)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda: dfc.SemiExplicitDAE(lambda t, y, args: y, CUBIC.g), TypeError, "`f` of a"),
+        (lambda: dfc.SemiExplicitDAE(CUBIC.f, 1.0), TypeError, "`g` of a"),
+        (lambda: CUBIC.wrap(dfx.Tsit5), TypeError, "`solver` is"),
+        (lambda: CUBIC.consistent(X, jnp.array(1.0)), ValueError, "returns 2 numbers, but `z` has"),
+        (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
+        (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
+    ],
+)
+def test_mistakes_are_named(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
