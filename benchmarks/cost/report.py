@@ -16,7 +16,11 @@ import measuring
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [DOCS / "performance.md", DOCS / "many-constraints.md", measuring.RESULTS.parent / "README.md"]
+PAGES = [
+    DOCS / "performance.md",
+    DOCS / "many-constraints.md",
+    measuring.RESULTS.parent / "README.md",
+]
 UNROLLED = ", unrolled"
 NAMES = ("overhead", "gradients", "work_precision", "scaling", "many_constraints")
 
