@@ -30,7 +30,7 @@ from .elimination import (
     gram_solve,
     scaled_rows,
 )
-from .equations import NOT_FINITE, ON, SETTLED, Equations, any_lane
+from .equations import NOT_FINITE, ON, SETTLED, Equations, Jacobian, any_lane
 from .scalars import components, in_scalars, joined
 from .sparse import SparseRows
 
@@ -200,7 +200,7 @@ def _of_many(
 
 
 def corrected(
-    equations: Equations, y: Array, g: Array, noise: Array, rows: Array, along: Array
+    equations: Equations, y: Array, g: Array, noise: Array, rows: Jacobian, along: Jacobian
 ) -> Array:
     """`y - s Vᵀ (U Vᵀ)⁻¹ g` for the rows `U`, which are scaled as the residuals `g` and their noise
     are, and the directions `V`."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .chord import Solved, after_test, corrected, counter
 from .elimination import scaled_rows
-from .equations import Equations, any_lane, relative
+from .equations import Equations, Jacobian, any_lane, relative
 
 _SHORTER = 1 / 4
 
@@ -30,7 +30,7 @@ class _Best(NamedTuple):
 def descend(
     equations: Equations,
     start: Float[Array, " n"],
-    directions: Float[Array, "m n"] | None = None,
+    directions: Jacobian | None = None,
     *,
     max_steps: int,
     extra: int = 0,

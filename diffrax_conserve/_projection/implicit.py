@@ -40,7 +40,7 @@ _CROSSING = 0.1
 def project_along(
     equations: Equations,
     candidate: Float[Array, " n"],
-    directions: Float[Array, "m n"] | None,
+    directions: Jacobian | None,
     *,
     max_steps: int,
     solve: Callable[..., Solved] = chord,
@@ -66,7 +66,7 @@ def _project_along_jvp(primals: Any, tangents: Any, **options: Any) -> Any:
     along = times(rows, in_units(y - candidate, equations.units))
     multiplier = gram_solve(gram_matrix(rows, rows), along) / sizes
 
-    def displaced(equations: Equations, candidate: Array, directions: Array | None) -> Any:
+    def displaced(equations: Equations, candidate: Array, directions: Any) -> Any:
         if directions is not None:
             moved = combined(multiplier, directions)
         else:  # by one reverse pass, not row by row
@@ -93,7 +93,7 @@ def certain(
     candidate: Array,
     y: Array,
     jacobian: Jacobian,
-    directions: Array | None = None,
+    directions: Jacobian | None = None,
 ) -> Float[Array, ""]:
     """One if the derivative of the projected state `y` is well determined, otherwise NaN: where
     gradients are nearly parallel, multipliers are large and cancel, so that roundoff dominates

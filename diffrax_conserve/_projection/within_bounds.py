@@ -23,7 +23,7 @@ from .._printing import is_traced
 from .base import AbstractProjection, has_bounds
 from .chord import Solved, after_test, counter
 from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
-from .equations import Equations, any_lane
+from .equations import Equations, Jacobian, any_lane
 from .implicit import project_along
 from .metric import positive_weights, spread
 from .options import check_options, option
@@ -77,7 +77,7 @@ def project_within(
 def _semismooth(
     equations: Equations,
     candidate: Float[Array, " n"],
-    directions: Float[Array, "m n"],
+    directions: Jacobian,
     *,
     max_steps: int,
 ) -> Solved:

@@ -18,7 +18,7 @@ from .._interpolation import PackedTarget
 from .._manifold import check_manifold, conserved_values, named_entries, rate_of
 from .._projection.base import Target
 from .._projection.chord import after_test, counter
-from .._projection.elimination import combined, gram_matrix, gram_solve, scaled_rows
+from .._projection.elimination import combined, gram_matrix, gram_solve, scaled_rows, times
 from .._projection.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, any_lane, length
 from .._projection.implicit import certain
 from .._projection.options import check_state
@@ -280,7 +280,7 @@ def _iterated(
         failed = result != dfx.RESULTS.successful
         level = jnp.where(failed, NOT_FINITE, jnp.minimum(level, solved))
         left = jnp.where(failed, -1, after_test(level, left, extra=1, gives_up=left > 0))
-        wrong = g + combined(defect, jacobian.T)
+        wrong = g + times(jacobian, defect)
         return _Iterate(y, multiplier, candidate, wrong, noise, rows, left, count, result)
 
     def body(last: _Iterate) -> _Iterate:

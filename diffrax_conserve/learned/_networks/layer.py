@@ -14,7 +14,7 @@ from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._options import check_counts
 from ..._projection.descent import descend
-from ..._projection.elimination import combined, gram_matrix, gram_solve
+from ..._projection.elimination import gram_matrix, gram_solve, times
 from ..._projection.equations import Equations, equations_of
 from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
 from .iterations import iterated
@@ -124,7 +124,7 @@ def _projected(
     del start
     _, rows = equations.linearise(candidate)
     y, ok, _ = descend(equations, candidate, rows, max_steps=_MAX_STEPS)
-    multipliers = gram_solve(gram_matrix(rows, rows), combined(y - candidate, rows.T))
+    multipliers = gram_solve(gram_matrix(rows, rows), times(rows, y - candidate))
     ok = ok & jnp.all(jnp.isfinite(multipliers))
     return jnp.where(ok, y, candidate), jnp.where(ok, multipliers, 0), ok
 
