@@ -226,7 +226,7 @@ def equations_of(
 class _Known:
     """An array that is not a leaf of arrays, so that no transformation makes it a tracer."""
 
-    def __init__(self, value: Array):
+    def __init__(self, value: Any):
         self.value = value
 
 

@@ -154,7 +154,7 @@ def _broadcast(x: _Places, shape: Sequence[int], broadcast_dimensions: Sequence[
     return np.broadcast_to(x.reshape(expanded), shape)
 
 
-def _pad(x: _Places, value: _Places, padding_config: Sequence[tuple[int, int, int]]) -> _Places:
+def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     out_shape, inside, kept = [], [], []
     for n, (low, high, interior) in zip(x.shape, padding_config, strict=True):
         first, last = max(low, 0), max(low, 0) + n + max(n - 1, 0) * interior
