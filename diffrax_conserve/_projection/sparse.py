@@ -17,7 +17,7 @@ when a solve is traced, and everything that depends on it is an array of integer
 
 import functools as ft
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -26,6 +26,7 @@ import jax.core
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
@@ -157,7 +158,7 @@ def pattern_of(
         )
         return None
     traced = [jax.make_jaxpr(part)(y) for part in parts]
-    keys = tuple((str(x.jaxpr), *map(_content, x.consts)) for x in traced)
+    keys = tuple((str(x.jaxpr), *map(_content, _constants(x))) for x in traced)
     if keys not in _KNOWN:
         with jax.ensure_compile_time_eval():
             found = [(size, _entries(x, y)) for size, x in zip(sizes, traced, strict=True)]
@@ -187,6 +188,16 @@ def _asdex() -> Any:
     return asdex
 
 
+def _constants(closed: Any) -> Iterator[Any]:
+    """The arrays over which a jaxpr and those inside it close, which their text does not show."""
+    yield from closed.consts
+    for eqn in closed.jaxpr.eqns:
+        yield from (x.val for x in eqn.invars if isinstance(x, jex.Literal) and np.ndim(x.val))
+        is_leaf = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731
+        for x in filter(is_leaf, jtu.tree_leaves(eqn.params, is_leaf=is_leaf)):
+            yield from _constants(x if isinstance(x, jex.ClosedJaxpr) else jex.ClosedJaxpr(x, ()))
+
+
 def _content(x: Any) -> Any:
     """A key for a constant of a function; the value of a tracer is not known."""
     if isinstance(x, jax.core.Tracer):
@@ -212,7 +223,7 @@ def _entries(closed: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
 def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
     counts = np.concatenate([np.bincount(r, minlength=size) for size, (r, _) in found])
     dense = counts > _DENSE_ROW * max(1, np.median(counts))
-    if np.sum(dense) > _DENSE_ROWS_MAX or 4 * np.sum(counts[~dense]) > np.prod(shape):
+    if np.sum(dense) > _DENSE_ROWS_MAX or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
         return None
     return Pattern(shape, found, dense)
 

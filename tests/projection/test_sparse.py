@@ -133,6 +133,23 @@ def test_many_dependent_constraints():
     assert jnp.max(jnp.abs(end - once)) < 1e-13
 
 
+def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
+    """The text of both is the same."""
+
+    def bonds(order: np.ndarray) -> dfc.Constraint:
+        chosen = jax.jit(lambda y: y[order])
+        return dfc.Constraint(lambda t, y, args: chosen(y) * jnp.roll(chosen(y), 1) - 0.5)
+
+    for seed in range(2):
+        order = np.random.default_rng(seed).permutation(NUM)
+        equations = equations_of(bonds(order), jnp.zeros(NUM), 0.0, jnp.ones(NUM), None)
+        dense = dataclasses.replace(equations, pattern=None)
+        x, y = jnp.arange(NUM) * 1.0, jnp.linspace(1, 2, NUM)
+        found, expected = (times(e.linearise(y)[1], x) for e in (equations, dense))
+        assert equations.pattern is not None
+        np.testing.assert_allclose(found, expected)
+
+
 def test_what_is_not_sparse_is_told(monkeypatch: pytest.MonkeyPatch):
     """Indices that are not known when the solve is traced could be any."""
     monkeypatch.setattr(sparse, "_LARGE", 0)
