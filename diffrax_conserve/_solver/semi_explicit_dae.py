@@ -245,7 +245,7 @@ def _consistent(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Fl
 
 @eqx.filter_custom_jvp
 def _root(fn: Any, t: Array, x: Y, z: Float[Array, " m"], args: Args) -> Float[Array, " m"]:
-    return _newton(lambda z: fn(t, x, z, args), z)
+    return _algebraic_newton(lambda z: fn(t, x, z, args), z)
 
 
 @_root.def_jvp
@@ -309,7 +309,9 @@ class _Iterate(NamedTuple):
     going: Bool[Array, ""]
 
 
-def _newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Float[Array, " m"]:
+def _algebraic_newton(
+    residual: Callable[[Array], Array], z: Float[Array, " m"]
+) -> Float[Array, " m"]:
     """Damped Newton's method. A correction is accepted if the next one with the same Jacobian is
     shorter, which does not depend on the units of the equations; NaN is not."""
     eps = float(jnp.finfo(z.dtype).eps)
