@@ -68,8 +68,10 @@ class SemiExplicitDAE(eqx.Module):
         )
         y0 = dae.consistent(jnp.array(5.0), jnp.array(0.5))
         print(f"{y0[1]:.3f}")
-        solver = dae.wrap(diffrax.Kvaerno3())
-        sol = diffrax.diffeqsolve(dae.term, solver, 0, 1e-3, 1e-5, y0)
+        solver, steps = dae.wrap(diffrax.Kvaerno3()), diffrax.PIDController(rtol=1e-5, atol=1e-8)
+        sol = diffrax.diffeqsolve(
+            dae.term, solver, 0, 1e-3, 1e-5, y0, stepsize_controller=steps
+        )
         ```
 
         ```text
