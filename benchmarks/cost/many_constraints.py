@@ -2,7 +2,7 @@
 
 1. A hanging chain of rigid bonds, bond lengths and relative velocities along the bonds kept: twice
    as many constraints as bonds; and with bond lengths alone.
-2. Spins on a line that precess about their neighbours (Landau and Lifshitz): the length of each,
+2. Spins on a line that turn about their neighbours (Landau and Lifshitz): the length of each,
    and the energy.
 3. Rigid molecules of water in a periodic field: three bonds each, and the energy.
 4. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
