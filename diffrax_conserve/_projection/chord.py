@@ -173,7 +173,11 @@ def _of_many(
     scaled = equations.scaled(jacobian)
     sizes, rows = scaled_rows(scaled)
     solve = factored(gram_matrix(rows, rows), sizes)
-    _, vjp = jax.vjp(equations.residual, y)
+    if isinstance(scaled, SparseRows):  # a reverse pass has no indices
+        _, vjp = jax.vjp(equations.residual, y)
+        combine = lambda multiplier: equations.scaled(vjp(multiplier)[0])  # noqa: E731
+    else:
+        combine = lambda multiplier: combined(multiplier, scaled)  # noqa: E731
 
     def test(g: Array, left: Array) -> tuple[Array, Array]:
         level, noise = equations.level(g, scale)
@@ -183,12 +187,9 @@ def _of_many(
     def body(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         y, g, left, count = carry
         multiplier, terms = solve(g), None
-        if isinstance(scaled, SparseRows):  # a reverse pass has no indices
-            moved = _moved(equations, y, equations.scaled(vjp(multiplier)[0]), None)
-        else:
-            if equations.may_vanish:
-                terms = combined(jnp.abs(multiplier), jnp.abs(scaled))
-            moved = _moved(equations, y, combined(multiplier, scaled), terms)
+        if equations.may_vanish and not isinstance(scaled, SparseRows):
+            terms = combined(jnp.abs(multiplier), jnp.abs(scaled))
+        moved = _moved(equations, y, combine(multiplier), terms)
         y = jnp.where(left > 0, moved, y)
         g, left = test(equations.residual(y), left)
         return y, g, left, count + (left > 0).astype(int)

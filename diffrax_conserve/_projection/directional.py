@@ -1,5 +1,6 @@
 """Projection along the embedded error estimate, which conserves every linear integral."""
 
+import abc
 import dataclasses
 from typing import ClassVar, final
 
@@ -13,8 +14,42 @@ from .implicit import project_along
 from .options import check_options, option
 
 
+class AbstractAlongLine(AbstractProjection):
+    """A projection with one unknown: along a line through the candidate."""
+
+    rtol: float | Array | None = option(None)
+    atol: float | Array | None = option(None)
+    max_steps: int = option(50, static=True)
+    metric: None = eqx.field(default=None, init=False)
+    sees_step: ClassVar[bool] = True
+    unknowns: ClassVar[str]  # in words
+
+    def __check_init__(self):
+        check_options(self)
+
+    @abc.abstractmethod
+    def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
+        """That of the line."""
+
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        size = problem.equations.magnitude.size
+        if size != 1:
+            raise ValueError(
+                f"`{type(self).__name__}` {self.unknowns}, but `manifold` has {size} scalar "
+                "constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
+            )
+        # The direction is the unit of each component, and its signs are what is left of it.
+        direction = self.direction(problem, candidate)
+        equations = dataclasses.replace(problem.equations, units=jnp.abs(direction))
+        signs = lax.stop_gradient(jnp.sign(direction))[None]
+        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
+        return y, problem.judge(candidate, y, count, ok=ok)
+
+
 @final
-class Directional(AbstractProjection):
+class Directional(AbstractAlongLine):
     r"""Projects along the error estimate of the wrapped solver, for one integral.
 
     For the candidate $\hat y$ and the error estimate $w$ of the step (in a Runge-Kutta method the
@@ -47,24 +82,10 @@ class Directional(AbstractProjection):
         explicit Runge-Kutta methods", *SIAM J. Sci. Comput.* 28 (2006), 868-885.
     """
 
-    rtol: float | Array | None = option(None)
-    atol: float | Array | None = option(None)
-    max_steps: int = option(50, static=True)
-    metric: None = eqx.field(default=None, init=False)
-    sees_step: ClassVar[bool] = True
+    unknowns: ClassVar[str] = "moves along one direction"
 
-    def __check_init__(self):
-        check_options(self)
-
-    def solve(
-        self, problem: Problem, candidate: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        size = problem.equations.magnitude.size
-        if size != 1:
-            raise ValueError(
-                f"`Directional` moves along one direction, but `manifold` has {size} scalar "
-                "constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
-            )
+    def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
+        del candidate
         error = None if problem.step is None else problem.step.error
         if error is None:
             raise ValueError(
@@ -72,11 +93,7 @@ class Directional(AbstractProjection):
                 "`ManifoldProjection` wrap a solver with an embedded method, such as "
                 "`diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
-        # The estimate is the unit of each component, and its signs are the direction.
-        equations = dataclasses.replace(problem.equations, units=jnp.abs(error))
-        signs = lax.stop_gradient(jnp.sign(error))[None]
-        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return error
 
 
 Directional.__init__.__doc__ = """**Arguments:**

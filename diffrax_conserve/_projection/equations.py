@@ -5,6 +5,7 @@ residual at `y`, to which roundoff is proportional, is the size of the terms tha
 `|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what `roundoff` finds inside `fn` but not in its gradient.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -85,6 +86,10 @@ class Equations(eqx.Module):
             else:
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
+
+    def dense(self) -> "Equations":
+        """The same, with a dense Jacobian."""
+        return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         y = y if self.clip is None else self.clip(y)

@@ -106,7 +106,7 @@ def _nearest(
     n, nothing = y.size, jnp.zeros_like(equations.magnitude)
     if n + nothing.size > _NEAREST_MAX:
         return jnp.concatenate([y, nothing]), nothing + 1, jnp.asarray(False), count
-    equations = dataclasses.replace(equations, pattern=None)
+    equations = equations.dense()
     sizes, unit, gram, units = _scaled(equations, y)
     along = times(unit, in_units(y - candidate, equations.units))
     start = jnp.concatenate([y, gram_solve(gram, along)])
@@ -145,7 +145,7 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     if unknowns.size > _NEAREST_MAX:
         return solved, (jnp.full_like(unknowns, jnp.nan), None, None, None)
     y = unknowns[: candidate.size]
-    equations = dataclasses.replace(equations, pattern=None)
+    equations = equations.dense()
     _, _, _, units = _scaled(equations, y)
     _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right

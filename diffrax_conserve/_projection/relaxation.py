@@ -1,20 +1,15 @@
 """Projection along the step, known as relaxation."""
 
-import dataclasses
 from typing import ClassVar, final
 
-import equinox as eqx
-import jax.lax as lax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import AbstractProjection, Problem, ProjectionInfo
-from .implicit import project_along
-from .options import check_options, option
+from .base import Problem
+from .directional import AbstractAlongLine
 
 
 @final
-class Relaxation(AbstractProjection):
+class Relaxation(AbstractAlongLine):
     r"""Projects along the step, for one integral: $y_{n+1} = y_n + \gamma (\hat y - y_n)$.
 
     The scalar $\gamma$ near 1 solves $g(y_n + \gamma (\hat y - y_n)) = 0$ by Newton's method. All
@@ -52,35 +47,15 @@ class Relaxation(AbstractProjection):
         A612-A638, for integrals that are not quadratic.
     """
 
-    rtol: float | Array | None = option(None)
-    atol: float | Array | None = option(None)
-    max_steps: int = option(50, static=True)
-    metric: None = eqx.field(default=None, init=False)
-    sees_step: ClassVar[bool] = True
+    unknowns: ClassVar[str] = "has one unknown"
 
-    def __check_init__(self):
-        check_options(self)
-
-    def solve(
-        self, problem: Problem, candidate: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        size = problem.equations.magnitude.size
-        if size != 1:
-            raise ValueError(
-                f"`Relaxation` has one unknown, but `manifold` has {size} scalar constraints. Keep "
-                "one integral, or pass `projection=SimplifiedNewton()`."
-            )
+    def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         if problem.step is None:
             raise ValueError(
                 "`Relaxation` moves along a step, but there is none outside a solve. Pass "
                 "`projection=Newton()`."
             )
-        # The increment is the unit of each component, and its signs are the direction.
-        increment = candidate - problem.step.y0
-        equations = dataclasses.replace(problem.equations, units=jnp.abs(increment))
-        signs = lax.stop_gradient(jnp.sign(increment))[None]
-        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return candidate - problem.step.y0
 
 
 Relaxation.__init__.__doc__ = """**Arguments:**

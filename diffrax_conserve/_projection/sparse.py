@@ -142,6 +142,14 @@ class Pattern:
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
+    def taken_apart(self, x: Float[Array, " m"]) -> tuple[Array, Array]:
+        """Numbers for the rows of the blocks, and for the dense ones."""
+        return _take(x, self.rows), x[self.dense_rows]
+
+    def joined(self, blocks: Array, dense: Array) -> Float[Array, " m"]:
+        """The opposite."""
+        return _take(jnp.concatenate([blocks.reshape(-1), dense]), self.places)
+
 
 def pattern_of(
     parts: Sequence[Callable[[Array], Array]], sizes: Sequence[int], y: Any
@@ -264,7 +272,7 @@ class SparseRows(eqx.Module):
     def scaled(self) -> tuple[Float[Array, " m"], "SparseRows"]:
         """The largest element of each row, or one if all are zero, and the rows divided by it."""
         largest = jnp.max(jnp.abs(_take(self.colours, self.pattern.elements)), axis=2)
-        sizes = self._joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
+        sizes = self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
         sizes = jnp.where(sizes > 0, sizes, 1)
         of = jnp.where(self.pattern.owners < len(self), _take(sizes, self.pattern.owners), 1)
         dense = self.dense / sizes[self.pattern.dense_rows, None]
@@ -274,7 +282,7 @@ class SparseRows(eqx.Module):
         """`U x`."""
         products = self.times_columns(x)
         blocks = jnp.sum(_take(products.colours, self.pattern.elements), axis=2)
-        return self._joined(blocks, jnp.sum(products.dense, axis=1))
+        return self.pattern.joined(blocks, jnp.sum(products.dense, axis=1))
 
     def combined(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
         """`Uᵀ λ`."""
@@ -299,8 +307,8 @@ class SparseRows(eqx.Module):
 
             following = coupling(ours, theirs)
             preceding = jnp.swapaxes(coupling(theirs, ours), 1, 2)
-        columns = jax.vmap(lambda x: self._taken_apart(self.times(x))[0], out_axes=-1)
-        rows = jax.vmap(lambda x: self._taken_apart(others.times(x))[0])
+        columns = jax.vmap(lambda x: self.pattern.taken_apart(self.times(x))[0], out_axes=-1)
+        rows = jax.vmap(lambda x: self.pattern.taken_apart(others.times(x))[0])
         return BlockGram(
             diagonal,
             following,
@@ -311,13 +319,6 @@ class SparseRows(eqx.Module):
             (self, others) if pattern.iterative else None,
             pattern,
         )
-
-    def _taken_apart(self, x: Float[Array, " m"]) -> tuple[Array, Array]:
-        """Numbers for the rows of the blocks, and for the dense ones."""
-        return _take(x, self.pattern.rows), x[self.pattern.dense_rows]
-
-    def _joined(self, blocks: Array, dense: Array) -> Float[Array, " m"]:
-        return _take(jnp.concatenate([blocks.reshape(-1), dense]), self.pattern.places)
 
 
 class BlockGram(eqx.Module):
@@ -354,17 +355,17 @@ class BlockGram(eqx.Module):
             sparse = self._iteration(diagonal)
         number = len(self.corner)
         if number == 0:
-            return lambda b: self._joined(sparse(self._taken_apart(b)[0]), b[:0])
+            return lambda b: self.pattern.joined(sparse(self.pattern.taken_apart(b)[0]), b[:0])
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
         least = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
         inverse = _inverse((corner + added * jnp.diag(least))[None])[0]
 
         def solve(b: Float[Array, " m"]) -> Float[Array, " m"]:
-            blocks, dense = self._taken_apart(b)
+            blocks, dense = self.pattern.taken_apart(b)
             blocks = sparse(blocks)
             dense = inverse @ (dense - jnp.einsum("dij,ij->d", self.rows, blocks))
-            return self._joined(blocks - eliminated @ dense, dense)
+            return self.pattern.joined(blocks - eliminated @ dense, dense)
 
         return solve
 
@@ -373,19 +374,15 @@ class BlockGram(eqx.Module):
         factors, zero = self.factors or (), jnp.zeros(len(self.corner), diagonal.dtype)
 
         def product(left: SparseRows, right: SparseRows, x: Array) -> Array:
-            return self._taken_apart(left.times(right.combined(self._joined(x, zero))))[0]
+            return self.pattern.taken_apart(
+                left.times(right.combined(self.pattern.joined(x, zero)))
+            )[0]
 
         def solve(product: Callable[[Array], Array], b: Array) -> Array:
             tol = float(jnp.finfo(b.dtype).eps) ** (3 / 4)
             return bicgstab(product, b, tol=tol, M=lambda x: x / diagonal[..., 0])[0]
 
         return lambda b: lax.custom_linear_solve(ft.partial(product, *factors), b, solve, solve)
-
-    def _taken_apart(self, x: Float[Array, " m"]) -> tuple[Array, Array]:
-        return _take(x, self.pattern.rows), x[self.pattern.dense_rows]
-
-    def _joined(self, blocks: Array, dense: Array) -> Float[Array, " m"]:
-        return _take(jnp.concatenate([blocks.reshape(-1), dense]), self.pattern.places)
 
 
 def _take(x: Array, places: np.ndarray) -> Array:

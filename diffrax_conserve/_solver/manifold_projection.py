@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._balance import has_rates
-from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
+from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import Constraint, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
@@ -32,14 +32,11 @@ from .state import (
     violated,
 )
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
-
-
-def _of_innermost(name: str) -> Any:
-    return property(lambda self: getattr(innermost(self.solver), name))
+from .wrapper import ForwardingSolver
 
 
 @final
-class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
+class ManifoldProjection(ForwardingSolver):
     r"""Projects every step of another solver to a manifold.
 
     The wrapped solver proposes a candidate $\hat y$ at $t_{n+1}$; $y_{n+1}$ is its projection to
@@ -123,29 +120,15 @@ class ManifoldProjection(dfx.AbstractWrappedSolver[Any]):
                 "out `every`, or `lower` and `upper`."
             )
 
-    # diffrax forwards `isinstance` to the innermost solver, then reads these attributes of the
-    # wrapper.
-    term_structure = _of_innermost("term_structure")
-    term_compatible_contr_kwargs = _of_innermost("term_compatible_contr_kwargs")
-    root_finder = _of_innermost("root_finder")
-    root_find_max_steps = _of_innermost("root_find_max_steps")
-    scan_kind = _of_innermost("scan_kind")
-
     @property
     def interpolation_cls(self) -> MakeManifoldInterpolation:  # pyright: ignore
         return MakeManifoldInterpolation(self.solver.interpolation_cls)
-
-    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
-        return self.solver.order(terms)
 
     def strong_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         return self.solver.strong_order(terms)
 
     def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> RealScalarLike | None:
         return self.solver.error_order(terms)
-
-    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args) -> VF:
-        return self.solver.func(terms, t0, y0, args)
 
     def init(
         self,

@@ -1,6 +1,5 @@
 """Symmetric projection: a symmetric method stays symmetric on the manifold."""
 
-import dataclasses
 import functools as ft
 from typing import Any, NamedTuple, final
 
@@ -13,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
+from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import PackedTarget
 from .._manifold import check_manifold, conserved_values, named_entries, rate_of
 from .._projection.base import Target
@@ -28,16 +27,13 @@ from .._solver.rk4 import RK4
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.unrolled import Unrolled
+from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf, root
 
 # The defect of the equation for the state, in units of roundoff of the state, from which one more
 # iteration is enough, and at which it is only the rounding of the state.
 _NEARLY_SOLVED, _SOLVED = 64, 2
-
-
-def _of_innermost(name: str) -> Any:
-    return property(lambda self: getattr(innermost(self.solver), name))
 
 
 class _State(eqx.Module):
@@ -64,7 +60,7 @@ class _Iterate(NamedTuple):
 
 
 @final
-class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
+class SymmetricProjection(ForwardingSolver):
     r"""Projects a symmetric method so that the projected method is symmetric too.
 
     A step $\Phi_h$ of the wrapped solver is projected at both of its ends, with one multiplier
@@ -136,19 +132,6 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
                     "by `ManifoldProjection`."
                 )
 
-    # diffrax forwards `isinstance` to the innermost solver, then reads these attributes here.
-    term_structure = _of_innermost("term_structure")
-    term_compatible_contr_kwargs = _of_innermost("term_compatible_contr_kwargs")
-    root_finder = _of_innermost("root_finder")
-    root_find_max_steps = _of_innermost("root_find_max_steps")
-    scan_kind = _of_innermost("scan_kind")
-
-    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int | None:
-        return self.solver.order(terms)
-
-    def func(self, terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args) -> VF:
-        return self.solver.func(terms, t0, y0, args)
-
     def init(
         self,
         terms: PyTree[dfx.AbstractTerm],
@@ -187,8 +170,7 @@ class SymmetricProjection(dfx.AbstractWrappedSolver[Any]):
         target = Target(
             self.projection, self.manifold, state.values, state.hidden, None, args, direction
         )
-        dense = lambda t: dataclasses.replace(target.equations(t, y0), pattern=None)  # noqa: E731
-        start, end = dense(t0), dense(t1)
+        start, end = (target.equations(t, y0).dense() for t in (t0, t1))
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
             # A symmetric method has no memory: what it keeps for the next step is not used.
@@ -329,7 +311,7 @@ def _check_symmetric(solver: Any) -> None:
     else:
         ours = isinstance(inner, RK4 | Unrolled)
         symmetric = not (ours or type(inner).__module__.startswith("diffrax."))
-    projects = type(solver).__name__ in ("ManifoldProjection", "SymmetricProjection")
+    projects = issubclass(type(solver), ForwardingSolver)  # which `isinstance` would not tell
     if projects or not symmetric:
         raise ValueError(
             f"`solver` is {name}, which is not symmetric: a step backwards does not undo a step, "

@@ -1,6 +1,5 @@
 """The conservative layer: a projection to the manifold, as the last layer of a network."""
 
-import dataclasses
 from typing import final
 
 import equinox as eqx
@@ -100,7 +99,7 @@ class ConservativeLayer(eqx.Module):
         vector = ravel(candidate)
         values = ravel(self.values(*start)).astype(vector.dtype)
         equations = equations_of(self.manifold, values, t, candidate, self.args)
-        return dataclasses.replace(equations, pattern=None), vector
+        return equations.dense(), vector
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
