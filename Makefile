@@ -44,7 +44,7 @@ $(VENV)/.installed-%: pyproject.toml | $(BIN)/python
 	@touch $@
 
 PLOTS := $(VENV)/.installed-plots
-TEST := $(VENV)/.installed-test
+TEST := $(VENV)/.installed-sparse,test
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 BENCH := $(VENV)/.installed-bench

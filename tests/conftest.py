@@ -19,6 +19,8 @@ from jaxtyping import install_import_hook
 QUICKLY_COMPILED = (Path(__file__).parent / "xla_flags.txt").read_text(encoding="utf-8").split()
 os.environ.setdefault("XLA_FLAGS", " ".join(QUICKLY_COMPILED))
 jax.config.update("jax_enable_x64", True)
+# The random numbers of today's JAX also with the oldest one that is supported.
+jax.config.update("jax_threefry_partitionable", True)
 # Threads of a small factorisation wait for each other: on a busy machine up to 200 times as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

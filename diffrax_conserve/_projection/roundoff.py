@@ -13,14 +13,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._tree import ravel, tree_stop_gradient
 from .equations import Jacobian, functions_of, shown_terms
-from .scalars import walk
+from .jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .sparse import LEAST_CONSTRAINTS, SparseRows, pattern_of
 
 # Sums, and sums of products, each of which has an error of its own.
@@ -115,26 +114,25 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if inner is not None and not _is_opaque(inner.jaxpr):  # a function with a rule of its own
         return _inside(inner, given, changed)
     if name in ("checkpoint", "remat2"):
-        return _inside(jex.ClosedJaxpr(params["jaxpr"], ()), given, changed)
+        return _inside(closed_jaxpr(params["jaxpr"]), given, changed)
     if name == "cond":
         branches = [ft.partial(_values, changed, branch) for branch in params["branches"]]
         return [(x, kind) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
     if name == "scan":
         return [(x, kind) for x in _scanned(changed, eqn, inputs)]
-    evaluate = ft.partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(params))
     products = name in _SUMS_OF_PRODUCTS
     computed = any(of == _COMPUTED for _, of in given)
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
         counted = (x if products or of != _STATE else jnp.zeros_like(x) for x, of in given)
         sizes = [jnp.abs(x) for x in counted]
-        size = sum(sizes) if name == "sub" else evaluate(*sizes)
-        return [(changed(evaluate(*inputs), size), _COMPUTED)]
+        size = sum(sizes) if name == "sub" else outputs(eqn, *sizes)[0]
+        return [(changed(outputs(eqn, *inputs)[0], size), _COMPUTED)]
     if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
-        return [(changed(x := evaluate(*inputs), x), _COMPUTED)]
-    if name in _FUNCTIONS or list(jex.jaxprs_in_params(params)):
+        (x,) = outputs(eqn, *inputs)
+        return [(changed(x, x), _COMPUTED)]
+    if name in _FUNCTIONS or any(True for _ in jaxprs_inside(eqn)):
         inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
-    outs = evaluate(*inputs)
-    return [(x, kind) for x in (outs if eqn.primitive.multiple_results else [outs])]
+    return [(x, kind) for x in outputs(eqn, *inputs)]
 
 
 def _is_inexact(*xs: Any) -> bool:
@@ -167,6 +165,6 @@ def _is_opaque(jaxpr: Any) -> bool:
     """Whether a jaxpr has a loop or callback, through which reverse mode needs a rule."""
     return any(
         eqn.primitive.name in ("while", "pure_callback", "io_callback")
-        or any(map(_is_opaque, jex.jaxprs_in_params(eqn.params)))
+        or any(_is_opaque(inner.jaxpr) for inner in jaxprs_inside(eqn))
         for eqn in jaxpr.eqns
     )

@@ -21,6 +21,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .jaxprs import closed_jaxpr, outputs, walk
+
 # An array as a tuple of its elements.
 Scalars = tuple[Any, ...]
 
@@ -75,32 +77,6 @@ def in_scalars(
         return out_treedef.unflatten(results)
 
     return written
-
-
-def walk(
-    closed: Any,
-    inputs: list[Any],
-    constant: Callable[[Any], Any],
-    equation: Callable[[Any, list[Any]], Iterable[Any]],
-) -> list[Any]:
-    """The outputs of a jaxpr that is evaluated otherwise: `constant(x)` and `equation(eqn, inputs)`
-    take the place of the values of its constants and equations."""
-    env = dict(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
-    env.update(zip(closed.jaxpr.invars, inputs, strict=True))
-
-    def read(var: Any) -> Any:
-        if isinstance(var, jex.Literal):
-            return constant(np.asarray(var.val, var.aval.dtype))  # pyright: ignore
-        return env[var]
-
-    for eqn in closed.jaxpr.eqns:
-        given = [read(var) for var in eqn.invars]
-        if eqn.primitive.name == "jit":
-            outs = walk(eqn.params["jaxpr"], given, constant, equation)
-        else:
-            outs = equation(eqn, given)
-        env.update(zip(eqn.outvars, outs, strict=True))
-    return [read(var) for var in closed.jaxpr.outvars]
 
 
 def components(x: Array) -> Any:
@@ -266,8 +242,7 @@ class _WriteOut:
             return [self._dot(inputs, params["dimension_numbers"])]
         if name in _CALLS or (name in _CALLS_WITH_A_RULE and not self.differentiated):
             inner = params.get("call_jaxpr", params.get("jaxpr"))
-            inner = inner if isinstance(inner, jex.ClosedJaxpr) else jex.ClosedJaxpr(inner, ())
-            return walk(inner, inputs, self._constant, self._equation)
+            return walk(closed_jaxpr(inner), inputs, self._constant, self._equation)
         return self._in_arrays(eqn, inputs)
 
     def _elementwise(self, fn: Callable[..., Array], inputs: list[_Places]) -> _Places:
@@ -338,8 +313,7 @@ class _WriteOut:
         """A primitive that is not known here: its inputs are joined, its outputs taken apart."""
         self._count(sum(prod(var.aval.shape) for var in (*eqn.invars, *eqn.outvars)))
         given = [self._array(x, var.aval.dtype) for x, var in zip(inputs, eqn.invars, strict=True)]
-        outs = eqn.primitive.bind(*given, **eqn.primitive.get_bind_params(eqn.params))
-        return [self._taken_apart(x) for x in (outs if eqn.primitive.multiple_results else [outs])]
+        return [self._taken_apart(x) for x in outputs(eqn, *given)]
 
     def _array(self, places: _Places, dtype: Any) -> Any:
         """The array of these elements; where it was taken apart, the array itself."""

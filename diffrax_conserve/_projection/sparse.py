@@ -26,11 +26,12 @@ import jax.core
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
+
+from .jaxprs import jaxprs_inside
 
 # The pattern is sought from this number of constraints on: below it a dense factor is as fast
 # (`benchmarks/cost/many_constraints.py`).
@@ -201,9 +202,8 @@ def _constants(closed: Any) -> Iterator[Any]:
     yield from closed.consts
     for eqn in closed.jaxpr.eqns:
         yield from (x.val for x in eqn.invars if isinstance(x, jex.Literal) and np.ndim(x.val))
-        is_leaf = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731
-        for x in filter(is_leaf, jtu.tree_leaves(eqn.params, is_leaf=is_leaf)):
-            yield from _constants(x if isinstance(x, jex.ClosedJaxpr) else jex.ClosedJaxpr(x, ()))
+        for inside in jaxprs_inside(eqn):
+            yield from _constants(inside)
 
 
 def _content(x: Any) -> Any:

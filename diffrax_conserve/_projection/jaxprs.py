@@ -1,0 +1,54 @@
+"""Functions as jaxprs, the programs into which JAX traces them: to evaluate one otherwise, equation
+by equation, and to look for the programs inside. Only here it matters which version of JAX runs."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import jax.extend.core as jex
+import jax.tree_util as jtu
+import numpy as np
+
+
+def walk(
+    closed: jex.ClosedJaxpr,
+    inputs: list[Any],
+    constant: Callable[[Any], Any],
+    equation: Callable[[Any, list[Any]], Iterable[Any]],
+) -> list[Any]:
+    """The outputs of a jaxpr that is evaluated otherwise: `constant(x)` and `equation(eqn, inputs)`
+    take the place of the values of its constants and equations."""
+    env = dict(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
+    env.update(zip(closed.jaxpr.invars, inputs, strict=True))
+
+    def read(var: Any) -> Any:
+        if isinstance(var, jex.Literal):
+            return constant(np.asarray(var.val, var.aval.dtype))  # pyright: ignore
+        return env[var]
+
+    for eqn in closed.jaxpr.eqns:
+        given = [read(var) for var in eqn.invars]
+        if eqn.primitive.name in ("jit", "pjit"):
+            outs = walk(eqn.params["jaxpr"], given, constant, equation)
+        else:
+            outs = equation(eqn, given)
+        env.update(zip(eqn.outvars, outs, strict=True))
+    return [read(var) for var in closed.jaxpr.outvars]
+
+
+def outputs(eqn: Any, *inputs: Any) -> list[Any]:
+    """The values of an equation, for other inputs."""
+    given = eqn.primitive.get_bind_params(eqn.params)
+    # Before version 0.9 the functions inside stood apart from the parameters.
+    functions, params = given if isinstance(given, tuple) else ((), given)
+    outs = eqn.primitive.bind(*functions, *inputs, **params)
+    return outs if eqn.primitive.multiple_results else [outs]
+
+
+def closed_jaxpr(jaxpr: Any) -> jex.ClosedJaxpr:
+    return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
+
+
+def jaxprs_inside(eqn: Any) -> Iterator[jex.ClosedJaxpr]:
+    """The programs that an equation runs, such as the body of a loop."""
+    is_jaxpr = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731
+    return map(closed_jaxpr, filter(is_jaxpr, jtu.tree_leaves(eqn.params, is_leaf=is_jaxpr)))
