@@ -3,13 +3,13 @@
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._projection.jaxprs import jaxprs_inside
 
 from .. import fresh
 from ..problems import kepler, kepler_energy, kepler_momentum, solve
@@ -398,7 +398,7 @@ def test_products_of_matrices_have_all_digits(projection):
     jaxprs, precisions = [closed.jaxpr], set()
     for jaxpr in jaxprs:
         for eqn in jaxpr.eqns:
-            jaxprs.extend(jex.jaxprs_in_params(eqn.params))
+            jaxprs.extend(inside.jaxpr for inside in jaxprs_inside(eqn))
             if eqn.primitive.name == "dot_general":
                 precisions.add(eqn.params["precision"])
     assert precisions == {(lax.Precision.HIGHEST, lax.Precision.HIGHEST)}
