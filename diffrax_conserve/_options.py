@@ -95,10 +95,10 @@ def calling(name: str, call: str, *given: Any) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        values = [textwrap.shorten(eqx.tree_pformat(x), 200) for x in given]
-        shown = ", ".join(f"{p} = {x}" for p, x in zip(parameters(call), values, strict=True))
-        note = f"{name} was called as `{call}`, here with {shown}."
-        if given[-1] is None:
+        known = dict(zip(parameters(call), given, strict=True))
+        shown = (f"{p} = {textwrap.shorten(eqx.tree_pformat(x), 200)}" for p, x in known.items())
+        note = f"{name} was called as `{call}`, here with {', '.join(shown)}."
+        if "args" in known and known["args"] is None:
             note += " If it needs `args`, pass `args=...` here too."
         if note not in getattr(error, "__notes__", []):
             error.add_note(note)

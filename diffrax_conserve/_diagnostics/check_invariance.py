@@ -30,7 +30,7 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
-from .._options import ONE_STATE, one_of
+from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
 from .._projection.equations import Jacobian, equations_of, relative, shown_terms
 from .._projection.roundoff import hidden_terms
@@ -168,6 +168,7 @@ def batch(
     t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
 ) -> tuple[Float[Array, " states"], PyTree[Array]]:
     if callable(states):
+        check_function("`states`", states, "states(key)", "a state")
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
     states = jtu.tree_map(jnp.asarray, states)
     leaves = jtu.tree_leaves(states)
