@@ -98,8 +98,8 @@ def calling(name: str, call: str, *given: Any) -> Iterator[None]:
         known = dict(zip(parameters(call), given, strict=True))
         shown = (f"{p} = {textwrap.shorten(eqx.tree_pformat(x), 200)}" for p, x in known.items())
         note = f"{name} was called as `{call}`, here with {', '.join(shown)}."
-        if "args" in known and known["args"] is None:
-            note += " If it needs `args`, pass `args=...` here too."
+        if "NoneType" in str(error) and known.get("args", "") is None:
+            note += " It seems to need `args`: pass them here too."
         if note not in getattr(error, "__notes__", []):
             error.add_note(note)
         raise
