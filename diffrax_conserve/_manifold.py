@@ -1,6 +1,7 @@
 """First integrals, constraints, and the PyTrees of them that define a manifold."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any, final
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
-from ._options import check_function, check_numbers, dtype_of, is_real
+from ._options import calling, check_function, check_numbers, dtype_of, is_real
 from ._tree import tree_shapes, tree_size
 
 
@@ -127,9 +128,15 @@ class Along(eqx.Module):
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         t = jnp.asarray(t, jnp.result_type(float, t))
         y = jtu.tree_map(jnp.asarray, y)
-        slope = slope_like(y, self.vector_field(t, y, args))
+        slope = slope_of(self.vector_field, t, y, args)
         _, along = jax.jvp(lambda t, y: self.fn(t, y, args), (t, y), (jnp.ones_like(t), slope))
         return along
+
+
+def slope_of(vector_field: Any, t: RealScalarLike, y: Y, args: Args) -> Y:
+    """The value of a vector field, like the state; an error tells how the field was called."""
+    with calling("`vector_field`", "vector_field(t, y, args)", t, y, args):
+        return slope_like(y, vector_field(t, y, args))
 
 
 def slope_like(y: Y, slope: Any) -> Y:
@@ -179,9 +186,9 @@ def check_manifold(manifold: Manifold) -> None:
             )
 
 
-def named_entries(manifold: Manifold) -> list[tuple[str, Any]]:
+def named_entries(manifold: Manifold, root: str = "manifold") -> list[tuple[str, Any]]:
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    return [(f"manifold{jtu.keystr(path)}", entry) for path, entry in flat]
+    return [(f"{root}{jtu.keystr(path)}", entry) for path, entry in flat]
 
 
 def entry_name(manifold: Manifold, position: int) -> str:
@@ -229,13 +236,22 @@ def exactly(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:
         return fn(t, y, args)
 
 
+def calling_fn(name: str, t: RealScalarLike, y: Y, args: Args) -> AbstractContextManager[None]:
+    return calling(f"`fn` of `{name}`", "fn(t, y, args)", t, y, args)
+
+
 def conserved_values(
-    manifold: Manifold, t: RealScalarLike, y: Y, args: Args, given: Values | None = None
+    manifold: Manifold,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    given: Values | None = None,
+    root: str = "manifold",
 ) -> Values:
     """`manifold` with each entry replaced by the value of `fn` that a solve started at
     `(t, y, args)` conserves: that in `given`, its own `value`, or that of the state; zero for a
     constraint. Raises unless all fit each other and the state."""
-    entries, treedef = named_entries(manifold), jtu.tree_structure(manifold, is_leaf=is_entry)
+    entries, treedef = named_entries(manifold, root), jtu.tree_structure(manifold, is_leaf=is_entry)
     values = [getattr(entry, "value", None) for _, entry in entries]
     if given is not None:
         try:
@@ -248,7 +264,8 @@ def conserved_values(
             ) from error
     found = []
     for (name, entry), value in zip(entries, values, strict=True):
-        output = exactly(entry.fn, t, y, args)
+        with calling_fn(name, t, y, args):
+            output = exactly(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
             value = jtu.tree_map(jnp.zeros_like, output)
@@ -274,7 +291,8 @@ def _check_output(
                 "or split a complex value into its real and its imaginary part."
             )
     if rate_of(entry) is not None:
-        rates = eqx.filter_eval_shape(entry.rate, t, y, args)
+        with calling(f"`rate` of `{name}`", "rate(t, y, args)", t, y, args):
+            rates = eqx.filter_eval_shape(entry.rate, t, y, args)
         _check_shapes(f"`rate` of `{name}` returns", rates, output)
         if not all(map(is_real, jtu.tree_leaves(rates))):
             raise TypeError(

@@ -2,6 +2,7 @@
 
 import contextlib
 import inspect
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
@@ -69,12 +70,39 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
     if not callable(fn):
         raise TypeError(f"{name} is {fn!r}, which is not callable. {remedy}")
     try:
-        inspect.signature(fn).bind(*call.split(", "))
-    except TypeError as error:
         given = inspect.signature(fn)
-        raise TypeError(f"{name} has the parameters `{given}`. {remedy}") from error
     except ValueError:  # some builtins have no signature
-        pass
+        return
+    wanted = parameters(call)
+    try:
+        given.bind(*wanted)
+    except TypeError as error:
+        raise TypeError(f"{name} has the parameters `{given}`. {remedy}") from error
+    positional = [p.name for p in given.parameters.values() if p.kind <= p.POSITIONAL_OR_KEYWORD]
+    for name_of_it, expected in zip(positional, wanted, strict=False):
+        if name_of_it != expected and name_of_it in wanted:
+            raise TypeError(f"{name} has the parameters `{given}`, in another order. {remedy}")
+
+
+def parameters(call: str) -> list[str]:
+    """The names `t`, `y` and `args` of `"fn(t, y, args)"`."""
+    return call.partition("(")[2].removesuffix(")").split(", ")
+
+
+@contextlib.contextmanager
+def calling(name: str, call: str, *given: Any) -> Iterator[None]:
+    """Tells with an error of a function of the user which one it is, and what it was given."""
+    try:
+        yield
+    except Exception as error:
+        known = dict(zip(parameters(call), given, strict=True))
+        shown = (f"{p} = {textwrap.shorten(eqx.tree_pformat(x), 200)}" for p, x in known.items())
+        note = f"{name} was called as `{call}`, here with {', '.join(shown)}."
+        if "NoneType" in str(error) and known.get("args", "") is None:
+            note += " It seems to need `args`: pass them here too."
+        if note not in getattr(error, "__notes__", []):
+            error.add_note(note)
+        raise
 
 
 @contextlib.contextmanager

@@ -43,6 +43,18 @@ def batch(sol):
     return dataclasses.replace(sol, ts=jnp.zeros((2, 3)), ys=jnp.zeros((2, 3, 3)))
 
 
+def looped(t, y, args):
+    return jax.lax.while_loop(lambda x: x[0] < 3, lambda x: (x[0] + 1, x[1] * y[0]), (0, y[1]))[1]
+
+
+def check(field=rigid_body, integral=ENERGY, states=OMEGA0[None]):
+    return dfc.check_invariance(field, {"a": integral}, states)
+
+
+NEEDS_ARGS = lambda t, y, args: args["scale"] * y[0]  # noqa: E731
+A_CALLED = (
+    r"`fn` of `manifold\['a'\]` was called as `fn\(t, y, args\)`, here with t = f64\[\], y = f64"
+)
 SUBS = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=[0.0, 1.0]), dfx.SubSaveAt(t1=True)])
 PARTS = dfx.SaveAt(ts=[0.0, 1.0], fn=lambda t, y, args: y[:2], dense=True)
 MISTAKES = [
@@ -53,6 +65,23 @@ MISTAKES = [
     (lambda: FirstIntegral(lambda y: y[0]), TypeError, r"parameters `\(y\)`.*`fn\(t, y, args\)`"),
     (lambda: FirstIntegral(jnp.sum, rate=lambda t, y: y), TypeError, r"`\(t, y\)`.*`rate\(t, y, a"),
     (lambda: FirstIntegral(jnp.sum, rate=3), TypeError, "rate"),
+    (
+        lambda: FirstIntegral(lambda y, t, args: y[0]),
+        TypeError,
+        r"`\(y, t, args\)`, in another ord",
+    ),
+    (lambda: check(field=lambda x, t, args: x), TypeError, r"`\(x, t, args\)`, in another order"),
+    (lambda: check(field=NEEDS_ARGS), TypeError, r"`vector_field` was called .*need `args`"),
+    (lambda: check(states=lambda: OMEGA0), TypeError, r"`states` has .* `states\(key\)`"),
+    *(
+        (lambda f=f: f(integral=FirstIntegral(NEEDS_ARGS)), TypeError, A_CALLED + ".*need `args`")
+        for f in (check, lambda integral: run({"a": integral}))
+    ),
+    *(
+        (lambda f=f: f(integral=FirstIntegral(looped)), ValueError, A_CALLED)
+        for f in (check, lambda integral: run({"a": integral}))
+    ),
+    (lambda: dfc.systems.hamiltonian_vector_field(ENERGY), TypeError, "`hamiltonian` is FirstInt"),
     (lambda: dfc.ClosedForm(lambda t, y, args: y), TypeError, r"`fn\(t, y, args, values\)`"),
     *((lambda x=x: wrap(x), ValueError, "nothing to conserve") for x in ((), [], {}, None)),
     (lambda: run(FirstIntegral(lambda t, y, args: ())), ValueError, "no array"),

@@ -20,14 +20,17 @@ from .._manifold import (
     Along,
     Constraint,
     FirstIntegral,
+    calling_fn,
     check_manifold,
+    check_vector_field,
     conserved_values,
     evaluate,
     is_entry,
+    named_entries,
     rate_of,
-    slope_like,
+    slope_of,
 )
-from .._options import ONE_STATE, one_of
+from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
 from .._projection.equations import Jacobian, equations_of, relative, shown_terms
 from .._projection.roundoff import hidden_terms
@@ -148,6 +151,7 @@ def check_invariance(
     check_manifold(manifold)
     if isinstance(vector_field, dfx.ODETerm):
         vector_field = vector_field.vector_field
+    check_vector_field(vector_field)
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
@@ -164,6 +168,7 @@ def batch(
     t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
 ) -> tuple[Float[Array, " states"], PyTree[Array]]:
     if callable(states):
+        check_function("`states`", states, "states(key)", "a state")
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
     states = jtu.tree_map(jnp.asarray, states)
     leaves = jtu.tree_leaves(states)
@@ -192,18 +197,19 @@ def _measure(
 ) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""], Bool[Array, " m"]]]:
     """The largest relative defect and residual of each entry, whether its gradient is zero, and of
     each of its elements whether all terms of the derivative are."""
-    return [_relative_sizes(entry, t, y, vector_field, args) for _, entry in _entries(manifold)]
+    return [_relative_sizes(*entry, t, y, vector_field, args) for entry in named_entries(manifold)]
 
 
 def _relative_sizes(
-    entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
+    name: str, entry: Entry, t: Float[Array, ""], y: Any, vector_field: Callable, args: Args
 ) -> tuple[Array, Array, Array, Array]:
     vector = ravel(y)
     dtype = vector.dtype
     t = t.astype(dtype)
-    values = ravel(conserved_values(entry, t, y, args)).astype(dtype)
+    values = ravel(conserved_values(entry, t, y, args, root=name)).astype(dtype)
     equations = equations_of(entry, values, t, y, args)
-    residual, jacobian = equations.linearise(vector)
+    with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
+        residual, jacobian = equations.linearise(vector)
     in_time = lambda t: ravel(evaluate(entry, t, y, args)).astype(dtype)  # noqa: E731
     _, partial = jax.jvp(in_time, (t,), (jnp.ones_like(t),))
     rate = ravel(rates(entry, t, y, args)).astype(dtype)
@@ -214,7 +220,7 @@ def _relative_sizes(
 
     def terms_at(vector: Array, jacobian: Jacobian) -> Array:
         state = unravel(vector, y)
-        slope = ravel(slope_like(state, vector_field(t, state, args)))
+        slope = ravel(slope_of(vector_field, t, state, args))
         return shown_terms(jacobian, slope) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Real
 
 from .._custom_types import Args, RealScalarLike
-from .._manifold import FirstIntegral, check_vector_field, slope_like
+from .._manifold import FirstIntegral, check_vector_field, slope_of
 from .._options import check_counts, check_function, one_of
 from .._tree import ravel, real_view, tree_size, unravel
 from .check_invariance import batch
@@ -320,7 +320,7 @@ def _sampled(
     @jax.vmap
     def measure(t: Array, y: Any) -> tuple[Array, Array, Array]:
         at = lambda x: functions(unravel(x, y))  # noqa: E731
-        slope = ravel(slope_like(y, vector_field(t, y, args)))
+        slope = ravel(slope_of(vector_field, t, y, args))
         return at(ravel(y)), jax.jacfwd(at)(ravel(y)).T, slope
 
     values, gradients, slopes = map(np.asarray, measure(ts, ys))

@@ -16,7 +16,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Inexact
 
 from .._custom_types import Args, RealScalarLike, Values
-from .._options import check_function
+from .._options import calling, check_function
 from .closed_form import ClosedForm
 
 Matrices = Inexact[Array, "*batch n n"]
@@ -144,6 +144,8 @@ class _OfPart(eqx.Module):
     def __call__(self, t: RealScalarLike, y: Any, args: Args, values: Values) -> Any:
         del t, args, values
         part = lambda y: tuple(jtu.tree_leaves(self.where(y)))  # noqa: E731
+        with calling("`where`", "where(y)", y):
+            part(y)
         return eqx.tree_at(part, y, tuple(map(self.formula, part(y))))
 
 

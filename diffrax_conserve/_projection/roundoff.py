@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
+from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
 from .equations import Jacobian, functions_of, shown_terms
 from .jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
@@ -48,7 +49,10 @@ def hidden_scale(
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
-        measured = [hidden_terms(fn, vector) for fn in functions]
+        measured = []
+        for (name, _), fn in zip(named_entries(manifold), functions, strict=True):
+            with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
+                measured.append(hidden_terms(fn, vector))
         value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
     else:  # not of entries with many elements, for which it would cost a reverse pass each
         value, jacobian = SparseRows.linearised(pattern, functions, vector)

@@ -21,7 +21,7 @@ from .._manifold import (
     has_value,
     named_entries,
     rate_of,
-    slope_like,
+    slope_of,
 )
 from .._options import check_number
 from .._tree import ravel, tree_add, unflatten, unravel
@@ -137,7 +137,7 @@ class TangentField(eqx.Module):
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
         values = conserved_values(self.manifold, t, y, args)
-        slope = slope_like(y, self.vector_field(t, y, args))
+        slope = slope_of(self.vector_field, t, y, args)
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)

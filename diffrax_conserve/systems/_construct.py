@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike
+from .._options import check_function
 
 ScalarFn = Callable[[RealScalarLike, Any, Args], Float[Array, ""]]
 
@@ -46,6 +47,7 @@ def hamiltonian_vector_field(hamiltonian: ScalarFn) -> Callable[[RealScalarLike,
 
     Source: Hairer, Lubich and Wanner, "Geometric Numerical Integration", VI.1.
     """
+    check_function("`hamiltonian`", hamiltonian, "hamiltonian(t, y, args)", "a real number")
     return eqx.Partial(_hamilton, hamiltonian)
 
 

@@ -109,7 +109,10 @@ class Mechanism(eqx.Module):
         """The state with these concentrations; those of all other species are zero."""
         unknown = set(concentrations) - set(self.species)
         if unknown:
-            raise ValueError(f"The mechanism has no species {', '.join(sorted(unknown))}.")
+            raise ValueError(
+                f"The mechanism has no species {', '.join(sorted(unknown))}. It has "
+                f"{', '.join(self.species)}."
+            )
         return jnp.stack([real(concentrations.get(name, 0.0)) for name in self.species])
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:

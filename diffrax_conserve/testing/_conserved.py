@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Real
 from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import check_manifold, conserved_values, evaluate, has_value, named_entries
+from .._options import check_solution
 from .._projection.equations import measure
 from .._projection.project import given_values
 from .._tree import ravel, tree_all_finite
@@ -79,6 +80,7 @@ def assert_conserved(
         dct.assert_conserved(sol, system.manifold)
         ```
     """
+    check_solution(solution, "assert_conserved")
     check_manifold(manifold)
     refuse_rates(manifold, "`assert_conserved`, unlike `diffrax_conserve.drift`,")
     _refuse_unsuccessful(solution)
