@@ -17,10 +17,9 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._printing import is_traced
-from .._tree import ravel
 from .base import AbstractProjection, has_bounds
 from .chord import Solved, after_test, counter
 from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
@@ -145,17 +144,6 @@ class AbstractNewton(AbstractProjection):
         low = -np.inf if self.lower is None else self.lower
         high = np.inf if self.upper is None else self.upper
         return Box(spread("lower", low, like), spread("upper", high, like))
-
-
-def outside(projection: AbstractProjection, y: Any) -> Bool[Array, ""]:
-    """Whether a state is out of the bounds of a projection by more than the root of roundoff of its
-    largest component."""
-    box = projection.box(y) if isinstance(projection, AbstractNewton) else None
-    if box is None:
-        return jnp.asarray(False)
-    z = ravel(y)
-    slack = float(jnp.finfo(z.dtype).eps) ** 0.5 * jnp.max(jnp.abs(z), initial=0)
-    return jnp.any((z < box.lower - slack) | (z > box.upper + slack))
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

@@ -19,7 +19,6 @@ from .._projection.base import AbstractProjection, Target, check_projection, has
 from .._projection.equations import any_lane, length, reach
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._projection.within_bounds import outside
 from .._tree import ravel, tree_sub
 from .diffrax_private import member
 from .state import (
@@ -68,11 +67,10 @@ class ManifoldProjection(ForwardingSolver):
     projection has other tolerances.
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
-    violates a `Constraint` or a bound of the projection. More than the square root of roundoff
-    counts, relative to the terms of the constraint, or to the largest component of the state: find
-    a consistent state by [`diffrax_conserve.project`][]. It fails likewise after a jump that the
-    step size controller declares, if the constraint jumps too: end the solve there, `project`, and
-    go on.
+    violates a `Constraint` by more than the square root of roundoff, relative to the size of its
+    terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise after a jump
+    that the step size controller declares, if the constraint jumps too: end the solve there,
+    `project`, and go on.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve tries smaller steps until one moves the state by no more than roundoff, or no
@@ -250,13 +248,13 @@ class ManifoldProjection(ForwardingSolver):
     def _cannot_start(
         self, target: Target, state: State, t0: RealScalarLike, y0: Y, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
-        """Whether a conserved value is not finite, or a step starts out of the bounds or off a
-        `Constraint` where nothing has projected its state: at the first step, and after a jump of
-        the vector field, with which the constraint may jump."""
-        first = jnp.all(state.motion == 0)
-        lost = ~jnp.all(jnp.isfinite(state.values)) | (first & outside(self.projection, y0))
+        """Whether a conserved value is not finite, or a step starts off a `Constraint` where
+        nothing has projected its state: at the first step, and after a jump of the vector field,
+        with which the constraint may jump."""
+        lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
             return lost
+        first = jnp.all(state.motion == 0)
         fresh = first if self.every > 1 else first | made_jump
         equations = target.equations(t0, y0)
         off = lax.cond(

@@ -30,7 +30,7 @@ _ENTRY = (
     "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
 )
 FIRST = register(
-    "a step cannot start: its state violates a `Constraint` or a bound, or a function of the "
+    "a step cannot start: its state violates a `Constraint`, or a function of the "
     "manifold is not finite there. At the start of a solve, start on the manifold: "
     "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a `SemiExplicitDAE` "
     "`y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps "
