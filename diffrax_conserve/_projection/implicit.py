@@ -33,8 +33,8 @@ from .sparse import SparseRows
 # Gradients count as nearly parallel if the sine of their angle is below the cube root of roundoff.
 # They also do if the sine is below `_SMALL_ANGLE` and the correction, relative to the state and
 # divided by the sine, exceeds `_SHORT_CORRECTION`: then the multipliers are large enough for their
-# errors to show in a derivative. These are choices. With them no derivative was found wrong by
-# `tests/laws/test_never_silent.py -k parallel` and by `make soak`.
+# errors to show in a derivative. These are choices, with which the law
+# `tests/laws/test_never_silent.py -k parallel` finds no derivative wrong on 400 orbits.
 _SMALL_ANGLE, _SHORT_CORRECTION = 1e-2, 1e-5
 # Constraints whose gradients are parallel everywhere repeat each other, which does no harm. To tell
 # them we look at the sine at another state, at this relative distance, so far that gradients which
