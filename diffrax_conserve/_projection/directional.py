@@ -45,7 +45,7 @@ class AbstractAlongLine(AbstractProjection):
         equations = dataclasses.replace(problem.equations, units=jnp.abs(direction))
         signs = lax.stop_gradient(jnp.sign(direction))[None]
         y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return y, problem.report(candidate, y, count, ok=ok)
 
 
 @final

@@ -83,7 +83,7 @@ class Newton(AbstractNewton):
         box = self.box(problem.like)
         unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
         y = unknowns[: candidate.size]
-        return y, problem.judge(candidate, y, count)
+        return y, problem.report(candidate, y, count)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS

@@ -60,7 +60,7 @@ class SimplifiedNewton(AbstractNewton):
             y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
         else:
             y, ok, count = project_within(box, equations, candidate, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return y, problem.report(candidate, y, count, ok=ok)
 
 
 SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS

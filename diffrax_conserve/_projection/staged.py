@@ -81,7 +81,7 @@ class Staged(AbstractProjection):
             infos.append(info)
         count = sum(info.num_steps for info in infos)
         # The last stage has judged all parts, by its own tolerances.
-        return y, problem.judge(candidate, y, count, ok=infos[-1].ok)
+        return y, problem.report(candidate, y, count, ok=infos[-1].ok)
 
 
 Staged.__init__.__doc__ = r"""**Arguments:**

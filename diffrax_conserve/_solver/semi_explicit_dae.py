@@ -198,7 +198,7 @@ class _Root(AbstractProjection):
         x, z = _pair(problem.state(candidate))
         root = _solved(self.g, problem.t, x, z, problem.args)
         y = jnp.concatenate([ravel(x), root])
-        return y, problem.judge(candidate, y)
+        return y, problem.report(candidate, y)
 
 
 def _pair(y: Any) -> tuple[Any, Any]:

@@ -192,7 +192,7 @@ class SymmetricProjection(ForwardingSolver):
         )
         y1 = _differentiable(y1, certain(end, found.candidate, y1, end.linearise(y1)[1]))
         problem = target.problem(t1, y0)
-        info = problem.judge(found.candidate, y1, found.num_steps, ok=found.left != -1)
+        info = problem.report(found.candidate, y1, found.num_steps, ok=found.left != -1)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
         failed = cause_of_failure(info.ok, off, (vector, found.candidate, y1), None, None)
         inner_failed = found.result != dfx.RESULTS.successful
