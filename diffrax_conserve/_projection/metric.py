@@ -54,8 +54,8 @@ class MatrixUnits(eqx.Module):
 
     def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S⁻¹ change` in the parts with a matrix, and `change` elsewhere."""
-        product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa:
-        E731 return self._in_parts(product, change)
+        product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
+        return self._in_parts(product, change)
 
     @property
     def sizes(self) -> Float[Array, " n"]:
