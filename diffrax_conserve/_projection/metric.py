@@ -22,7 +22,6 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._options import check_function, check_number
 from .._tree import ravel, real_view
 
-
 # Elements of a matrix that a user passes may differ from their mirror images by this share of
 # themselves. A mass matrix that is computed in float32, with units of roundoff of 1e-7, is
 # symmetric to about 1e-6.
