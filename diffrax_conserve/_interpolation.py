@@ -179,7 +179,7 @@ def _first_of(
     failed = jnp.where(ok, 0, 1)
     for attempt in others:
         # A condition that is the same for all lanes of a batch remains a branch, which is skipped
-        # if no lane needs it. `better` tells that the attempt succeeded, or was not needed.
+        # if no lane needs it.
         found, better = lax.cond(
             any_lane(~ok), lambda fn=attempt: fn(candidate), lambda y=y: (y, ~ok)
         )
