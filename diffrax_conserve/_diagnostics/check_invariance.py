@@ -38,9 +38,9 @@ Entry = FirstIntegral | Constraint
 # By default a derivative is tested at this many states: a misprint shows at almost every state, and
 # more states cost little.
 _NUM_STATES = 100
-# By default a defect of this many units of roundoff counts as roundoff. True integrals of the
-# catalogue have a few units, and those with many terms some hundreds; wrong ones have 1e15 in
-# float64, and 1e7 in float32.
+# By default a defect of this many units of roundoff counts as roundoff. The number is a choice: the
+# roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
+# order one at almost every state.
 _ROUNDOFF = 1e4
 # The distance to another state at which a derivative is looked at too, as a share of each component
 # and of the largest one.

@@ -55,9 +55,9 @@ _LATER = 0.7390851332151607
 _ROUNDS = 3
 # A sampler is called for this many states at least, and for four for each function.
 _LEAST_STATES = 100
-# To find components that rest at all states but not elsewhere, each is moved by this share of its
-# largest value.
-_BESIDE = 1 / 10
+# To find components that rest at all states but not elsewhere, each is moved by its largest value
+# divided by this number.
+_BESIDE = 10
 
 
 def find_invariants(
@@ -361,7 +361,7 @@ def _sampled(
         )
     x = np.asarray(jax.vmap(ravel)(ys))
     largest = np.abs(x).max(axis=0)
-    apart = np.where(largest > 0, largest, largest.max()) * _BESIDE
+    apart = np.where(largest > 0, largest, largest.max()) / _BESIDE
     beside = x + apart * np.sin(np.arange(x.size)).reshape(x.shape)
     moved = np.asarray(measure(ts, jax.vmap(unravel)(beside, ys))[2])
     idle = (slopes == 0).all(axis=0) & (np.isfinite(moved) & (moved != 0)).any(axis=0)
@@ -464,7 +464,7 @@ def _simplified(samples: _Samples, rows: np.ndarray) -> list[np.ndarray]:
 
 def _number(x: float, share: float) -> float:
     """`x` as a decimal number or a fraction, if it is one up to a share of it."""
-    # One digit fewer than the error leaves, so that a decimal is not found by chance.
+    # Two digits fewer than the error leaves, so that a decimal is not found by chance.
     digits = min(_DIGITS, -round(math.log10(share)) - 2)
     simple = float(f"{x:.{digits}g}"), float(Fraction(x).limit_denominator(_DENOMINATOR))
     return next((number for number in simple if abs(x - number) <= share * abs(x)), x)
