@@ -2,7 +2,9 @@
 
 A step kicks the velocities by half of the forces, moves the positions such that the constraints
 hold at the end (SHAKE), kicks the velocities again, and projects them to those that keep the
-constraints. The velocities at the end of a step belong to a linear system with the matrix `G M⁻¹ Gᵀ` there. The
+constraints.
+
+The velocities at the end of a step belong to a linear system with the matrix `G M⁻¹ Gᵀ` there. The
 multipliers of the positions in the next step are found by an iteration for which the same matrix is
 good enough, because that is where the step starts. So the matrix is factored once in a step.
 """
