@@ -142,6 +142,8 @@ def _of_few(
 ) -> Solved:
     """For up to four constraints: each iteration has a Jacobian and an elimination of its own."""
     may_start_again = directions is None and equations.magnitude.size > 1
+    # After so many iterations, and the test that follows them, this is what `left` is.
+    left_then = max_steps - FROZEN_STEPS
 
     def start(y: Any) -> Any:
         """The candidate and the directions, which the iterations share."""
@@ -153,9 +155,9 @@ def _of_few(
         """Tests a state, and if tests are left moves it."""
         candidate, along = first
         if may_start_again:
-            # It starts again at the candidate, because a plane that misses the manifold may have
-            # led far away.
-            y = jnp.where(left == max_steps - FROZEN_STEPS, candidate, y)
+            # If the manifold was not reached then, the state after the next iteration is replaced by
+            # the candidate, because a plane that misses the manifold may have led far away.
+            y = jnp.where(left == left_then, candidate, y)
         seen = equations.linearise(y)
         if not written_out:
             # Without a barrier XLA would evaluate the residuals once for each use of them.
@@ -165,10 +167,10 @@ def _of_few(
         left = after_test(level, left, extra=1, gives_up=left > 0)
         sizes, rows = scaled_rows(equations.scaled(jacobian))
         if may_start_again:
-            # Once `left` is small, the directions are the gradients at the last state. So they are
-            # in the extra iteration within the tolerance too, where `left` is 1. There both are
-            # alike up to roundoff.
-            along = jnp.where(left > max_steps - FROZEN_STEPS, along, rows)
+            # From then on the directions are the gradients at the last state. So they are in the
+            # extra iteration within the tolerance too, where `left` is 1: there the correction is so
+            # short that both are alike.
+            along = jnp.where(left > left_then, along, rows)
         moved = corrected(equations, y, g / sizes, noise / sizes, rows, along)
         return jnp.where(left > 0, moved, y), left
 
