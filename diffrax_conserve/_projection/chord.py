@@ -155,8 +155,8 @@ def _of_few(
         """Tests a state, and if tests are left moves it."""
         candidate, along = first
         if may_start_again:
-            # If the manifold was not reached then, the state after the next iteration is replaced by
-            # the candidate, because a plane that misses the manifold may have led far away.
+            # If the manifold was not reached then, the state after the next iteration is replaced
+            # by the candidate, because a plane that misses the manifold may have led far away.
             y = jnp.where(left == left_then, candidate, y)
         seen = equations.linearise(y)
         if not written_out:
@@ -168,8 +168,8 @@ def _of_few(
         sizes, rows = scaled_rows(equations.scaled(jacobian))
         if may_start_again:
             # From then on the directions are the gradients at the last state. So they are in the
-            # extra iteration within the tolerance too, where `left` is 1: there the correction is so
-            # short that both are alike.
+            # extra iteration within the tolerance too, where `left` is 1: there the correction is
+            # so short that both are alike.
             along = jnp.where(left > left_then, along, rows)
         moved = corrected(equations, y, g / sizes, noise / sizes, rows, along)
         return jnp.where(left > 0, moved, y), left
