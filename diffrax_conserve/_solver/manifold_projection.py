@@ -182,6 +182,8 @@ class ManifoldProjection(ForwardingSolver):
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
         )
+        # The projection. `start` is its target with the balances at the start of the step, from
+        # which dense output integrates them to any time in the step; `target` is that at the end.
         change = moved(y0, candidate)
         motion = state.moved_by(change, candidate)
         start = self._target(terms, t1, state, motion, candidate, args).following(t0, y0)
@@ -191,6 +193,7 @@ class ManifoldProjection(ForwardingSolver):
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
+        # Whether it succeeded, and if not, whether a shorter step could.
         units = start.units(t0, y0)
         cannot_start = self._cannot_start(start, state, t0, y0, made_jump)
         states = y0, candidate, y1
@@ -215,8 +218,9 @@ class ManifoldProjection(ForwardingSolver):
         # A failure that is final reports no error: the step is accepted, and its result ends the
         # solve. The error is huge but finite, because the norm of an infinite complex number would
         # be NaN.
-        shown = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
-        error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
+        reported = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
+        error = jtu.tree_map(lambda e: jnp.where(failed > 0, reported.astype(e.dtype), e), error)
+        # If the wrapped solver has failed by itself, its own result is kept.
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
@@ -260,7 +264,8 @@ class ManifoldProjection(ForwardingSolver):
         lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
             return lost
-        first = jnp.all(state.motion == 0)
+        first = jnp.all(state.motion == 0)  # it is zero only before the first step
+        # If not every step is projected, a later step may well start off the constraint.
         fresh = first if self.every > 1 else first | made_jump
         equations = target.equations(t0, y0)
         off = lax.cond(
