@@ -76,6 +76,11 @@ def tree_tangents(a: Any, t_a: Any) -> Any:
     return jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, a, t_a)
 
 
+def key_of(entry: Any) -> Any:
+    """What an entry of a path in a PyTree says: a key, a position or a name."""
+    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
+
+
 def ravel(y: Any) -> Any:
     """The components of `y` as one real vector, complex ones as real and imaginary parts."""
     leaves = [jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))]

@@ -262,7 +262,7 @@ def never_give_up(package):
     package.function("is_final", lambda _: lambda *arguments: jnp.asarray(False))
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "elastic_wall")
+@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def give_up_once_a_step_is_short(package):
     def mutate(is_final):
         def mutated(state, t0, t1, moved, candidate):
@@ -274,7 +274,7 @@ def give_up_once_a_step_is_short(package):
     package.function("is_final", mutate)
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "near_rest")
+@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def forget_the_roundoff_that_is_not_in_the_gradient(package):
     def mutate(measure):
         return lambda fn, y: (*measure(fn, y)[:2], 0 * fn(y))

@@ -2,13 +2,13 @@
 
 import diffrax as dfx
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._projection.jaxprs import jaxprs_inside
 from diffrax_conserve._projection.scalars import MAX_OPERATIONS, components, in_scalars, written_out
 
 from .thinned import some_of
@@ -148,9 +148,9 @@ JOINTS = {"broadcast_in_dim", "concatenate", "reshape", "squeeze", "slice", "sta
 def equations_in(jaxpr):
     """Those of a jaxpr, but inside of calls instead of the calls."""
     for eqn in jaxpr.eqns:
-        inner = list(jex.jaxprs_in_params(eqn.params)) if eqn.primitive.name == "jit" else []
+        inner = list(jaxprs_inside(eqn)) if eqn.primitive.name in ("jit", "pjit") else []
         for called in inner:
-            yield from equations_in(called)
+            yield from equations_in(called.jaxpr)
         if not inner:
             yield eqn
 
@@ -240,7 +240,7 @@ def innermost_loops(jaxpr):
 def loops_of(eqn):
     if eqn.primitive.name == "while":
         return innermost_loops(eqn.params["body_jaxpr"].jaxpr)
-    inner = jex.jaxprs_in_params(eqn.params)
+    inner = [closed.jaxpr for closed in jaxprs_inside(eqn)]
     return [loop for jaxpr in inner for loop in innermost_loops(jaxpr) if loop is not jaxpr]
 
 

@@ -31,7 +31,7 @@ from .._options import ONE_STATE, one_of
 from .._printing import printed
 from .._projection.equations import Jacobian, equations_of, relative, shown_terms
 from .._projection.roundoff import hidden_terms
-from .._tree import ravel, unravel
+from .._tree import key_of, ravel, unravel
 
 Entry = FirstIntegral | Constraint
 
@@ -195,7 +195,7 @@ def batch(
 def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
     """The entries with their names in the report, such as `energy` for `manifold["energy"]`."""
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    return [(jtu.keystr(path, simple=True, separator=".") or "manifold", e) for path, e in flat]
+    return [(".".join(str(key_of(x)) for x in path) or "manifold", e) for path, e in flat]
 
 
 @eqx.filter_jit

@@ -28,6 +28,11 @@ from .._options import check_counts, check_function, one_of
 from .._tree import ravel, real_view, tree_size, unravel
 from .check_invariance import batch
 
+try:
+    from jax import enable_x64 as _enable_x64
+except ImportError:  # before version 0.8
+    from jax.experimental import enable_x64 as _enable_x64  # pyright: ignore
+
 # A combination counts as conserved if its derivative is at most this many units of roundoff of the
 # terms that cancel in it. True integrals have 0.1 to 0.7 of them.
 _ROUNDOFF = 16
@@ -142,7 +147,7 @@ def find_invariants(
         vector_field = vector_field.vector_field
     check_vector_field(vector_field)
     _check_basis(basis)
-    with jax.enable_x64(True):
+    with _enable_x64(True):
         if callable(states):
             like = eqx.filter_eval_shape(states, jr.key(0))
             size = len(_names(basis, like))

@@ -18,7 +18,7 @@ from .._balance import integrated_rates
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
-from .._tree import ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
+from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 from .equations import ON, Equations, equations_of, length, relative
 from .metric import MatrixUnits, Units, units_of
 
@@ -304,7 +304,7 @@ class Target(eqx.Module):
         equations, like = self.equations(t, candidate), jax.eval_shape(lambda: candidate)
         manifold, t, args = self.manifold, t * self.direction, self.args
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-        keys = tuple(_key(path[0]) if path else None for path, _ in flat)
+        keys = tuple(key_of(path[0]) if path else None for path, _ in flat)
         values = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
         return Problem(equations, t, args, unflatten(self.value, values), like, keys, step)
 
@@ -328,8 +328,3 @@ class Target(eqx.Module):
         idle = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         idle = dataclasses.replace(idle, ok=jnp.asarray(True))
         return lax.cond(needed, lambda: self.project(t, candidate, step), lambda: (candidate, idle))
-
-
-def _key(entry: Any) -> Any:
-    """The key, the index or the name in one part of a JAX path, whichever kind of part it is."""
-    return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))

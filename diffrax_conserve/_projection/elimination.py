@@ -129,7 +129,7 @@ def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
         solve = gram.factored()
         return lambda g: solve(g / sizes) / sizes
     added = _added(gram) * jnp.where(gram > 0, gram, 1)
-    lower = jnp.linalg.cholesky(gram + added, symmetrize_input=False)
+    lower = lax.linalg.cholesky(gram + added, symmetrize_input=False)
     one = jnp.eye(len(gram), dtype=added.dtype)
     inverse = jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
     return lambda g: combined(combined(g.astype(inverse.dtype), inverse.T), inverse).astype(g.dtype)

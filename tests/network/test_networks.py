@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from jax.extend.core import jaxprs_in_params
 
 import diffrax_conserve as dfc
+from diffrax_conserve._projection.jaxprs import jaxprs_inside
 
 from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, in_single, oscillator, solution, states
 from ..problems import solve
@@ -165,8 +165,8 @@ def products(jaxpr):
     for eqn in jaxpr.eqns:
         if eqn.primitive.name == "dot_general":
             found |= {v.aval.dtype.name for v in eqn.invars}
-        for inner in jaxprs_in_params(eqn.params):
-            found |= products(inner)
+        for inner in jaxprs_inside(eqn):
+            found |= products(inner.jaxpr)
     return found
 
 
