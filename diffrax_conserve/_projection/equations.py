@@ -43,7 +43,7 @@ NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
 _NOISE = 1 / 8
 # A state is near rest where the tolerance exceeds one part in this many of the terms that the
 # gradient shows. There a correction by one tolerance would move the state by more than 1/64 of
-# itself. The number is a choice; `tests/laws/test_refused.py -k "near rest"` solves such problems.
+# itself. The number is a choice; `tests/laws/test_refused.py -k near` solves such problems.
 _NEAR_REST = 64
 # One entry of a manifold, as a function from the state to the vector of its residuals.
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]

@@ -4,9 +4,9 @@ In `1 - cos(q)` near zero the terms are about one, but the value and the gradien
 a network the terms of the hidden layers cancel. Such a function is less accurate than its value and
 gradient tell, and a tolerance made from them alone could not be met.
 
-This is a first-order error analysis, done by reverse differentiation as in "automatic error
-analysis" (S. Linnainmaa, "Taylor expansion of the accumulated rounding error", *BIT* 16 (1976),
-146-160): an error of size `δ` in an intermediate value changes the result by `δ` times its adjoint.
+So we make a first-order error analysis by reverse differentiation (S. Linnainmaa, "Taylor expansion
+of the accumulated rounding error", *BIT* 16 (1976), 146-160): an error `δ` of an intermediate value
+changes the result by `δ` times the adjoint of that value.
 
 - The error of a sum is about one unit of roundoff of the sizes of its terms. That of a cast, or of
   the operand of a function such as the sine, is one unit of roundoff of its own size.
