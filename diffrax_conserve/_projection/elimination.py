@@ -97,8 +97,8 @@ def eliminated(
             x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
         return x.astype(dtype) * unit, rows
     least = _LEAST_PIVOT * m * float(jnp.finfo(dtype).eps)
-    left, right = list(b), list(rows)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
+    left, right = list(b), list(rows)
     small = [] if noise is None else list(noise)
     for k in range(m):
         regular = jnp.abs(matrix[k][k]) > least * jnp.abs(gram[k, k])
