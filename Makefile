@@ -134,7 +134,7 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 	XLA_FLAGS= $(BIN)/python benchmarks/cost/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
 	$(BIN)/python benchmarks/cost/report.py --write
 
-bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and judge them: many hours
+bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and measure them: many hours
 	set -e; for name in $(TRAININGS); do $(BIN)/python benchmarks/learned/$$name.py; done
 	$(BIN)/python benchmarks/learned/chemistry.py --system robertson
 

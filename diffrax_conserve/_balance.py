@@ -1,4 +1,8 @@
-"""Balance laws: the rates of first integrals, integrated along a solution."""
+"""Balance laws: the rates of first integrals, integrated along a solution.
+
+Between two times a first integral with a `rate` changes by the integral of its rate. Within a step
+we know the solution by the dense output of the solver, and compute the integral by quadrature.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +16,8 @@ from jaxtyping import Array
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ._manifold import evaluate, exactly, is_entry, named_entries, rate_of
 
-# Gauss quadrature of order eight, the highest order of any solver in diffrax.
+# Gauss quadrature with four nodes is exact for polynomials of degree seven, so its error in a step
+# is of order nine, like that of the most accurate solver in diffrax, Dopri8.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -31,7 +36,8 @@ def refuse_rates(manifold: Manifold, user: str) -> None:
 
 
 def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`manifold` with each entry replaced by its rate, zero where it has none."""
+    """`manifold` with each entry replaced by its rate, shaped like its value. The rate of an entry
+    that has none is zero."""
 
     def rate(entry: Any, like: Any) -> Values:
         fn = rate_of(entry)
@@ -51,9 +57,13 @@ def integrated_rates(
     args: Args,
     direction: RealScalarLike,
 ) -> Values:
-    """The integral of each rate along `path`, zero for an entry without one. All times are those of
-    the solver, that is `direction` times the times of the manifold."""
-    half = (end - start) / 2
+    """The integral of each rate along `path`, zero for an entry without one.
+
+    All times are those of the solver, which `diffeqsolve` negates in a solve backwards in time. The
+    times of the manifold are `direction` times these. So a rate is evaluated at `t * direction`,
+    and the integral over the time of the manifold has the factor `direction`.
+    """
+    half = (end - start) / 2  # the nodes are in the interval from -1 to 1
 
     def at(node: RealScalarLike) -> Values:
         t = start + (1 + node) * half

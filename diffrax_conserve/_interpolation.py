@@ -1,8 +1,12 @@
-"""Dense output on the manifold: the inner solver's interpolant, projected at each evaluation.
+"""Dense output on the manifold: the interpolant of the wrapped solver, projected at each
+evaluation.
 
-A value always belongs to its time: what cannot be projected stays where the interpolant is. At
-the ends of a step it is projected too, because stored states would have no slope, which the root
-finder of an event needs.
+A value always belongs to its time. If the interpolant cannot be projected at a time, the value
+there is the interpolant itself, and not the state of a time nearby that could be projected.
+
+The ends of a step are evaluated in the same way, although their projected states are known. To
+return these by a comparison of times would give a value that is constant in time, and the root
+finder of an event needs the slope.
 """
 
 import dataclasses
@@ -26,20 +30,21 @@ from ._projection.equations import any_lane, length
 from ._projection.within_bounds import AbstractNewton
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
 
-# The largest number of damped steps.
+# The second attempt at a projection makes at most this many damped steps, as many as `Newton` by
+# default. It is made only in very long steps, where the undamped iteration has failed.
 _DAMPED_STEPS = 100
 
 
 @final
 class PackedTarget(eqx.Module):
-    """A `Target`, or another module, in the form in which `dense_info` stores it: only arrays are
-    leaves."""
+    """A `Target`, or another module, in the form in which `dense_info` can store it. diffrax copies
+    the leaves of `dense_info` into arrays over the steps, so that only arrays may be leaves."""
 
     arrays: PyTree[Array]
     static: Any = eqx.field(static=True)
 
     def __init__(self, target: Any):
-        # Python numbers are kept static, because a function may use them as a shape or an index.
+        # Python numbers stay what they are, because a function may use them as a shape or an index.
         arrays, self.static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
 
@@ -58,6 +63,14 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     interpolant itself, which is off the manifold by the error of the interpolation.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
+
+    - `t0`, `t1`: the ends of the step, as times of the solver.
+    - `inner`: the interpolant `u` of the wrapped solver.
+    - `shift`: the correction of the step, `y₁ - ŷ₁`.
+    - `limit`: the length of the step in the metric, which no correction may exceed.
+    - `error`: the error estimate of the step, if the projection uses it.
+    - `target`: what the projection of the step aimed at, without the balances of the step itself.
+    - `due`: whether the step is projected; `None` if every step is.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -75,7 +88,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        # Arrays over which the functions of the manifold close become leaves.
+        # The derivative rule below needs the arrays over which the functions of the manifold close,
+        # such as parameters, as leaves.
         projected, moved = (
             eqx.filter_closure_convert(ft.partial(fn, left=left), t0)
             for fn in (self.projected, self.moved)
@@ -83,8 +97,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         return _evaluated(projected, moved, t0)
 
     def moved(self, t: RealScalarLike, left: bool) -> Y:
-        """The interpolant of the wrapped solver, which meets the projected states at both ends."""
-        # Strict inequalities keep the derivative of the interpolant at the ends of the step.
+        """The interpolant of the wrapped solver, moved by `θ (y₁ - ŷ₁)` at the share `θ` of the
+        step, so that it meets the projected states at both ends."""
+        # A time exactly at an end is inside, so that the slope there is that of the interpolant.
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
         t = jnp.where(t < first, first, jnp.where(t > last, last, t))
         share = (t - self.t0) / (self.t1 - self.t0)
@@ -95,6 +110,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(move, self.inner.evaluate(t, left=left), self.shift)
 
     def projected(self, t: RealScalarLike, left: bool) -> Y:
+        """The projection of the moved interpolant, or that itself where no projection succeeds."""
         candidate = self.moved(t, left)
         target = self.target.unpack().advanced(self.t0, t, self.inner.evaluate)
         start = lambda: self.inner.evaluate(self.t0)  # noqa: E731
@@ -103,6 +119,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         units, limit = problem.equations.units, lax.stop_gradient(self.limit)
 
         def near(candidate: Array, y: Array, ok: Array) -> tuple[Array, Array]:
+            """`y`, and whether it succeeded without leading further away than the step is long."""
             return y, ok & (length(y - candidate, units) <= limit)
 
         def project(candidate: Array) -> tuple[Array, Array]:
@@ -114,11 +131,12 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             return near(candidate, y, ok)
 
         vector = ravel(candidate)
-        # Damped steps keep no bounds, and lead elsewhere than another projection's own rule.
+        # A second attempt by damped steps makes sense only if the projection follows gradients too.
+        # The rule of another projection, such as a line, leads elsewhere. And bounds would be lost.
         by_gradients = isinstance(target.projection, AbstractNewton)
         damps = by_gradients and not has_bounds(target.projection)
         attempts = [project, damped] if damps else [project]
-        # Arrays over which the functions of the manifold close become leaves.
+        # `_first_of` has a derivative rule too, so its functions are converted likewise.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
         y, _ = _first_of(attempts, vector)
         y, due = problem.state(y), self.due
@@ -127,15 +145,17 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
 @eqx.filter_custom_jvp
 def _evaluated(projected: Callable[..., Y], moved: Callable[..., Y], t: RealScalarLike) -> Y:
+    """The value at a time. The moved interpolant is needed only for its derivative."""
     del moved
     return projected(t)
 
 
 @_evaluated.def_jvp
 def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
-    """The slope in time is that of the projected interpolant. Where this is not certain, as on a
-    circular orbit, it is that of the moved interpolant: the root finder of an event needs a slope,
-    but not an exact one. A derivative in anything else is exact or NaN."""
+    """The slope in time is that of the projected interpolant. Where that is NaN, because gradients
+    are nearly parallel as on a circular orbit, it is the slope of the moved interpolant: the root
+    finder of an event needs a slope, but not an exact one. The derivative by anything else, such as
+    a parameter, must be exact, so it stays NaN there."""
     (projected, moved, t), (t_projected, _, t_t) = primals, tangents
     y = projected(t)
     _, t_y = eqx.filter_jvp(lambda fn: fn(t), (projected,), (t_projected,))
@@ -157,7 +177,9 @@ def _first_of(
     project, *others = attempts
     y, ok = project(candidate)
     failed = jnp.where(ok, 0, 1)
-    for attempt in others:  # not evaluated where no lane needs it
+    for attempt in others:
+        # A condition that is the same for all lanes of a batch remains a branch, which is skipped
+        # if no lane needs it.
         found, better = lax.cond(
             any_lane(~ok), lambda fn=attempt: fn(candidate), lambda y=y: (y, ~ok)
         )
@@ -167,7 +189,9 @@ def _first_of(
 
 @_first_of.def_jvp
 def _first_of_jvp(primals: Any, tangents: Any) -> Any:
-    """Damped steps have no derivative, and the candidate has its own."""
+    """The derivative of the first attempt, a projection, is its own. The state of a later one
+    depends on a path of damped steps, so that its derivative is unknown, and NaN. If all failed,
+    the state is the candidate, with the derivative of the candidate."""
     attempts, candidate = primals
     y, failed = _first_of(*primals)
     given = (attempts[0], candidate), (tangents[0][0], tangents[1])

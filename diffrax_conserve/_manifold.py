@@ -16,7 +16,7 @@ from ._tree import tree_shapes, tree_size
 
 def _arrays(value: Values | None) -> Values | None:
     check_numbers("value", value)
-    # Arrays, so that a different value does not trigger another compilation.
+    # Python numbers would be static for JAX: another value would be another compilation.
     return jtu.tree_map(jnp.asarray, value)
 
 
@@ -120,7 +120,8 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 
 
 class Along(eqx.Module):
-    """The derivative of a function along a vector field."""
+    """The derivative of a function along a vector field, `∂_t g + ∂_y g · f`, by one forward pass.
+    It is a module and not a closure, so that JAX compiles it once for equal functions."""
 
     fn: ConstraintFn
     vector_field: Callable[[RealScalarLike, Any, Args], Any]
@@ -140,7 +141,8 @@ def slope_of(vector_field: Any, t: RealScalarLike, y: Y, args: Args) -> Y:
 
 
 def slope_like(y: Y, slope: Any) -> Y:
-    """The value of a vector field, broadcast and cast to the shapes and dtypes of the state."""
+    """The value of a vector field, broadcast and cast to the shapes and dtypes of the state. Raises
+    if a leaf has another shape than that of the state and is no scalar."""
     if jtu.tree_structure(slope) == jtu.tree_structure(y):
         pairs = zip(jtu.tree_leaves(slope), jtu.tree_leaves(y), strict=True)
         if all(jnp.shape(f) in ((), jnp.shape(x)) for f, x in pairs):
@@ -163,7 +165,7 @@ def is_entry(x: Any) -> bool:
 
 
 def has_value(entry: Any) -> bool:
-    """Whether the conserved value at the start of a solve does not depend on the solve."""
+    """Whether it is known without a solve what an entry is at its start: zero or its `value`."""
     return isinstance(entry, Constraint) or entry.value is not None
 
 
@@ -187,6 +189,8 @@ def check_manifold(manifold: Manifold) -> None:
 
 
 def named_entries(manifold: Manifold, root: str = "manifold") -> list[tuple[str, Any]]:
+    """The entries of a manifold, with the names that messages give them, such as
+    `manifold['energy']`."""
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(f"{root}{jtu.keystr(path)}", entry) for path, entry in flat]
 
@@ -231,7 +235,9 @@ def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
 
 
 def exactly(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:
-    """`fn(t, y, args)`, without the three digits that float32 matrix products have on a GPU."""
+    """`fn(t, y, args)`, with matrix products of full precision. By default a GPU multiplies
+    matrices in float32 with inputs of three digits (TensorFloat-32), which no tolerance could allow
+    for."""
     with jax.default_matmul_precision("highest"):
         return fn(t, y, args)
 
@@ -248,9 +254,12 @@ def conserved_values(
     given: Values | None = None,
     root: str = "manifold",
 ) -> Values:
-    """`manifold` with each entry replaced by the value of `fn` that a solve started at
-    `(t, y, args)` conserves: that in `given`, its own `value`, or that of the state; zero for a
-    constraint. Raises unless all fit each other and the state."""
+    """`manifold` with each entry replaced by the value that a solve from `(t, y, args)` conserves.
+
+    For a constraint that is zero. For a first integral it is what `given` holds in its place; if
+    nothing is given, its own `value`; and without that, `fn(t, y, args)`. Raises unless all fit
+    each other and the state.
+    """
     entries, treedef = named_entries(manifold, root), jtu.tree_structure(manifold, is_leaf=is_entry)
     values = [getattr(entry, "value", None) for _, entry in entries]
     if given is not None:

@@ -1,4 +1,4 @@
-"""PyTree arithmetic: states as vectors, with real dtypes kept leaf by leaf."""
+"""PyTree arithmetic, and states as real vectors."""
 
 import math
 from typing import Any
@@ -14,8 +14,12 @@ from ._custom_types import Y
 
 
 def real_view(y: Any) -> Any:
-    """`y` with the real and the imaginary part of each complex leaf along a new first axis, so that
-    a weight shaped like the leaf still broadcasts. Projections work on this view only."""
+    """`y` with the real and the imaginary part of each complex leaf stacked along a new first axis.
+
+    All linear algebra of this package is real, and works on this view. Because the new axis is the
+    first one, an option such as a weight that broadcasts against the leaf broadcasts against the
+    view too.
+    """
     return jtu.tree_map(lambda x: jnp.stack([jnp.real(x), jnp.imag(x)]) if _is_complex(x) else x, y)
 
 
@@ -38,7 +42,8 @@ def tree_all_finite(a: PyTree[Array]) -> Array:
 
 
 def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
-    """The components of `vector` in the structure, shapes and dtypes of `like`."""
+    """The components of `vector` in the structure, shapes and dtypes of `like`, whose leaves are
+    real; see `unravel` for states."""
     leaves, treedef = jtu.tree_flatten(like)
     out, start = [], 0
     for leaf in leaves:
@@ -60,11 +65,14 @@ def tree_shapes(a: Any) -> Any:
 
 
 def tree_stop_gradient(a: Any) -> Any:
+    """`a` without its derivative. Leaves that are no arrays, such as functions, stay as they
+    are."""
     return jtu.tree_map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, a)
 
 
 def tree_tangents(a: Any, t_a: Any) -> Any:
-    """`t_a`, the tangents of `a`, with `None` replaced by zeros."""
+    """`t_a`, the tangents of `a`, with zeros in the place of each `None`, which equinox gives where
+    something is not differentiated."""
     return jtu.tree_map(lambda x, t: jnp.zeros_like(x) if t is None else t, a, t_a)
 
 

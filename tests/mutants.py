@@ -198,7 +198,7 @@ def leave_a_lane_of_a_batch_unfinished(package):
 
 
 @noticed_by("tests/laws/test_never_silent.py", "-k", "success_means")
-def judge_success_by_the_scale_at_the_candidate(package):
+def decide_success_by_the_scale_at_the_candidate(package):
     def mutate(solve):
         def mutated(equations, candidate, *rest, **options):
             scale = equations.scale(equations.linearise(candidate)[1], candidate)

@@ -38,6 +38,17 @@ from .._tree import key_of, ravel, unravel
 
 Entry = FirstIntegral | Constraint
 
+# By default a derivative is tested at this many states: a misprint shows at almost every state, and
+# more states cost little.
+_NUM_STATES = 100
+# By default a defect of this many units of roundoff counts as roundoff. The number is a choice: the
+# roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
+# order one at almost every state.
+_ROUNDOFF = 1e4
+# The distance to another state at which a derivative is looked at too, as a share of each component
+# and of the largest one.
+_BESIDE = 0.1
+
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceEntry:
@@ -61,8 +72,8 @@ class InvarianceEntry:
 
 @dataclasses.dataclass(frozen=True)
 class InvarianceReport:
-    """The verdict of `check_invariance`, printed as a table: `ok` if every entry is conserved,
-    within `rtol`, at each of the `num_states` states."""
+    """What `check_invariance` found, printed as a table: `ok` if every entry is conserved, within
+    `rtol`, at each of the `num_states` states."""
 
     entries: tuple[InvarianceEntry, ...]
     num_states: int
@@ -96,7 +107,7 @@ def check_invariance(
     t: Real[ArrayLike, "*states"] = 0.0,
     args: Args = None,
     key: PRNGKeyArray | None = None,
-    num_states: int = 100,
+    num_states: int = _NUM_STATES,
     rtol: float | None = None,
 ) -> InvarianceReport:
     r"""Checks, by automatic differentiation, that a vector field conserves a manifold.
@@ -154,11 +165,11 @@ def check_invariance(
     check_vector_field(vector_field)
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
-        rtol = 1e4 * float(jnp.finfo(ts.dtype).eps)
+        rtol = _ROUNDOFF * float(jnp.finfo(ts.dtype).eps)
     with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
     entries = [
-        _verdict(name, entry, rtol, *map(np.asarray, measured))
+        _entry_of_report(name, entry, rtol, *map(np.asarray, measured))
         for (name, entry), measured in zip(_entries(manifold), found, strict=True)
     ]
     return InvarianceReport(tuple(entries), ts.size, rtol)
@@ -167,6 +178,7 @@ def check_invariance(
 def batch(
     t: Real[ArrayLike, "*states"], states: Any, key: PRNGKeyArray, num_states: int
 ) -> tuple[Float[Array, " states"], PyTree[Array]]:
+    """A time for each state, and the states, sampled if they are given by a sampler."""
     if callable(states):
         check_function("`states`", states, "states(key)", "a state")
         states = eqx.filter_jit(eqx.filter_vmap(states))(jr.split(key, num_states))
@@ -186,6 +198,7 @@ def batch(
 
 
 def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
+    """The entries with their names in the report, such as `energy` for `manifold["energy"]`."""
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(".".join(str(key_of(x)) for x in path) or "manifold", e) for path, e in flat]
 
@@ -195,8 +208,9 @@ def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
 def _measure(
     vector_field: Callable, manifold: Manifold, t: Float[Array, ""], y: Any, args: Args
 ) -> list[tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""], Bool[Array, " m"]]]:
-    """The largest relative defect and residual of each entry, whether its gradient is zero, and of
-    each of its elements whether all terms of the derivative are."""
+    """At one state, for each entry: the largest relative defect of its derivative; its largest
+    relative residual, zero for a first integral; whether its gradient is zero; and for each of its
+    elements whether all terms of the derivative are zero here but not beside this state."""
     return [_relative_sizes(*entry, t, y, vector_field, args) for entry in named_entries(manifold)]
 
 
@@ -215,21 +229,25 @@ def _relative_sizes(
     rate = ravel(rates(entry, t, y, args)).astype(dtype)
 
     def excess(vector: Array) -> Array:
+        """The derivative along the flow, minus the rate."""
         along = Along(entry.fn, vector_field)(t, unravel(vector, y), args)
         return ravel(along).astype(dtype) - rate
 
     def terms_at(vector: Array, jacobian: Jacobian) -> Array:
+        """The sum of the sizes of its terms."""
         state = unravel(vector, y)
         slope = ravel(slope_of(vector_field, t, state, args))
         return shown_terms(jacobian, slope) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)
-    # Where each term is zero nothing is tested, unless that is so beside the state too, as it is of
-    # a parameter among the components.
-    sizes = 0.1 * (jnp.abs(vector) + jnp.max(jnp.abs(vector), initial=0))
+    # If each term of the derivative is zero, its sum tells nothing, as at an equilibrium. Only if
+    # the terms are zero beside the state too they are zero everywhere, such as those of an integral
+    # which is a parameter among the components. The other state is in a direction without pattern.
+    sizes = _BESIDE * (jnp.abs(vector) + jnp.max(jnp.abs(vector), initial=0))
     beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
     idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
-    # Forces may cancel inside the field.
+    # Forces may cancel inside the field, so that its value is less accurate than its size tells. If
+    # that roundoff is much larger than the terms, the defect is relative to it.
     if equations.pattern is None:
         _, _, hidden = hidden_terms(excess, vector)
         terms = jnp.where(hidden > 4 * terms, hidden, terms)
@@ -247,9 +265,11 @@ def _relative_sizes(
     )
 
 
-def _verdict(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:
+def _entry_of_report(name: str, entry: Entry, rtol: float, *found: np.ndarray) -> InvarianceEntry:
+    """The line of the report on an entry of the manifold, from what was measured at all states.
+    Raises if a state violates a constraint."""
     defects, residuals, constant, idle = found
-    # The first NaN, or the largest.
+    # `argmax` finds the first NaN, or without one the largest.
     state, worst = int(np.argmax(defects)), int(np.argmax(residuals))
     if not residuals[worst] <= rtol:
         raise ValueError(

@@ -125,6 +125,8 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
     numbers = jnp.abs(ravel(values))
 
     def at(t: Array, y: Y) -> Array:
+        # Twice the tolerance of a projection, because the roundoff of the functions is measured
+        # here anew, and may be a bit smaller than where the solve measured it.
         g = ravel(residual(t, y))
         _, jacobian, hidden = hidden_scale(manifold, t, y, args)
         scale = numbers + shown_terms(jacobian, ravel(y)) + hidden
@@ -181,7 +183,8 @@ def _residuals(
         ) from error
     gained = _gained(sol, manifold, args, values)
 
-    # The rates are integrated from the start of the solve, at which a given `value` holds.
+    # A given `value` holds at the start of the solve, from which the rates are integrated. Without
+    # one the value is known at the first saved time, so what was gained before is subtracted.
     def at_start(entry: Any, value: Values, gained: Values) -> Values:
         return value if has_value(entry) else tree_sub(value, gained)
 
@@ -212,12 +215,14 @@ def _gained(
     def until(step: RealScalarLike, end: RealScalarLike) -> Values:
         info = jtu.tree_map(lambda x: x[step], path.infos)
         local = path.interpolation_cls(t0=path.ts[step], t1=path.ts[step + 1], **info)
-        # That from which a projected solver computed its balance.
+        # A projected solver computes its balances along the dense output of the wrapped solver, so
+        # we take the same.
         local = getattr(local, "inner", local)
         return integrated_rates(manifold, path.ts[step], end, local.evaluate, args, path.direction)
 
     def whole(step: Array) -> Values:
-        # Padded steps are computed too, as the first one, and discarded.
+        # Of a batch with unlike numbers of steps, some are padding. These are replaced by the first
+        # step, and the result is discarded.
         used = step < path.ts_size - 1
         start = jnp.where(used, step, 0)
         return jtu.tree_map(lambda x: jnp.where(used, x, 0), until(start, path.ts[start + 1]))

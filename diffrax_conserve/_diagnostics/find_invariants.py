@@ -1,4 +1,10 @@
-"""First integrals of a vector field, found as combinations of basis functions."""
+"""First integrals of a vector field, found as combinations of basis functions.
+
+The derivatives of the functions along the field, at many states, are the columns of a matrix. A
+combination is conserved if its coefficients are in the null space. The rest of this file makes that
+reliable: rows and columns are scaled, roundoff is compared with the sizes of terms, the null space
+is brought into a simple form, and each result is verified at other states.
+"""
 
 import itertools
 import math
@@ -27,21 +33,36 @@ try:
 except ImportError:  # before version 0.8
     from jax.experimental import enable_x64 as _enable_x64  # pyright: ignore
 
-# A combination is conserved if its derivative is within `_ROUNDOFF` units of roundoff of the terms
-# that cancel in it; true ones have 0.1 to 0.7. The next singular value must be `_GAP` times as
-# large, because the inverse of this ratio is the error of the coefficients.
-_ROUNDOFF, _GAP = 16, 1e3
-# What counts as the error of a coefficient, as a share of the largest term: each is tried, and the
-# combination must then still be conserved. A number may be a decimal, of fewer digits than the
-# error allows, or a fraction with such a denominator.
-_SHARES, _DENOMINATOR = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11), 12
-# What varies by less than this share of its terms does not vary.
+# A combination counts as conserved if its derivative is at most this many units of roundoff of the
+# terms that cancel in it. True integrals have 0.1 to 0.7 of them.
+_ROUNDOFF = 16
+# The next singular value must be larger by this factor. The inverse of the ratio is the error of
+# the coefficients: with a thousand they have three digits, of which the simplification finds the
+# rest.
+_GAP = 1e3
+# The errors of coefficients that are tried, as shares of the largest term. With each the
+# coefficients are rounded to simple numbers, and the combination must then still be conserved.
+_SHARES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
+# A simple number is a decimal of at most so many digits, or a fraction with at most this
+# denominator.
+_DIGITS, _DENOMINATOR = 6, 12
+# If a function varies by less than this share of its terms, it counts as constant. This and the
+# next two are choices between roundoff, 1e-16, and the smallest effects that matter.
 _ZERO = 1e-9
-# A smaller element is no pivot. A combination is a polynomial of others if no more than this share
-# of it is left over.
-_PIVOT, _DEPENDENT = 1e-8, 1e-7
-# A second time at which a field that depends on time has another value.
+# An element smaller than this is no pivot of the reduced echelon form.
+_PIVOT = 1e-8
+# A combination counts as a polynomial of others if at most this share of it is left over.
+_DEPENDENT = 1e-7
+# A second time, at which a field that depends on time should have another value: a number that is
+# no multiple of a likely period.
 _LATER = 0.7390851332151607
+# The scales of rows and of columns depend on each other. They settle after three rounds.
+_ROUNDS = 3
+# A sampler is called for this many states at least, and for four for each function.
+_LEAST_STATES = 100
+# To find components that rest at all states but not elsewhere, each is moved by its largest value
+# divided by this number.
+_BESIDE = 10
 
 
 def find_invariants(
@@ -130,7 +151,7 @@ def find_invariants(
         if callable(states):
             like = eqx.filter_eval_shape(states, jr.key(0))
             size = len(_names(basis, like))
-            num_states = max(100, 4 * size) if num_states is None else num_states
+            num_states = max(_LEAST_STATES, 4 * size) if num_states is None else num_states
             check_counts(num_states=num_states)
         key = jr.key(0) if key is None else key
         ts, ys = batch(t, states, key, 0 if num_states is None else num_states)
@@ -155,7 +176,8 @@ def _one(ys: Any) -> Any:
 
 
 class _Products(eqx.Module):
-    """Products of components of the state, as indices of these; that of a one fills them up."""
+    """Products of components of the state, each given by the indices of its factors. All have the
+    same number of factors: the index past the end of the state, which means 1, fills them up."""
 
     factors: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
@@ -271,7 +293,10 @@ def _formula(c: np.ndarray, names: list[str]) -> str:
 
 
 class _Samples:
-    """What is known of the functions at the states, with rows and columns scaled to size one.
+    """What is known of the functions at the states.
+
+    The rows, one for each state, and the columns, one for each function, are scaled such that the
+    largest terms are one. So the units of states, time and functions do not matter.
 
     - `values`, of shape `(states, functions)`: their values.
     - `gradients`, `terms`, of shape `(states, components, functions)`: their derivatives, and the
@@ -285,7 +310,7 @@ class _Samples:
         total = np.abs(terms).sum(axis=1)
         rows, still = np.ones(len(total)), total.max(axis=0) == 0
         size = np.abs(values).max(axis=0)
-        for _ in range(3):
+        for _ in range(_ROUNDS):
             size = np.where(still, size, (total / rows[:, None]).max(axis=0))
             size = np.where(size > 0, size, 1.0)
             rows = (total / size).max(axis=1)
@@ -296,10 +321,11 @@ class _Samples:
         self.derivatives, self.totals = self.terms.sum(axis=1), total / size / rows[:, None]
 
     def resolution(self, sizes: np.ndarray) -> float:
-        """The singular value below which there is roundoff."""
+        """The singular value below which there is only roundoff."""
         return float(np.max(sizes) * self.terms.size**0.5 * np.finfo(float).eps)
 
     def has_gradient(self, c: np.ndarray) -> bool:
+        """Whether the gradient of a combination is not zero at some state."""
         size = np.abs(self.gradients) @ np.abs(c)
         return bool(np.any(np.abs(self.gradients @ c) > _ZERO * size.max()))
 
@@ -340,7 +366,7 @@ def _sampled(
         )
     x = np.asarray(jax.vmap(ravel)(ys))
     largest = np.abs(x).max(axis=0)
-    apart = np.where(largest > 0, largest, largest.max()) / 10
+    apart = np.where(largest > 0, largest, largest.max()) / _BESIDE
     beside = x + apart * np.sin(np.arange(x.size)).reshape(x.shape)
     moved = np.asarray(measure(ts, jax.vmap(unravel)(beside, ys))[2])
     idle = (slopes == 0).all(axis=0) & (np.isfinite(moved) & (moved != 0)).any(axis=0)
@@ -360,11 +386,15 @@ def _combinations(samples: _Samples) -> list[np.ndarray]:
     terms = terms.reshape(-1, terms.shape[2])
     _, sizes, basis = np.linalg.svd(terms, full_matrices=False)
     moves = sizes > samples.resolution(sizes)
-    # Combinations of which no term is left, and those in general, with terms of size one.
+    # The first singular value decomposition is that of the terms. Combinations of which no term is
+    # left, such as of components that do not move, are conserved. The others are scaled such that
+    # their terms have size one. So the singular values of their derivatives tell what cancels.
     still, moving = basis[~moves], basis[moves] / sizes[moves, None]
     _, sizes, turn = np.linalg.svd(samples.derivatives[_FIRST] @ moving.T, full_matrices=False)
     sizes, moving = sizes[::-1], (turn @ moving)[::-1]
     roundoff = np.linalg.norm(samples.totals[_FIRST] @ np.abs(moving.T), axis=0) * samples.eps
+    # In ascending order, the first singular values that are roundoff belong to conserved
+    # combinations. If there is no gap to the next one, fewer do: we go back to the last gap.
     count = int(np.sum(np.cumprod(sizes <= _ROUNDOFF * roundoff)))
     largest = np.maximum.accumulate(np.maximum(sizes, roundoff))
     first = count
@@ -380,7 +410,8 @@ def _combinations(samples: _Samples) -> list[np.ndarray]:
         )
     orthogonal = np.linalg.qr(np.concatenate([still, moving[:count]]).T)[0].T
     found = _simplified(samples, _reduced(orthogonal))
-    # Once more without the errors among which the first pivots were chosen.
+    # The first pivots were chosen among elements with errors. Now that the coefficients are exact,
+    # the echelon form is made once more.
     exact = np.array([c * samples.size for c in found]).reshape(-1, len(samples.size))
     return _simplified(samples, _reduced(exact, np.abs(exact).max(axis=0, initial=0)))
 
@@ -438,13 +469,16 @@ def _simplified(samples: _Samples, rows: np.ndarray) -> list[np.ndarray]:
 
 def _number(x: float, share: float) -> float:
     """`x` as a decimal number or a fraction, if it is one up to a share of it."""
-    digits = min(6, -round(math.log10(share)) - 2)
+    # Two digits fewer than the error leaves, so that a decimal is not found by chance.
+    digits = min(_DIGITS, -round(math.log10(share)) - 2)
     simple = float(f"{x:.{digits}g}"), float(Fraction(x).limit_denominator(_DENOMINATOR))
     return next((number for number in simple if abs(x - number) <= share * abs(x)), x)
 
 
 def _independent(samples: _Samples, found: list[np.ndarray]) -> list[np.ndarray]:
-    """Those of the combinations that vary, and are no polynomials of those before them."""
+    """Those of the combinations that vary from state to state, and are no polynomials of others
+    that are simpler. The polynomials in question are those of which the values are in the span of
+    the basis."""
     scaled = [c * samples.size for c in found]
     sizes = [np.abs(samples.values) @ np.abs(c) for c in scaled]
     values = [samples.values @ c for c in scaled]

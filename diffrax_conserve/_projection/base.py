@@ -115,7 +115,7 @@ class Problem(eqx.Module):
         """The state of the solve whose numbers are `y`."""
         return unravel(y, self.like)
 
-    def judge(
+    def report(
         self,
         candidate: Float[Array, " n"],
         y: Float[Array, " n"],
@@ -128,14 +128,15 @@ class Problem(eqx.Module):
         **Arguments:**
 
         - `num_steps`: the number of iterations.
-        - `ok`: the verdict, if it is known. By default: whether every residual is small at `y`.
+        - `ok`: whether the projection succeeded, if that is known. By default: whether every
+            residual is within its tolerance at `y`.
         """
-        # The verdict has no derivative.
+        # A report has no derivative.
         equations, candidate, y = tree_stop_gradient((self.equations, candidate, y))
         after, jacobian = equations.linearise(y)
         scale = equations.scale(jacobian, y)
         sizes = [jnp.abs(relative(g, scale)) for g in (equations.residual(candidate), after)]
-        # A maximum can lose NaN on a CPU.
+        # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
         success = equations.level(after, scale)[0] >= ON if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
@@ -153,7 +154,8 @@ class Problem(eqx.Module):
             residual_after=after,
             correction=length(y - candidate, equations.units),
             roundoff=jnp.max(relative(equations.hidden, scale)),
-            # The smaller of both, so that none is blamed for an iteration that diverged.
+            # An iteration that diverged makes every residual large. So we look for the entry whose
+            # residual is large both before and after: of both the smaller one counts.
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
         )
 
@@ -162,14 +164,15 @@ class AbstractProjection(eqx.Module):
     """A map from a candidate to a state on the manifold.
 
     Write your own as a subclass with a field `metric` and the method `solve`; see [Your own
-    projection][your-own-projection]. Residuals are judged by its fields `rtol` and `atol`, if it
-    has them.
+    projection][your-own-projection]. The tolerances of the residuals are its fields `rtol` and
+    `atol`, if it has them.
     Set `sees_step = False` in the class if it does not use `Problem.step`: then it needs no step,
     as in a stage of [`diffrax_conserve.Staged`][].
     """
 
     metric: eqx.AbstractVar[PyTree[Any] | None]
-    # Whether `Problem.step` is set. If so, dense output also stores the error estimate.
+    # Whether `Problem.step` is set. If it is, dense output stores the error estimate too, which
+    # costs memory.
     sees_step: ClassVar[bool] = True
 
     @abc.abstractmethod
@@ -185,8 +188,8 @@ class AbstractProjection(eqx.Module):
 def adapted(
     equations: Equations, projection: AbstractProjection, t: RealScalarLike, y: Y, args: Args
 ) -> Equations:
-    """The equations with the metric at a state, if it has one, and the tolerances of a
-    projection."""
+    """The equations with the tolerances of a projection, and with its metric at a state, if it has
+    one; otherwise they keep theirs."""
     changed = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
     if projection.metric is not None:
         changed["units"] = units_of(projection.metric, t, y, args)
@@ -208,14 +211,17 @@ def check_projection(projection: Any) -> None:
 
 
 class Target(eqx.Module):
-    """Everything that a projection needs except the time and the candidate.
+    """Everything that a projection needs except the time and the candidate. It does not change
+    within a step, so that dense output can project by it too.
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
     - `motion`: how far each component moves in a step, its unit in the metric of motion; `None`
       where that is not the metric, with noise and outside a solve.
-    - `direction`: -1 if the solver's time is the negative of the manifold's, otherwise 1.
-    - `gained`: the integrals of the rates since the start, and what rounding added to them.
+    - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
+      backwards in time, otherwise 1.
+    - `gained`: in the first row the integrals of the rates since the start of the solve, in the
+      second what rounding has added to them; `None` if no entry has a rate.
     """
 
     projection: AbstractProjection
@@ -230,7 +236,12 @@ class Target(eqx.Module):
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
     ) -> "Target":
-        """The target at a time `end` in a step, given the `path` of the solution from `start`."""
+        """The target at a time `end` in a step, given the `path` of the solution from `start`.
+
+        The integral over the step is added to the integrals so far by compensated summation (W.
+        Kahan, "Further remarks on reducing truncation errors", *Comm. ACM* 8 (1965), 40). So their
+        roundoff does not grow with the number of steps.
+        """
         if self.gained is None:
             return self
         last, excess = self.gained
@@ -240,24 +251,34 @@ class Target(eqx.Module):
         return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
 
     def following(self, t: RealScalarLike, y: Y) -> "Target":
-        """At rest roundoff is left, which the state cannot follow: there the value follows it."""
+        """The target with values that a state `y` on the manifold can keep.
+
+        A balance comes to rest, for example when friction has stopped a pendulum. The integral of
+        its rate then keeps a rest of roundoff, say an energy of -1e-17, which no state has: all
+        later projections would fail. So where the residual at the start of a step is more than half
+        of the tolerance, though within it, the value follows the state until it is half of it.
+        """
         if self.gained is None:
             return self
         equations, y = tree_stop_gradient((self.equations(t, y), ravel(y)))
         off, jacobian = equations.linearise(y)
         limit = equations.tolerance(equations.scale(jacobian, y))
-        rest = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
-        follow = jnp.where(rest, off - jnp.clip(off, -limit / 2, limit / 2), 0)
+        within = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
+        follow = jnp.where(within, off - jnp.clip(off, -limit / 2, limit / 2), 0)
+        # The second row is subtracted from what is added next, so this adds `follow`.
         return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
 
     @property
     def value(self) -> Float[Array, " m"]:
+        """What the functions must be now: the conserved values, plus what balances have gained."""
         return self.values if self.gained is None else self.values + self.gained[0]
 
     def equations(self, t: RealScalarLike, y: Y) -> Equations:
         """The equations at a time of the solver, for states like `y`."""
         hidden, like = self.hidden, jax.eval_shape(lambda: y)
-        if self.gained is not None:  # a sum has the roundoff of its terms
+        if self.gained is not None:
+            # An energy that has been lost leaves a small value, which is a difference of large
+            # numbers and has their roundoff. So its scale is at least that of the start.
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
@@ -279,6 +300,7 @@ class Target(eqx.Module):
         return Step(start * self.direction, end * self.direction, ravel(y0()), error)
 
     def problem(self, t: RealScalarLike, candidate: Y, step: Step | None = None) -> Problem:
+        """The problem at a time of the solver."""
         equations, like = self.equations(t, candidate), jax.eval_shape(lambda: candidate)
         manifold, t, args = self.manifold, t * self.direction, self.args
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
@@ -297,7 +319,8 @@ class Target(eqx.Module):
     def project_if(
         self, due: Bool[Array, ""] | None, t: RealScalarLike, candidate: Y, step: Step | None = None
     ) -> tuple[Y, ProjectionInfo]:
-        """As `project` where a projection is `due`; otherwise the candidate, if it is finite."""
+        """As `project` where a projection is `due`, otherwise the candidate with an empty report.
+        A candidate that is not finite is projected in any case, so that the report tells of it."""
         if due is None:
             return self.project(t, candidate, step)
         needed = due | ~tree_all_finite(candidate)

@@ -95,7 +95,8 @@ class _Clipped(eqx.Module):
         x = ravel(y)
         lower = spread("lower", -jnp.inf if self.lower is None else self.lower, y)
         upper = spread("upper", jnp.inf if self.upper is None else self.upper, y)
-        # Not by `jnp.clip`, which has the derivative zero at a bound. NaN stays NaN.
+        # A component exactly at its bound keeps its derivative, that from inside, which `jnp.clip`
+        # would change. A component that is NaN stays NaN.
         x = jnp.where(x < lower, lower, jnp.where(x > upper, upper, x))
         x = jnp.where(lower <= upper, x, jnp.nan)
         return self.vector_field(t, unravel(x, y), args)

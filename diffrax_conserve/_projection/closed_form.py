@@ -61,7 +61,7 @@ class ClosedForm(AbstractProjection):
                 "same structure, shapes and dtypes."
             )
         y = ravel(y)
-        return y, problem.judge(candidate, y)
+        return y, problem.report(candidate, y)
 
 
 ClosedForm.__init__.__doc__ = r"""**Arguments:**

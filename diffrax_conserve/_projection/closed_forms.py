@@ -185,8 +185,15 @@ def _density_matrix(x: Matrices) -> Matrices:
 
 @_density_matrix.defjvp
 def _density_matrix_jvp(primals: Any, tangents: Any) -> Any:
-    """Divided differences `(p_i - p_j) / (w_i - w_j)` of the eigenvalues before and after: one
-    where both are positive, zero where neither is."""
+    """The derivative of a function of a Hermitian matrix (the theorem of Daleckii and Krein;
+    Higham, Theorem 3.11): in the basis of its eigenvectors each element of the tangent is
+    multiplied by the divided difference `(p_i - p_j) / (w_i - w_j)` of the eigenvalues before (`w`)
+    and after (`p`).
+
+    Here `p = max(w - μ, least)`. So the divided difference is one where both eigenvalues are above
+    the bound, also where they coincide, and zero where neither is. At last `μ` changes such that
+    the trace stays one, by the same amount for all eigenvalues above the bound.
+    """
     y, v, w, p, positive = _spectral(primals[0])
     change = _product(_dagger(v), _product(_hermitian(tangents[0]), v))
     both = positive[..., :, None] & positive[..., None, :]
@@ -204,18 +211,22 @@ def _density_matrix_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def _spectral(x: Matrices) -> tuple[Array, Array, Array, Array, Array]:
-    """The density matrix, and the eigenvectors and eigenvalues before and after of which it is."""
+    """The density matrix; the eigenvectors; the eigenvalues before and after; and which of them are
+    above the bound."""
     _check_square(x)
     w, v = jnp.linalg.eigh(_hermitian(x), symmetrize_input=False)
     n = w.shape[-1]
     least = 2 * n * float(jnp.finfo(w.dtype).eps)
     p, positive = _onto_simplex(w, least)
     root = v * jnp.sqrt(p)[..., None, :]
-    # From the lower triangle, because a compiler may evaluate a sum with the adjoint in two ways.
+    # The upper triangle is made from the lower one. Half the sum of the matrix and its adjoint
+    # would be Hermitian too, but a compiler may round the two sums for a pair of elements
+    # differently.
     y = _product(root, _dagger(root))
     lower = jnp.tril(y, -1)
     diagonal = jnp.diagonal(y, axis1=-2, axis2=-1).real
-    # What rounding added to the trace is taken from the largest entry.
+    # What rounding added to the trace is taken from the largest element of the diagonal, of which
+    # it is the smallest share.
     largest = jnp.arange(n) == jnp.argmax(diagonal, axis=-1)[..., None]
     excess = jnp.sum(diagonal, axis=-1, keepdims=True) - 1
     diagonal = diagonal - jnp.where(largest, excess, 0)
@@ -224,7 +235,12 @@ def _spectral(x: Matrices) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def _onto_simplex(w: Float[Array, "*batch n"], least: float) -> tuple[Array, Array]:
-    """`max(w - mu, least)` with the sum one, for ascending `w`, and where it is not `least`."""
+    """`max(w - μ, least)` with the sum one, for ascending `w`, and where it is above `least`.
+
+    If the `k` largest are above the bound, `Σ_k w - k μ + (n - k) least = 1` determines `μ`. We
+    compute it for every `k`, and take the largest `k` for which the `k`-th one is above the bound
+    (Smolin, Gambetta and Smith).
+    """
     n = w.shape[-1]
     descending = w[..., ::-1]
     counts = jnp.arange(1, n + 1, dtype=w.dtype)
@@ -242,18 +258,24 @@ def _rotation_matrix(x: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"
 
 @_rotation_matrix.defjvp
 def _rotation_matrix_jvp(primals: Any, tangents: Any) -> Any:
-    """`U ((W - Wᵀ) / (s_i + s_j)) Vᵀ` with `W = Uᵀ ẋ V`, as the symmetric factor has none."""
+    """`U ((W - Wᵀ) / (s_i + s_j)) Vᵀ` with `W = Uᵀ ẋ V`.
+
+    This follows from the polar decomposition `x = R P`, where `P` is symmetric and `Rᵀ Ṙ`
+    antisymmetric: the antisymmetric part of `Rᵀ ẋ = Rᵀ Ṙ P + Ṗ` has no `Ṗ`, and is solved for
+    `Rᵀ Ṙ` in the basis of the eigenvectors of `P`.
+    """
     y, u, s, vt = _polar(primals[0])
     w = _product(_dagger(u), _product(tangents[0], _dagger(vt)))
     sums = s[..., :, None] + s[..., None, :]
-    # On the diagonal the difference is zero.
+    # On the diagonal the difference is zero, whatever it is divided by.
     sums = jnp.where(jnp.eye(s.shape[-1], dtype=bool), 1, sums)
     return y, _product(u, _product((w - _dagger(w)) / sums, vt))
 
 
 def _polar(x: Float[Array, "*batch n n"]) -> tuple[Array, Array, Array, Array]:
-    """The rotation, and the singular value decomposition of `x` whose last singular value and left
-    vector have the sign that makes it one."""
+    """The rotation `U Vᵀ`, and the singular value decomposition `x = U diag(s) Vᵀ`. The last
+    singular value and the last left vector have a sign, such that the determinant of `U Vᵀ` is
+    one."""
     _check_square(x)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise TypeError("A rotation matrix is real, but that of the state is complex.")
@@ -262,6 +284,7 @@ def _polar(x: Float[Array, "*batch n n"]) -> tuple[Array, Array, Array, Array]:
     signs = jnp.concatenate([jnp.ones_like(s[..., 1:]), sign], axis=-1)
     u, s = u * signs[..., None, :], s * signs
     y = _product(u, vt)
-    # One step of Newton and Schulz takes off most of the roundoff of the decomposition.
+    # One step of the iteration of Newton and Schulz (Higham, 8.3) removes most of the roundoff of
+    # the decomposition.
     y = y + _product(y, jnp.eye(s.shape[-1], dtype=s.dtype) - _product(_dagger(y), y)) / 2
     return y, u, s, vt

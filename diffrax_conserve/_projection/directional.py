@@ -11,25 +11,27 @@ from jaxtyping import Array, Float
 
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .implicit import project_along
-from .options import check_options, option
+from .options import MAX_STEPS, check_options, option
 
 
 class AbstractAlongLine(AbstractProjection):
-    """A projection with one unknown: along a line through the candidate."""
+    """A projection with one unknown: `y = ŷ + λ w` for the direction `w` of a line through the
+    candidate."""
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
-    max_steps: int = option(50, static=True)
+    max_steps: int = option(MAX_STEPS, static=True)
     metric: None = eqx.field(default=None, init=False)
     sees_step: ClassVar[bool] = True
-    unknowns: ClassVar[str]  # in words
+    # A verb and its object for the message about too many constraints, such as "has one unknown".
+    unknowns: ClassVar[str]
 
     def __check_init__(self):
         check_options(self)
 
     @abc.abstractmethod
     def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
-        """That of the line."""
+        """The vector `w`."""
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
@@ -40,12 +42,13 @@ class AbstractAlongLine(AbstractProjection):
                 f"`{type(self).__name__}` {self.unknowns}, but `manifold` has {size} scalar "
                 "constraints. Keep one integral, or pass `projection=SimplifiedNewton()`."
             )
-        # The direction is the unit of each component, and its signs are what is left of it.
+        # The iteration moves along `s Uᵀ λ`, for units `s` and a row `U` that are given. With
+        # `s = |w|`, and the signs of `w` as the row, this is `w λ`.
         direction = self.direction(problem, candidate)
         equations = dataclasses.replace(problem.equations, units=jnp.abs(direction))
         signs = lax.stop_gradient(jnp.sign(direction))[None]
         y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return y, problem.report(candidate, y, count, ok=ok)
 
 
 @final

@@ -1,9 +1,12 @@
 """The small linear systems of projections: Gram matrices `U Vᵀ` of rows, one for each constraint.
 
-They are singular where constraints depend on each other. A pivot at the level of roundoff belongs
-to a constraint whose gradient depends linearly on the earlier ones: its multiplier is zero, which
-is exact if the constraints are consistent. Of gradients that are only nearly parallel all are kept,
-because the correction needs the direction in which they differ.
+The matrices are singular where constraints depend on each other, as when an integral is given
+twice. In an elimination without pivoting the pivot of a constraint is then at the level of roundoff
+if its gradient is a combination of those of the constraints before it. We give such a constraint
+the multiplier zero. That is exact if the constraints are consistent, because meeting the earlier
+ones then meets this one too. Gradients that are only nearly parallel are all kept, because the
+correction needs the direction in which they differ: a truncated singular value decomposition, which
+would drop this direction, makes Newton's method stall.
 """
 
 from collections.abc import Callable
@@ -17,14 +20,20 @@ from jaxtyping import Array, Float
 
 from .sparse import BlockGram, SparseRows
 
-# Up to this many constraints a solve is written out, so that XLA fuses it with what is around it.
+# Up to this many constraints the elimination is written out, element by element, so that XLA fuses
+# it with what is around it. A call of LAPACK would take most of the time of a small projection.
 WRITTEN_OUT_MAX = 4
-# A pivot below this many units of roundoff, times the number of constraints, is one of roundoff.
+# A pivot counts as roundoff if it is at most this many units of roundoff, times the number `m` of
+# constraints, of its diagonal element. It is the rest of `m` products of about the size of that
+# element, each of which is rounded, as are the elements themselves.
 _LEAST_PIVOT = 4
-# The roundoff that is added to the unit diagonal of a large matrix, in units of roundoff times the
-# root of the number of constraints, so that a factor exists where constraints depend on each other.
+# For more constraints we add this many units of roundoff, times `√m`, to a diagonal of ones, so
+# that a factor exists where constraints depend on each other. The rounding of a factorisation
+# perturbs the matrix by about `√m` units (N. J. Higham, *Accuracy and Stability of Numerical
+# Algorithms*, SIAM 2002, 2.8 and 10.1), so that a pivot which should be zero stays positive.
 _ADDED = 16
-# The steps of iterative refinement that remove from a solution what was added.
+# So many steps of iterative refinement remove from a solution the error that the addition causes.
+# Each multiplies it by what was added, divided by the smallest eigenvalue of the scaled matrix.
 _REFINEMENTS = 3
 
 
@@ -52,7 +61,7 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def gram_solve(gram: Any, b: Array, noise: Array | None = None) -> Array:
-    """`gram⁻¹ b`, for a matrix not symmetric in general."""
+    """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
     if isinstance(gram, BlockGram):
         return gram.factored()(b)
     return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), noise))
@@ -61,14 +70,24 @@ def gram_solve(gram: Any, b: Array, noise: Array | None = None) -> Array:
 def eliminated(
     gram: Any, b: Array, rows: Any, noise: Array | None = None
 ) -> tuple[Float[Array, " m"], Any]:
-    """`L⁻¹ b` and `U⁻ᵀ rows` for `gram = L U`, not symmetric in general: combined they are
-    `rowsᵀ gram⁻¹ b`. The multipliers `gram⁻¹ b` of nearly parallel gradients are large and cancel
-    in the sum, which is wrong if XLA evaluates `b` once for each. If a small matrix is written out,
-    what is within the `noise` of `b` is zero in `L⁻¹ b`: a small pivot would amplify it."""
+    """`L⁻¹ b` and `R⁻ᵀ rows` for `gram = L R`, by Gaussian elimination without pivoting. The matrix
+    is not symmetric in general. The `combined` of both is the correction `rowsᵀ gram⁻¹ b`.
+
+    Why not multiply `rowsᵀ` by the multipliers `gram⁻¹ b`? If gradients are nearly parallel, the
+    multipliers are large and cancel in the sum. XLA may evaluate `b` once for each of them, with
+    another rounding each time, and then they do not cancel. The elimination takes differences of
+    the rows first, so that nothing large is left.
+
+    If `noise` is given and the elimination is written out, elements of `L⁻¹ b` that are within the
+    noise are set to zero, because a small pivot would amplify them to a large, random correction.
+    For more than four constraints, and in blocks, the first result is the multipliers, and the
+    second the rows themselves.
+    """
     if isinstance(gram, BlockGram):
         return gram.factored()(b), rows
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
+        # The rows and columns are scaled such that the diagonal is one.
         added, diagonal = _added(gram), jnp.abs(jnp.diagonal(gram))
         unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
         scaled = gram * unit[:, None] * unit
@@ -78,27 +97,34 @@ def eliminated(
             x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
         return x.astype(dtype) * unit, rows
     least = _LEAST_PIVOT * m * float(jnp.finfo(dtype).eps)
-    u, x, d = [[gram[i, j] for j in range(m)] for i in range(m)], list(b), list(rows)
+    matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
+    left, right = list(b), list(rows)
     small = [] if noise is None else list(noise)
     for k in range(m):
-        regular = jnp.abs(u[k][k]) > least * jnp.abs(gram[k, k])
-        pivot = jnp.where(regular, u[k][k], jnp.inf)
+        regular = jnp.abs(matrix[k][k]) > least * jnp.abs(gram[k, k])
+        pivot = jnp.where(regular, matrix[k][k], jnp.inf)  # so that the multiplier is zero
         if noise is not None:
-            x[k] = jnp.where(jnp.abs(x[k]) <= small[k], 0, x[k])
+            left[k] = jnp.where(jnp.abs(left[k]) <= small[k], 0, left[k])
         for i in range(k + 1, m):
-            below, right = u[i][k] / pivot, u[k][i] / pivot
-            x[i], d[i] = x[i] - below * x[k], d[i] - right * d[k]
-            if noise is not None:  # what is not corrected is within half of the tolerance
+            below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
+            left[i], right[i] = left[i] - below * left[k], right[i] - beside * right[k]
+            if noise is not None:
+                # The noise of a row grows by that of the rows subtracted from it. It is at most
+                # half of the tolerance, of which `noise` is an eighth: so what we leave out cannot
+                # keep a state off the manifold.
                 small[i] = jnp.minimum(small[i] + jnp.abs(below) * small[k], 4 * noise[i])
             for j in range(k + 1, m):
-                u[i][j] = u[i][j] - below * u[k][j]
-        x[k] = x[k] / pivot
-    return jnp.stack(x), jnp.stack(d)
+                matrix[i][j] = matrix[i][j] - below * matrix[k][j]
+        left[k] = left[k] / pivot
+    return jnp.stack(left), jnp.stack(right)
 
 
 def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
-    """`S⁻¹ gram⁻¹ S⁻¹ g` as a function of `g`, for the diagonal matrix `S` of `sizes`. With the
-    inverse of a triangle, `L⁻¹ S⁻¹` for `gram = L Lᵀ`, each solve is two products."""
+    """`S⁻¹ gram⁻¹ S⁻¹ g` as a function of `g`, for the diagonal matrix `S` of `sizes`.
+
+    We invert the triangle of `gram = L Lᵀ` once, and store `L⁻¹ S⁻¹`. Each solve is then two
+    products with a matrix, which are faster than two substitutions, in a batch above all.
+    """
     if isinstance(gram, BlockGram):
         solve = gram.factored()
         return lambda g: solve(g / sizes) / sizes
@@ -110,8 +136,11 @@ def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
-    """The largest element of each row, or one if all are zero, and the rows divided by it. In
-    float64 one: products of elements neither overflow nor underflow in usual units."""
+    """The largest element of each row, or one if all are zero, and the rows divided by it.
+
+    The products in a Gram matrix could otherwise overflow or underflow in float32. In float64 they
+    do not in usual units, so there the sizes are one, which saves time.
+    """
     if jnp.result_type(*jtu.tree_leaves(rows)) == jnp.float64:
         return jnp.ones(len(rows)), rows
     if isinstance(rows, SparseRows):
@@ -122,6 +151,8 @@ def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
 
 
 def _added(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Roundoff that is added to a unit diagonal: dependent constraints have small multipliers."""
+    """What is added to a matrix with a diagonal of ones, so that its factor exists where
+    constraints depend on each other; see `_ADDED`. The multipliers of such constraints then stay
+    small."""
     roundoff = _ADDED * len(gram) ** 0.5 * float(jnp.finfo(gram.dtype).eps)
     return roundoff * jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))

@@ -1,8 +1,13 @@
 """A manifold at one time, as equations `g(y) = 0` for a state in one real vector.
 
-For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` itself. The *scale* of a
-residual at `y`, to which roundoff is proportional, is the size of the terms that cancel in it:
-`|I₀| + Σ_k |y_k ∂g/∂y_k|`, and what `roundoff` finds inside `fn` but not in its gradient.
+For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` is its function.
+
+A residual in floating-point arithmetic is never exactly zero, so this file also says when it counts
+as zero. The roundoff of a residual is proportional to the size of the terms that cancel in it, its
+*scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
+in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
+no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
+measures them, and they are added as the *hidden* part of the scale.
 """
 
 import dataclasses
@@ -25,14 +30,22 @@ from .._tree import ravel, unflatten, unravel
 from .metric import MatrixUnits, Units
 from .sparse import Pattern, SparseRows, pattern_of
 
-# The accepted residual in units of roundoff of the scale. Rounding the state and evaluating the
-# residual contribute about one unit each.
+# A residual of at most this many units of roundoff of its scale counts as zero. Rounding the state
+# and evaluating the residual contribute about one unit each, in long sums a few. The promise "16
+# units of roundoff" is part of the documentation, and `tests/soak` checks it in long double.
 ROUNDOFF_MULTIPLE = 16
-# What a state is, in this order, so that a minimum over the residuals tells it.
+# The four levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all
+# are within; all are so small that only chance could make them smaller. They are ordered such that
+# the level of a state is the minimum over its residuals.
 NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
-# The noise of a residual as a share of its tolerance, and the tolerance as a share of what the
-# gradient shows from which a state counts as near rest.
-_NOISE, _NEAR_REST = 1 / 8, 64
+# The noise of a residual is this share of its tolerance: two of the 16 units of roundoff, the two
+# that rounding the state and evaluating the residual contribute.
+_NOISE = 1 / 8
+# A state is near rest where the tolerance exceeds one part in this many of the terms that the
+# gradient shows. There a correction by one tolerance would move the state by more than 1/64 of
+# itself. The number is a choice; `tests/laws/test_refused.py -k near` solves such problems.
+_NEAR_REST = 64
+# One entry of a manifold, as a function from the state to the vector of its residuals.
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
 
@@ -43,18 +56,19 @@ class Equations(eqx.Module):
     - `parts`: the residual of each entry.
     - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
     - `hidden`: the part of it that the gradients do not show.
-    - `units`: the unit `s` of each component in which a correction is measured, `M⁻¹ = diag(s²)`,
-      or a factor `S` of `M⁻¹ = S Sᵀ`; `None` if all are one. A component whose unit is zero is
-      never moved. All linear algebra works with `G S`, whose columns no longer know the units of
-      the user: so nothing is squared before it is scaled, and a change of units by powers of two
-      changes no bit of the result.
+    - `units`: the metric `M` in the form in which it is used, as a factor `S` of `M⁻¹ = S Sᵀ`. A
+      vector `s` is the unit in which a correction of each component is measured, `S = diag(s)`;
+      `None` means that all units are one. A component whose unit is zero is never moved. All linear
+      algebra works with the product `G S`, in whose columns the units of the user have cancelled.
+      So nothing is squared before it is scaled, which could overflow, and a change of units by
+      powers of two changes no bit of the result.
     - `motion`: how far each component moves in a step, where that is known; see `Target`.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
-    - `may_vanish`: whether all terms of a residual may be zero, as those of a `Constraint`.
-    - `clip`: within bounds the map to the state from a vector without bounds, then the argument of
-      all methods. The residual is the gradient of a convex function of the multipliers with kinks:
-      an iteration looks for the minimum along its step.
-    - `pattern`: that of a sparse Jacobian.
+    - `may_vanish`: whether all terms of a residual may be zero on the manifold, so that its
+      tolerance is zero too. Only those of a `Constraint` may, such as of `q[0] = 0`.
+    - `clip`: used within bounds only. Then the argument of all methods is not the state but a
+      vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
+    - `pattern`: the places of the elements of a sparse Jacobian; `None` if it is dense.
     """
 
     parts: tuple[Part, ...]
@@ -73,8 +87,12 @@ class Equations(eqx.Module):
 
     @eqx.filter_jit  # traced once for all uses
     def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Jacobian]:
-        """`g(y)` and the constraint Jacobian `G(y)`. Entry by entry, so that the rows of one do not
-        contain the gradients of the others."""
+        """`g(y)` and the constraint Jacobian `G(y)`.
+
+        Each entry of the manifold is differentiated by itself. In one reverse pass over all of them
+        the row of one would contain zeros times the gradients of the others, which are NaN where
+        those gradients are infinite.
+        """
         if self.pattern is not None:
             return SparseRows.linearised(self.pattern, self.parts, y)
         values, rows = [], []
@@ -88,7 +106,7 @@ class Equations(eqx.Module):
         return jnp.concatenate(values), jnp.concatenate(rows)
 
     def dense(self) -> "Equations":
-        """The same, with a dense Jacobian."""
+        """The same equations, whose Jacobian is computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -104,22 +122,27 @@ class Equations(eqx.Module):
     def level(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """What a state is, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the residuals,
-        given these and their scales.
+        """The level of a state, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the
+        residuals, given the residuals and their scales.
 
-        The noise is what only chance could reduce: an eighth of the tolerance, or half of it where
-        the tolerance is a large part of what the gradient shows, as near rest, where a correction
-        within it would move the state by much. A state is settled if each residual is within twice
-        the noise. A residual within a tolerance that underflows says nothing.
+        The noise is the part of a residual that an iteration cannot reduce except by chance.
+        Usually that is an eighth of the tolerance. Near rest it is half of it: there the gradient
+        is so small that a correction by one tolerance would move the state by much, which would be
+        worse than the residual. A state is settled if each residual is within twice its noise.
         """
         limit = self.tolerance(scale)
+        # A tolerance that has underflowed would be met by a residual that has underflowed too,
+        # whatever the state is, and an infinite one is met by everything. So neither is ever met.
+        # If the scale is exactly zero, all terms are zero, and so is the residual.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         valid = valid & (limit < jnp.inf)
+        # The scale minus its constant part is what the gradient shows at this state.
         near_rest = _NEAR_REST * limit >= scale - self.magnitude
         noise = jnp.where(near_rest, 1 / 2, _NOISE) * limit
         on = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(SETTLED), jnp.int8(ON))
         off = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(OFF), jnp.int8(NOT_FINITE))
-        # Not by a maximum of residuals, which can lose NaN on a CPU.
+        # We take the minimum of the levels, which are integers. A maximum of the residuals would be
+        # shorter, but on a CPU a maximum can lose a NaN.
         return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), on, off)), noise
 
     def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
@@ -138,15 +161,15 @@ class Equations(eqx.Module):
         return rows * jnp.broadcast_to(self.units, rows.shape)
 
     def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S u`, the change of the state that is `u` in the units."""
+        """`S u`, the change of the state that is `u` when it is measured in the units."""
         if isinstance(self.units, MatrixUnits):
             return self.units.moved(change)
         return change if self.units is None else change * self.units
 
 
 def in_units(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
-    """A change of the state, each component in its unit; zero where the unit is zero, because such
-    a component is never moved."""
+    """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
+    such a component is never moved."""
     if units is None:
         return change
     if isinstance(units, MatrixUnits):
@@ -161,22 +184,27 @@ def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
 
 
 def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:
-    """The length of a step in the metric, the yardstick of corrections. Each component counts at
-    least by the root of roundoff of itself, by which roundoff alone moves a state where gradients
-    are nearly parallel: otherwise no correction would be short in a step at rest."""
+    """The length of a step in the metric, with which the length of a correction is compared.
+
+    Each component counts as moved by at least `√ε` of itself. Where gradients are nearly parallel,
+    the roundoff of the residuals alone moves a state by about that much. Without this floor a step
+    at rest would have no length, and every correction would be longer than it.
+    """
     least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
     return length(jnp.maximum(jnp.abs(end - start), least), units)
 
 
 def shown_terms(jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`Σ_k |y_k ∂g/∂y_k|`, the part of a scale that the gradient shows."""
+    """`Σ_k |y_k ∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
+    shows."""
     if isinstance(jacobian, SparseRows):
         return jtu.tree_map(jnp.abs, jacobian).times(jnp.abs(y))
     return jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
 
 
 def relative(residual: Any, scale: Any) -> Any:
-    """Residuals relative to their scales; a scale of zero counts as one."""
+    """Residuals divided by their scales. A scale of zero counts as one, so that a residual that is
+    exactly zero stays zero instead of becoming NaN."""
     return jtu.tree_map(lambda g, s: g / jnp.where(s > 0, s, jnp.ones_like(s)), residual, scale)
 
 
@@ -219,7 +247,8 @@ def equations_of(
         def part(y: Array, fn=fn, start=start, end=start + size) -> Array:
             return fn(y) - values[start:end]
 
-        # Arrays over which `fn` closes become leaves, and can be differentiated.
+        # The user's function may close over arrays, such as the parameters of a network. Conversion
+        # makes them leaves of the equations: only so can the custom rules differentiate by them.
         parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
         start += size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
@@ -229,15 +258,17 @@ def equations_of(
 
 
 class _Known:
-    """An array that is not a leaf of arrays, so that no transformation makes it a tracer."""
+    """An array in a box, which JAX takes for a leaf that is no array. So no transformation replaces
+    it by a tracer, and its numbers remain known."""
 
     def __init__(self, value: Any):
         self.value = value
 
 
 class _Converted(eqx.Module):
-    """A converted function that still knows the integers over which it closes: `scalars` moves
-    elements only by indices that are known."""
+    """A function after closure conversion, in which the integers over which it closes keep their
+    values. They are usually indices, such as of `y[indices]`, and `scalars` can follow a function
+    that moves elements only if it knows the indices."""
 
     fn: Any
 
@@ -254,7 +285,13 @@ class _Converted(eqx.Module):
 
 @jax.custom_batching.custom_vmap
 def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether the flag of any lane of a batch is set: a loop with this condition has no selects."""
+    """Whether the flag of any lane of a batch is set, for the conditions of loops.
+
+    If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
+    array in the carry, which keeps the lanes that are done. With this condition, which is the same
+    for all lanes, it adds none. So the body of such a loop itself must leave a finished lane as it
+    is.
+    """
     return flag
 
 

@@ -1,5 +1,6 @@
-"""Functions as jaxprs, the programs into which JAX traces them: to evaluate one otherwise, equation
-by equation, and to look for the programs inside. Only here it matters which version of JAX runs."""
+"""Jaxprs, the programs into which JAX traces functions: evaluated with other meanings of their
+equations, as one would overload operators in Python, and searched for the programs inside. What
+depends on the version of JAX is in this file only."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -15,8 +16,11 @@ def walk(
     constant: Callable[[Any], Any],
     equation: Callable[[Any, list[Any]], Iterable[Any]],
 ) -> list[Any]:
-    """The outputs of a jaxpr that is evaluated otherwise: `constant(x)` and `equation(eqn, inputs)`
-    take the place of the values of its constants and equations."""
+    """The outputs of a jaxpr whose values are of another kind, which the caller chooses.
+
+    `constant(x)` makes such a value of a constant, and `equation(eqn, inputs)` computes those of an
+    equation. Functions under `jax.jit` are entered.
+    """
     env = dict(zip(closed.jaxpr.constvars, map(constant, closed.consts), strict=True))
     env.update(zip(closed.jaxpr.invars, inputs, strict=True))
 
@@ -36,7 +40,7 @@ def walk(
 
 
 def outputs(eqn: Any, *inputs: Any) -> list[Any]:
-    """The values of an equation, for other inputs."""
+    """The values of an equation for given inputs, computed by JAX."""
     given = eqn.primitive.get_bind_params(eqn.params)
     # Before version 0.9 the functions inside stood apart from the parameters.
     functions, params = given if isinstance(given, tuple) else ((), given)
@@ -45,6 +49,7 @@ def outputs(eqn: Any, *inputs: Any) -> list[Any]:
 
 
 def closed_jaxpr(jaxpr: Any) -> jex.ClosedJaxpr:
+    """A jaxpr together with its constants. One that JAX stores without them has none."""
     return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
 
 

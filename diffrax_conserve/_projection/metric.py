@@ -1,4 +1,8 @@
-"""The metric of a projection, as units of the components, or as matrices for parts of the state."""
+"""The metric `M` of a projection, in the form of a factor `S` of its inverse, `M⁻¹ = S Sᵀ`.
+
+Projections never use `M` itself. For weights, `S` is the diagonal matrix of the units `1/√M_k` of
+the components. For parts of the state that have a matrix, it is made from a Cholesky factor.
+"""
 
 import math
 from collections.abc import Callable
@@ -18,13 +22,19 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._options import check_function, check_number
 from .._tree import ravel, real_view
 
+# Elements of a matrix that a user passes may differ from their mirror images by this share of
+# themselves. A mass matrix that is computed in float32, with units of roundoff of 1e-7, is
+# symmetric to about 1e-6.
+_SYMMETRIC = 1e-5
+
 
 class MatrixUnits(eqx.Module):
-    """A factor `S` of `M⁻¹ = S Sᵀ`, where the metric `M` is a matrix in some parts of the state. It
-    is `L⁻ᵀ` for the Cholesky factor of the matrix, `L Lᵀ`, and diagonal elsewhere.
+    """A factor `S` of `M⁻¹ = S Sᵀ`, where the metric `M` is a matrix in some parts of the state. In
+    such a part `M = L Lᵀ` is the Cholesky factorisation, and `S = L⁻ᵀ`; elsewhere `S` is diagonal.
 
-    - `diagonal`: the units, one in parts with a matrix.
-    - `lower`, `starts`: the factors `L`, and the first component of each part.
+    - `diagonal`: the units of the components, ones in the parts with a matrix.
+    - `lower`: the factor `L` of each part with a matrix.
+    - `starts`: the first component of each of these parts.
     """
 
     diagonal: Float[Array, " n"]
@@ -42,27 +52,32 @@ class MatrixUnits(eqx.Module):
         return self._in_parts(solve, change * self.diagonal)
 
     def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S⁻¹ change` in the parts with a matrix."""
+        """`S⁻¹ change` in the parts with a matrix, and `change` elsewhere."""
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
         return self._in_parts(product, change)
 
     @property
     def sizes(self) -> Float[Array, " n"]:
-        """A unit of each component, as if the others did not move."""
+        """A unit of each component, `1/√M_kk`, as if the others did not move. The diagonal element
+        `M_kk` is the square of the length of row `k` of `L`."""
         return self._in_parts(lambda lower, x: x / jnp.linalg.norm(lower, axis=1), self.diagonal)
 
     def _in_parts(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
+        """`x` with `fn(L, part)` in the place of each part with a matrix."""
         for start, lower in zip(self.starts, self.lower, strict=True):
             part = slice(start, start + len(lower))
             x = x.at[..., part].set(fn(lower, x[..., part]))
         return x
 
 
+# The metric as it is used: a unit for each component, or a factor with matrices, or `None` if all
+# units are one.
 Units = Float[Array, " n"] | MatrixUnits | None
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:
-    """`metric`, checked now as far as its values are known."""
+    """`metric`, checked now as far as its values are known. The weights of a tracer are checked at
+    run time, and functions where they are called."""
 
     def check(weight: Any) -> Any:
         if callable(weight):
@@ -71,7 +86,9 @@ def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any]
         check_number("metric", weight)
         is_square = jnp.ndim(weight) == 2 and len({*jnp.shape(weight)}) == 1
         if isinstance(weight, jax.core.Tracer):
-            if is_square:  # perhaps a matrix, whose factor is NaN if it is not positive
+            if is_square:
+                # It may be a matrix. If that is not positive definite, its Cholesky factor is NaN,
+                # and the projection fails.
                 return weight
             message = "`metric` has a weight that is not positive."
             return eqx.error_if(weight, ~jnp.all(weight > 0), message)
@@ -87,12 +104,13 @@ def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any]
 
 
 def _is_positive_definite(matrix: np.ndarray) -> bool:
-    symmetric = np.allclose(matrix, matrix.T, rtol=1e-5, atol=0)
+    symmetric = np.allclose(matrix, matrix.T, rtol=_SYMMETRIC, atol=0)
     return bool(symmetric and np.all(np.linalg.eigvalsh((matrix + matrix.T) / 2) > 0))
 
 
 def units_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> Units:
-    """The units `M^(-1/2)` of a metric at a state; that of an infinite weight is zero."""
+    """The units `M^(-1/2)` of a metric at a state. The unit of an infinite weight is zero, so that
+    its component is never moved."""
     values = jtu.tree_map(lambda x: x(t, y, args) if callable(x) else x, metric, is_leaf=callable)
     like, matrices, start = jax.eval_shape(lambda: y), {}, 0
 
@@ -128,7 +146,8 @@ def spread(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"
                 f"`{name}` has a leaf of shape {shape} for one of shape {leaf.shape} of the state. "
                 f"Give a number or an array that broadcasts against it{_or_matrix(name, leaf)}."
             )
-        view = jax.eval_shape(real_view, leaf)  # both parts of a complex component are alike
+        # The real and the imaginary part of a complex component have the same option.
+        view = jax.eval_shape(real_view, leaf)
         return jnp.broadcast_to(jnp.asarray(given, view.dtype), view.shape)
 
     def spread_part(given: ArrayLike, part: Any) -> Any:

@@ -1,4 +1,10 @@
-"""Damped Newton's method for the nearest point, with fresh Jacobians, for candidates far away."""
+"""Damped Newton's method for the nearest point of a manifold, for candidates far away.
+
+The nearest point is a stationary point of the distance under the constraints, where the Lagrange
+conditions `y - ŷ - M⁻¹ G(y)ᵀ λ = 0` and `g(y) = 0` hold. These are equations for the pair `(y, λ)`.
+So they are solved by the same damped iteration as `g(y) = 0` alone, `descent.descend`, and the
+derivative follows from the implicit function theorem for them.
+"""
 
 import dataclasses
 from typing import Any, final
@@ -18,10 +24,15 @@ from .metric import MatrixUnits
 from .options import NEWTON_OPTIONS, option
 from .within_bounds import AbstractNewton, Box, project_within
 
-# The largest number of unknowns and constraints for which the nearest point is sought.
+# The nearest point is sought for at most this many unknowns and constraints together, because each
+# iteration solves a dense system of that size. The docstring of `Newton` gives the number.
 _NEAREST_MAX = 512
-# Singular values below this many units of roundoff of the largest belong to dependent constraints.
+# A singular value below this many units of roundoff of the largest belongs to constraints that
+# depend on each other: the roundoff of a singular value decomposition of a rounded matrix.
 _SINGULAR = 64
+# A projection from far away makes at most this many iterations in each phase, by default. Nearby it
+# needs about five; the rest is for steps that must be shortened.
+_MAX_STEPS = 100
 
 
 @final
@@ -57,12 +68,13 @@ class Newton(AbstractNewton):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.4, (4.3).
     """
 
-    max_steps: int = option(100, static=True)
+    max_steps: int = option(_MAX_STEPS, static=True)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        if jnp.finfo(candidate.dtype).bits < 32:
+        if jnp.promote_types(candidate.dtype, jnp.float32) != candidate.dtype:
+            # LAPACK has no half precision, in which the derivative would need singular values.
             raise TypeError(
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
                 "state to float32, or pass `projection=SimplifiedNewton()`."
@@ -71,14 +83,16 @@ class Newton(AbstractNewton):
         box = self.box(problem.like)
         unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
         y = unknowns[: candidate.size]
-        return y, problem.judge(candidate, y, count)
+        return y, problem.report(candidate, y, count)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS
 
 
 class _Optimality(eqx.Module):
-    """`y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and `sizes * λ` in one vector."""
+    """The Lagrange conditions: `y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and
+    `sizes * λ` in one vector. The `sizes` are those of the gradients, so that all unknowns have
+    comparable units. Without bounds `clip` is the identity."""
 
     equations: Equations
     candidate: Float[Array, " n"]
@@ -87,7 +101,8 @@ class _Optimality(eqx.Module):
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         y, multiplier = jnp.split(unknowns, [self.candidate.size])
-        g, vjp = jax.vjp(self.equations.residual, y)  # by one reverse pass, not row by row
+        # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
+        g, vjp = jax.vjp(self.equations.residual, y)
         gradient = self.equations.scaled(vjp(multiplier / self.sizes)[0])
         z = self.candidate + self.equations.moved(gradient)
         return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
@@ -97,8 +112,9 @@ class _Optimality(eqx.Module):
 def _nearest(
     equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
 ) -> tuple[Float[Array, " N"], Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]:
-    """State and scaled multipliers, the sizes by which they are scaled, whether they are of the
-    nearest point, and a count of iterations."""
+    """State and scaled multipliers in one vector, the sizes by which the multipliers are scaled,
+    whether the state is the nearest point, and the number of iterations."""
+    # First phase: some point of the manifold.
     if box is None:
         y, _, count = descend(equations, candidate, max_steps=max_steps)
     else:
@@ -106,10 +122,13 @@ def _nearest(
     n, nothing = y.size, jnp.zeros_like(equations.magnitude)
     if n + nothing.size > _NEAREST_MAX:
         return jnp.concatenate([y, nothing]), nothing + 1, jnp.asarray(False), count
+    # Second phase: the nearest point. It starts from the multipliers that fit `y - ŷ` best.
     equations = equations.dense()
     sizes, unit, gram, units = _scaled(equations, y)
     along = times(unit, in_units(y - candidate, equations.units))
     start = jnp.concatenate([y, gram_solve(gram, along)])
+    # The Lagrange conditions take the place of the constraints. There are as many as unknowns, so
+    # the Gauss-Newton steps of `descend` are steps of Newton's method.
     optimality = dataclasses.replace(
         equations,
         parts=(_Optimality(equations, candidate, box, sizes),),
@@ -125,8 +144,9 @@ def _nearest(
 
 
 def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, Array, Array]:
-    """The sizes of the rows of `G diag(s)`, the rows divided by them, their Gram matrix, and the
-    units of `y` and the multipliers in which no condition number depends on the user's."""
+    """The sizes of the rows of `G diag(s)`, the rows divided by them, their Gram matrix, and units
+    for `y` and for the multipliers, with which no condition number depends on the units of the
+    user."""
     sizes, unit = scaled_rows(equations.scaled(equations.linearise(y)[1]))
     gram = gram_matrix(unit, unit)
     lengths = jnp.diagonal(gram)
@@ -138,7 +158,9 @@ def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, 
 
 @_nearest.def_jvp
 def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
-    """The tangent of the optimality system at constant `y` and `λ` is cancelled by theirs."""
+    """By the implicit function theorem: the Lagrange conditions stay zero. So their tangent at
+    constant `y` and `λ`, which is `right`, is cancelled by the tangents of `y` and `λ` times the
+    Jacobian, which is `matrix`. Rows and columns are scaled by the units."""
     equations, candidate, _ = primals
     solved = _nearest(*primals, max_steps=max_steps)
     unknowns, sizes, found, _ = solved
@@ -153,7 +175,8 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     rows = jnp.concatenate([columns[: y.size], sizes / columns[y.size :]])
     matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns) / rows[:, None] * columns
     tangent = -columns * _shortest(matrix, right / rows)
-    # Only the nearest point has a derivative; that of a failed projection is not used.
+    # Only the nearest point has a derivative, so it is NaN where only the first phase succeeded.
+    # The result of a failed projection is discarded, and its derivative must stay finite.
     sure = certain(equations, candidate, y, equations.linearise(y)[1])
     doubt = jnp.where(found, sure, jnp.nan)
     doubt = lax.stop_gradient(jnp.where(equations.holds(y), doubt, 1))
@@ -161,8 +184,10 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
 
 
 def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
-    """The minimum-norm solution by singular values, because dependent constraints make the system
-    singular but consistent. NaN if `matrix` is not finite: LAPACK never returns from infinity."""
+    """The solution of least norm, by singular values, because constraints that depend on each other
+    make the system singular but consistent. It can be differentiated again, in both modes, as the
+    solution of a linear system. An infinite element is replaced by NaN first, because LAPACK does
+    not return from a matrix with infinite elements."""
     fixed = lax.stop_gradient(jnp.where(jnp.isfinite(matrix), matrix, jnp.nan))
     u, s, vt = jnp.linalg.svd(fixed)
     inverse = jnp.where(s > _SINGULAR * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)

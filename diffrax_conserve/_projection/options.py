@@ -1,4 +1,4 @@
-"""The options of projections: their checks, and their vectors."""
+"""The options that projections share: defaults, checks, and the text that documents them."""
 
 import math
 from typing import Any
@@ -10,6 +10,10 @@ import jax.tree_util as jtu
 from .._custom_types import Y
 from .._options import check_counts, check_number, check_numbers, dtype_of
 
+# By default a Newton iteration makes at most this many iterations. In a solve it needs about two.
+# The rest is for steps that are much too long, and a projection that fails costs all of them.
+MAX_STEPS = 50
+
 
 def option(default: Any, **kwargs: Any) -> Any:
     """An optional, keyword-only field."""
@@ -17,6 +21,7 @@ def option(default: Any, **kwargs: Any) -> Any:
 
 
 def check_options(projection: Any) -> None:
+    """Raises unless the tolerances, the number of iterations and the bounds are valid."""
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
     if hasattr(projection, "max_steps"):

@@ -76,26 +76,31 @@ def project(
 
 @eqx.filter_jit
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
-    """The tolerance follows the roundoff of the functions, which is measured at the candidate. At a
-    result far away it may be another: then the projection is made again with that of the result."""
+    """The tolerance follows the roundoff of the functions. That is measured before the projection,
+    at the candidate. At a result far away it may be different, so it is measured there too. If the
+    projection failed, or the roundoff at its result is much smaller, we make it once more, with the
+    roundoff that was measured at the result."""
 
     def by(hidden: Array) -> tuple[Y, ProjectionInfo, Array, Array]:
-        """The projection with this roundoff, that at its result, and whether it is as large."""
+        """The projection with a tolerance for the roundoff `hidden`; the roundoff at its result;
+        and whether that justifies the tolerance, which may be twice too large."""
         y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
+        # If the projection failed, its result may be NaN, where nothing can be measured.
         usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
         value, jacobian, found = hidden_scale(target.manifold, t, usable, target.args)
         shown = jnp.abs(value) + shown_terms(jacobian, ravel(usable))
         return y, info, found, jnp.all(hidden <= 2 * (shown + found))
 
     hidden = hidden_scale(target.manifold, t, candidate, target.args)[2]
-    y, info, found, measured = first = by(hidden)
-    done = info.ok & measured
+    y, info, found, justified = first = by(hidden)
+    done = info.ok & justified
     again = lax.cond(any_lane(~done), lambda: by(found), lambda: first)
-    y, info, _, measured = jtu.tree_map(lambda a, b: jnp.where(done, a, b), first, again)
-    # Success by a roundoff that is larger than that at the result is none.
+    y, info, _, justified = jtu.tree_map(lambda a, b: jnp.where(done, a, b), first, again)
+    # If the roundoff measured at the result is smaller than what we assumed, the tolerance was too
+    # loose, and we report a failure.
     missed = optx.RESULTS.nonlinear_max_steps_reached
-    result = optx.RESULTS.where(info.ok & ~measured, missed, info.result)
-    return y, dataclasses.replace(info, ok=info.ok & measured, result=result)
+    result = optx.RESULTS.where(info.ok & ~justified, missed, info.result)
+    return y, dataclasses.replace(info, ok=info.ok & justified, result=result)
 
 
 def given_values(

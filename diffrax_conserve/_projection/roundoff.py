@@ -1,11 +1,21 @@
-"""The roundoff of a function, which its gradient does not show.
+"""The roundoff of a function, as far as its gradient does not show it.
 
-In `1 - cos(q)` near zero the terms are about one and the gradient is about zero; in a network the
-terms of the hidden layers cancel. The error of a sum is about one unit of roundoff of the sizes of
-its terms, that of a cast or of the operand of a function one of its own size. Times their adjoints,
-and as they are independent, they add up to the root of the sum of squares. A product passes
-relative errors on. A function of what does not depend on the state has the same error each time,
-which is none here; the error of the state is in the gradient.
+In `1 - cos(q)` near zero the terms are about one, but the value and the gradient are about zero. In
+a network the terms of the hidden layers cancel. Such a function is less accurate than its value and
+gradient tell, and a tolerance made from them alone could not be met.
+
+So we make a first-order error analysis by reverse differentiation (S. Linnainmaa, "Taylor expansion
+of the accumulated rounding error", *BIT* 16 (1976), 146-160): an error `δ` of an intermediate value
+changes the result by `δ` times the adjoint of that value.
+
+- The error of a sum is about one unit of roundoff of the sizes of its terms. That of a cast, or of
+  the operand of a function such as the sine, is one unit of roundoff of its own size.
+- These errors are independent, so that their squares add up.
+- A product only passes relative errors on, so it counts as exact.
+- What does not depend on the state has the same error at each time. It shifts the conserved value,
+  which does no harm, so it counts as exact too.
+- The components of the state themselves are exact here, because their errors are what the gradient
+  shows.
 """
 
 import functools as ft
@@ -23,18 +33,21 @@ from .equations import Jacobian, functions_of, shown_terms
 from .jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .sparse import LEAST_CONSTRAINTS, SparseRows, pattern_of
 
-# Sums, and sums of products, each of which has an error of its own.
+# The primitives of JAX that are sums, and sums of products.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
 _SUMS_OF_PRODUCTS = frozenset({"dot_general", "conv_general_dilated"})
-# An operation with other operations inside is taken as one function, unless it is looked into.
+# The primitives that are functions: they amplify the error of their operand. A primitive with
+# others inside, such as a loop, counts as one of them, unless we look into it.
 _FUNCTION_NAMES = """acos acosh asin asinh atan atan2 atanh cos cosh erf erf_inv erfc exp exp2 expm1
 fft lgamma log log1p logistic lu pow sin sinh tan tanh"""
-# What these take from the state is still the state.
+# The primitives that only move elements. What they take from the state is still exact.
 _PART_NAMES = """broadcast_in_dim concatenate gather reshape rev slice split squeeze stack transpose
 unstack"""
 _FUNCTIONS, _PARTS = frozenset(_FUNCTION_NAMES.split()), frozenset(_PART_NAMES.split())
-# How a value depends on the state: not at all, as a part of it, or as computed from it.
+# How a value depends on the state: not at all, as a part of it, or as computed from it. They are
+# ordered such that the result of an operation depends as the maximum of its operands.
 _CONSTANT, _STATE, _COMPUTED = range(3)
+# A value, a Jacobian, and a roundoff.
 _Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
 
 
@@ -42,7 +55,12 @@ def hidden_scale(
     manifold: Manifold, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Jacobian, Float[Array, " m"]]:
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
-    gradients do not show: nothing where they show more, because elsewhere they may show less."""
+    gradients do not show.
+
+    Where the value and the gradient show more than that part, it counts as zero. It is measured
+    once, at the start of a solve, and is added to the scale everywhere. So it must not contain what
+    the gradient shows here but not elsewhere.
+    """
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)
     functions = functions_of(manifold, t, y, args)
@@ -54,7 +72,9 @@ def hidden_scale(
             with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
                 measured.append(hidden_terms(fn, vector))
         value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
-    else:  # not of entries with many elements, for which it would cost a reverse pass each
+    else:
+        # The roundoff of an entry with many elements is not measured, because that would cost a
+        # reverse pass for each.
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
         few = [size < LEAST_CONSTRAINTS for size in sizes]
         measured = [
@@ -67,7 +87,12 @@ def hidden_scale(
 
 
 def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
-    """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff."""
+    """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff.
+
+    The function is evaluated with two more arguments, both zero, which change nothing. The rule of
+    `_rounded` gives them cotangents: the sum over all rounded values of size times adjoint, and the
+    sum of the squares. So one reverse pass finds the gradient and the roundoff together.
+    """
     closed = jax.make_jaxpr(fn)(y)
 
     def evaluate(y: Array, *sums: Array) -> Array:
@@ -77,7 +102,9 @@ def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measur
     one = jnp.eye(value.size, dtype=value.dtype)
     jacobian, total, squares = jax.vmap(vjp)(one)
     unit = jnp.ones_like(total)
-    if y.dtype != jnp.float64:  # squares of small energies underflow
+    if y.dtype != jnp.float64:
+        # In float32 the squares of small numbers, such as of energies in joules of a molecule,
+        # underflow. So a second pass is made in a unit in which the sum is one.
         unit = jnp.where(total > 0, total, 1)
         _, _, squares = jax.vmap(vjp)(one / unit[:, None].astype(value.dtype))
     return value, jacobian, unit * jnp.sqrt(squares)
@@ -85,16 +112,20 @@ def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measur
 
 @jax.custom_vjp
 def _rounded(x: Array, size: Array, total: Array, squares: Array) -> Array:
-    """`x`, which is rounded. The cotangents of the last two are sums over all that is rounded, of
-    the sizes times their adjoints, and of the squares."""
+    """`x`, whose error is one unit of roundoff of `size`. The arguments `total` and `squares` do
+    not matter, but their cotangents are what we want: JAX adds up the cotangents of all uses of an
+    argument, here the size times the adjoint, and its square."""
     del size, total, squares
     return x
 
 
 def _adjoint(given: tuple[Array, Array], adjoint: Array) -> tuple[Array, ...]:
     size, total = given
+    # A cast to a lower precision has a larger unit of roundoff than the state.
     unit = float(jnp.finfo(adjoint.dtype).eps) / float(jnp.finfo(total.dtype).eps)
     terms = unit * jnp.abs(adjoint * size).astype(total.dtype)
+    # A term that is not finite says nothing of roundoff: the value itself is not finite then, or
+    # its derivative is infinite.
     terms = jnp.where(terms < jnp.inf, terms, 0)
     return adjoint, jnp.zeros_like(size), jnp.sum(terms), jnp.sum(terms**2)
 
@@ -106,16 +137,20 @@ _Pair = tuple[Any, int]  # a value, and how it depends on the state
 
 
 def _inside(closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]) -> list[_Pair]:
-    """The values of a jaxpr in which `changed(x, size)` takes the place of an `x` with an error."""
+    """The values of a jaxpr in which `changed(x, size)` takes the place of each `x` that has an
+    error of its own, of one unit of roundoff of `size`."""
     return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, changed))
 
 
 def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
+    """The values of one equation of a jaxpr, by the rules at the head of this file."""
     name, params = eqn.primitive.name, eqn.params
     inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
     kind = _COMPUTED if kind == _STATE and name not in _PARTS else kind
     inner = params.get("call_jaxpr")
-    if inner is not None and not _is_opaque(inner.jaxpr):  # a function with a rule of its own
+    # A function with a derivative rule of its own. We look into it, because a rule is about the
+    # derivative and not about the errors, unless JAX could not differentiate what is inside.
+    if inner is not None and not _is_opaque(inner.jaxpr):
         return _inside(inner, given, changed)
     if name in ("checkpoint", "remat2"):
         return _inside(closed_jaxpr(params["jaxpr"]), given, changed)
@@ -127,6 +162,7 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     products = name in _SUMS_OF_PRODUCTS
     computed = any(of == _COMPUTED for _, of in given)
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
+        # In a sum the parts of the state are exact terms, which the gradient shows.
         counted = (x if products or of != _STATE else jnp.zeros_like(x) for x, of in given)
         sizes = [jnp.abs(x) for x in counted]
         size = sum(sizes) if name == "sub" else outputs(eqn, *sizes)[0]
@@ -150,12 +186,15 @@ def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> li
 
 def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
     params, inside = eqn.params, eqn.params["jaxpr"]
-    # What is carried has the same shape inside.
+    # The operands are constants, what is carried, and arrays over which the loop runs. Parameters
+    # that count them have other names in other versions of JAX. But only elements of the last kind
+    # have another shape inside the loop than outside, and so we can count.
     alike = lambda var, x: var.aval.shape == x.shape  # noqa: E731
     num_carry = sum(map(alike, eqn.outvars, inside.out_avals))
     first = (last := sum(map(alike, eqn.invars, inside.in_avals))) - num_carry
 
-    @jax.checkpoint  # so that no step of a long scan is kept
+    # Without a checkpoint, reverse mode would keep the values of each step of a long scan.
+    @jax.checkpoint
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
         outs = _values(changed, inside, *inputs[:first], *carry, *x)
         return outs[:num_carry], outs[num_carry:]
@@ -166,7 +205,8 @@ def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) ->
 
 
 def _is_opaque(jaxpr: Any) -> bool:
-    """Whether a jaxpr has a loop or callback, through which reverse mode needs a rule."""
+    """Whether a jaxpr contains a loop of unknown length or a callback, which JAX can differentiate
+    in reverse mode only by a rule."""
     return any(
         eqn.primitive.name in ("while", "pure_callback", "io_callback")
         or any(_is_opaque(inner.jaxpr) for inner in jaxprs_inside(eqn))

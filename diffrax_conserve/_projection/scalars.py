@@ -1,9 +1,16 @@
 """Functions of small arrays, written out in scalars.
 
-XLA does not fuse across a sum or a stack of components: in a batch of small systems nearly every
-operation becomes a loop, whose overhead exceeds its arithmetic. Elementwise arithmetic of scalars
-it fuses. The functions call those of the user, so their jaxprs are rewritten: what only moves
-elements costs nothing, and what is neither elementwise nor a sum stays in arrays in its place.
+XLA does not fuse across a sum or a stack of components. So in a batch of small systems nearly every
+operation becomes a loop over the lanes, whose overhead exceeds its arithmetic. It does fuse
+elementwise arithmetic, and under `vmap` a scalar is an array over the lanes. So we replace each
+array by its elements, each a scalar.
+
+The functions call those of the user, so we cannot write them in scalars ourselves. Instead their
+jaxprs are rewritten. All elements are kept in one list, and an array becomes an array of integers,
+the *places* of its elements in that list. A primitive that only moves elements moves their places,
+which costs nothing at run time. An elementwise primitive, a reduction, or a product of matrices
+appends new scalars to the list. Any other primitive stays in arrays in its place: its operands are
+stacked, and its results taken apart.
 """
 
 import functools as ft
@@ -33,8 +40,11 @@ MAX_OPERATIONS = 2048
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
-    """`fn(y)`, computed in scalars where that is possible and `fn` is small. The limit allows for
-    XLA's tendency to repeat the whole computation for each element of the result."""
+    """`fn(y)`, computed in scalars if that is possible and `fn` is small.
+
+    XLA tends to repeat the whole computation for each element of the result, so the limit is
+    divided by their number.
+    """
     out = jax.eval_shape(fn, y)
     size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
     written = in_scalars(fn, y, limit=MAX_OPERATIONS // size, differentiated=True)
@@ -49,9 +59,12 @@ def in_scalars(
     limit: int = MAX_OPERATIONS,
     differentiated: bool = False,
 ) -> Callable[..., Any] | None:
-    """`fn` with each array that it takes and returns replaced by the tuple of its elements; `None`
-    if it is too large, has an effect or uses random keys. With `differentiated` it has the
-    derivative of `fn`, also where a function inside has a rule of its own."""
+    """`fn` with each array that it takes and returns replaced by the tuple of its elements.
+
+    It is `None` if `fn` is too large, has an effect or uses random keys. With `differentiated` it
+    has the derivative of `fn`, even if a function inside has a derivative rule of its own: then
+    such a function stays as it is. Without it the function is looked into, and its rule is lost.
+    """
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
     if sum(map(prod, shapes)) > limit:
@@ -64,6 +77,8 @@ def in_scalars(
         given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
         return _WriteOut(limit, differentiated)(closed, shapes, given)
 
+    # Tracing `write_out` once gives a jaxpr of scalars. It can be evaluated without rewriting
+    # again.
     flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(x.size)]
     try:
         evaluate = jex.jaxpr_as_fun(jax.make_jaxpr(write_out)(*flat))
@@ -93,7 +108,8 @@ def joined(like: Any, scalars: Any) -> Array:
     return jnp.stack(scalars).reshape(like.shape) if scalars else jnp.zeros(like.shape, like.dtype)
 
 
-_Places = np.ndarray  # of integers
+# An array of integers: where in the list of scalars the elements of an array are.
+_Places = np.ndarray
 
 
 class _NotWrittenOut(Exception):
@@ -115,10 +131,11 @@ _REDUCTIONS = {
     "reduce_and": lax.bitwise_and,
     "reduce_or": lax.bitwise_or,
 }
-# A requested precision may be ignored: sums of products are computed in the type of the state.
+# The parameters of a product of matrices that we can treat. A requested precision may be ignored,
+# because the sums of products are computed in the type of the state.
 _DOT = {"dimension_numbers", "precision", "preferred_element_type"}
-# Calls of a function, which is looked into. Some have a rule of their own for the derivative, which
-# would be lost: they are looked into only where no derivative is taken afterwards.
+# Calls of a function, which we look into. Some functions have a derivative rule of their own, which
+# would be lost by that. So these are looked into only if no derivative is taken afterwards.
 _CALLS = frozenset({"closed_call", "core_call", "checkpoint", "remat2"})
 _CALLS_WITH_A_RULE = frozenset({"custom_jvp_call", "custom_vjp_call"})
 
@@ -142,8 +159,8 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     return out[tuple(kept)]
 
 
-# What only moves elements moves their places alike. By numpy, because jax would compile each of
-# these for each shape, which takes 15 to 50 ms.
+# The primitives that only move elements, as functions that move their places by numpy. JAX itself
+# could do that too, but it would compile each of them for each shape, which takes 15 to 50 ms.
 _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
@@ -159,8 +176,9 @@ _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "transpose": lambda x, permutation: x.transpose(permutation),
     "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
 }
-# These do so by indices, which are the operands from the first to before the last number. Their
-# rules for indices are intricate: jax itself moves the places, if it knows the indices.
+# The primitives that move elements by indices. The operands from the first number to before the
+# last are the indices. The rules for them are intricate, so we let JAX itself move the places. That
+# is possible if the indices are known when the function is rewritten.
 _BY_INDICES = {
     "dynamic_slice": (1, None),
     "dynamic_update_slice": (2, None),
@@ -168,7 +186,8 @@ _BY_INDICES = {
     "scatter": (1, 2),
     "scatter-add": (1, 2),
 }
-# What jax does to indices before it uses them, -1 for the last element for example.
+# What JAX does to indices before it uses them, for example to replace -1 by the last place. These
+# are computed by numpy, so that the indices remain known.
 _ON_INDICES: dict[str, Callable[..., np.ndarray]] = {
     "add": np.add,
     "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
@@ -182,11 +201,16 @@ _ON_INDICES: dict[str, Callable[..., np.ndarray]] = {
 
 
 def _once(fn: Callable[[Array], Array], x: Array) -> Array:
-    """`fn(x)`, which XLA would compute again in each loop that uses it, dozens in a gradient. It
-    does not compute quotients again, so this is divided by a 1 that it cannot simplify away."""
+    """`fn(x)`, computed once.
+
+    XLA considers a sine cheap, and computes it again in each kernel that uses it. In a gradient
+    these are dozens. It does not compute quotients again, so we divide by a 1 that it cannot
+    simplify away, because `x` might be infinite.
+    """
     return fn(x) / (lax.stop_gradient(x) * 0 + 1)
 
 
+# Primitives that are computed otherwise.
 _INSTEAD: dict[str, Callable[..., Any]] = {
     "sin": ft.partial(_once, lax.sin),
     "cos": ft.partial(_once, lax.cos),
@@ -200,7 +224,8 @@ class _WriteOut:
         self.limit, self.differentiated = limit, differentiated
         self.scalars: list[Any] = []
         self.num_operations = 0
-        # The arrays whose elements are in the list, by the place of the first.
+        # The arrays that were taken apart, by the place of their first element. If one is needed as
+        # a whole again, it need not be stacked.
         self.arrays: dict[int, Array] = {}
 
     def __call__(
@@ -211,10 +236,12 @@ class _WriteOut:
         return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
 
     def _equation(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
+        """The places of the results of an equation, by the rule for its kind of primitive."""
         name, params = eqn.primitive.name, eqn.params
         if eqn.effects or any(_is_key(var.aval) for var in eqn.outvars):
             raise _NotWrittenOut
-        # Parameters that are `None` have no effect.
+        # Parameters that are `None`, and those that tell on which device something is, do not
+        # matter here.
         given = {
             key: value
             for key, value in params.items()
@@ -261,7 +288,8 @@ class _WriteOut:
         return self._add((ft.reduce(fn, [self.scalars[i] for i in row]) for row in rows), shape)
 
     def _dot(self, inputs: list[_Places], dimensions: Any) -> _Places:
-        """Products of the elements, with the axes in the order batch, free, contracted."""
+        """A product of arrays, as products of their elements that are summed. The axes of both are
+        brought into the order batch, free, contracted, and the free ones are spread out."""
         contracted, batch = dimensions
         order = [
             [*some, *(i for i in range(x.ndim) if i not in (*some, *summed)), *summed]
@@ -284,12 +312,14 @@ class _WriteOut:
             return self._in_arrays(eqn, inputs)
 
         def moved(*others: np.ndarray, **given: Any) -> np.ndarray:
+            """What the primitive does to numbers in the place of the other operands."""
             xs = [*others[:first], *indices, *others[first:]]
             with jax.ensure_compile_time_eval():
                 return np.asarray(eqn.primitive.bind(*xs, **(params | given)))
 
         if name == "scatter-add":
-            # Which of the updates are added to which elements.
+            # To find out which update is added to which elements, we let JAX add a one in its place
+            # to zeros.
             dtype, updates = eqn.outvars[0].aval.dtype, inputs[2]
             self._count(updates.size)
             nothing, out = np.zeros(operand.shape, dtype), operand.copy()
@@ -302,7 +332,8 @@ class _WriteOut:
         places = [x.astype(np.int32) for x in (*inputs[:first], *inputs[first:][len(indices) :])]
         if name != "gather":
             return [moved(*places)]
-        # Where an index is outside, the place would be that of a filling value.
+        # Where an index is outside of the operand, a gather returns a filling value, which has no
+        # place yet. We mark it by -1, and let JAX tell the value.
         out = moved(*places, fill_value=-1)
         if np.any(out < 0):
             filled = moved(np.zeros(operand.shape, eqn.outvars[0].aval.dtype))
@@ -310,13 +341,15 @@ class _WriteOut:
         return [out]
 
     def _in_arrays(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
-        """A primitive that is not known here: its inputs are joined, its outputs taken apart."""
+        """A primitive for which there is no rule here: its inputs are stacked to arrays, and its
+        outputs are taken apart."""
         self._count(sum(prod(var.aval.shape) for var in (*eqn.invars, *eqn.outvars)))
         given = [self._array(x, var.aval.dtype) for x, var in zip(inputs, eqn.invars, strict=True)]
         return [self._taken_apart(x) for x in outputs(eqn, *given)]
 
     def _array(self, places: _Places, dtype: Any) -> Any:
-        """The array of these elements; where it was taken apart, the array itself."""
+        """The array of these elements. If they are those of an array that was taken apart, in the
+        same order, it is that array."""
         whole = self.arrays.get(places.flat[0]) if places.size else None
         if whole is not None and np.array_equal(
             np.arange(whole.size), places.ravel() - places.flat[0]
@@ -350,6 +383,7 @@ class _WriteOut:
         return self._add(np.asarray(x).flat, np.shape(x))
 
     def _add(self, scalars: Iterable[Any], shape: tuple[int, ...]) -> _Places:
+        """Appends scalars to the list, and returns their places in an array of this shape."""
         first = len(self.scalars)
         self.scalars.extend(scalars)
         return np.arange(first, len(self.scalars)).reshape(shape)
@@ -361,4 +395,5 @@ class _WriteOut:
 
 
 def _is_key(x: Any) -> bool:
+    """Whether an array holds random keys, which have no arithmetic."""
     return jnp.issubdtype(x.dtype, jax.dtypes.extended)

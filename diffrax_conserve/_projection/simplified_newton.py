@@ -1,5 +1,7 @@
-"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, with the constraint Jacobian
-frozen at the candidate, for candidates as close as an integrator's local error."""
+"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as
+close to the manifold as the local error of a step. It moves along the gradients at the candidate.
+The iteration itself is in `chord`, that within bounds in `within_bounds`, the derivative in
+`implicit`."""
 
 from typing import final
 
@@ -7,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .base import Problem, ProjectionInfo
 from .implicit import project_along
-from .options import NEWTON_OPTIONS, option
+from .options import MAX_STEPS, NEWTON_OPTIONS, option
 from .within_bounds import AbstractNewton, project_within
 
 
@@ -49,7 +51,7 @@ class SimplifiedNewton(AbstractNewton):
         equations (4.4) to (4.6).
     """
 
-    max_steps: int = option(50, static=True)
+    max_steps: int = option(MAX_STEPS, static=True)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
@@ -60,7 +62,7 @@ class SimplifiedNewton(AbstractNewton):
             y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
         else:
             y, ok, count = project_within(box, equations, candidate, max_steps=self.max_steps)
-        return y, problem.judge(candidate, y, count, ok=ok)
+        return y, problem.report(candidate, y, count, ok=ok)
 
 
 SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS

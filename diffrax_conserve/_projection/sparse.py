@@ -33,92 +33,77 @@ from jaxtyping import Array, Float
 
 from .jaxprs import jaxprs_inside
 
-# The pattern is sought from this number of constraints on: below it a dense factor is as fast
+# The pattern is sought from this number of constraints on. With fewer a dense factor is as fast
 # (`benchmarks/cost/many_constraints.py`).
 LEAST_CONSTRAINTS = 33
-# A row with this many times the entries of the median row is dense. Of more dense rows than these
-# a Jacobian is not sparse.
-_DENSE_ROW, _DENSE_ROWS_MAX = 16, 16
-# The work for a block grows with the square of its size, and compile time with the size.
+# A row counts as dense if it has more than this many times the elements of the median row. The
+# number is a choice: a bond has 6 elements, an energy all of them.
+_DENSE_ROW = 16
+# A Jacobian with more dense rows than these is treated as dense. Each dense row costs one reverse
+# pass, and a solve of the sparse system.
+_DENSE_ROWS_MAX = 16
+# Larger blocks are replaced by an iteration: the work for a row grows with the square of the size
+# of its block, and compile time with the size, because a block is eliminated element by element.
 _BLOCK_MAX = 16
-# The roundoff that is added to the diagonal of the Gram matrix, as a share of it, so that a factor
-# exists where constraints depend on each other.
+# As in `elimination`: so many units of roundoff, times the root of the size of a block, are added
+# to the diagonal of the Gram matrix, as a share of it, so that a factor exists where constraints
+# depend on each other.
 _ADDED = 16
-# A dense Jacobian of so many bytes is announced before it is allocated.
-_LARGE = 2**28
+# A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
+_LARGE, _GIB = 2**28, 2**30
 
 
 class Pattern:
-    """The places of a sparse Jacobian. Equal only to itself, because equal functions share one.
+    """The places of the elements of a sparse Jacobian. It is equal only to itself, because equal
+    functions share one.
 
+    Places are integers, and arrays of them have a number past the end where there is nothing.
+
+    - `size`, `num_columns`: the numbers of rows and of columns.
     - `colours`: for each entry of the manifold the colour of each row, and their number.
-    - `sparse`, `dense`: the colours of sparse rows, and those of dense ones, a row each.
-    - `active`: from the first to the last component on which a sparse row depends.
-    - `rows`: the row in each place of the blocks. Here and below a number past the end is none.
+    - `sparse_colours`, `dense_colours`: which colours, counted over all entries, belong to sparse
+      rows, and which to dense ones. Each dense row has a colour of its own.
     - `dense_rows`: the rows that are dense.
-    - `places`: the place of each row among those of the blocks and the dense ones.
-    - `owners`: for each colour of sparse rows and each active component the row that it belongs to.
-    - `elements`: for the rows in the blocks, and the components on which the block depends, the
-      place among the colours.
-    - `overlap`: the place of each component of a block among those of the next, where blocks are
-      coupled.
-    - `iterative`: whether the Gram matrix is too wide for blocks.
+    - `active`: from the first to the last component on which a sparse row depends.
+    - `owners`: for each colour of sparse rows and each active component the row to which the
+      element belongs.
+    - `rows`: the row in each place of the blocks.
+    - `places`: the place of each row among those of the blocks, followed by the dense rows.
+    - `elements`: for each row in the blocks, and each component on which its block depends, the
+      place of the element in an array shaped like `owners`.
+    - `overlap`: the number of each component of a block among those of the next block; `None` if
+      blocks are not coupled.
+    - `iterative`: whether the Gram matrix is too wide for blocks. Then each row is a block.
     """
 
     def __init__(self, shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray):
-        self.size, self.num_columns = shape
-        (m, n), self.colours, kinds = shape, [], []
-        colour_of, entries, first, number = np.zeros(m, int), [], 0, 0
-        for size, (rows, columns) in found:
-            is_dense = dense[first : first + size]
-            sparse = ~is_dense[rows]
-            kept = _asdex().SparsityPattern.from_coo(rows[sparse], columns[sparse], (size, n))
-            colour, total = _asdex().color_rows(kept)
-            colour = np.where(is_dense, total + np.cumsum(is_dense) - 1, colour)
-            kinds += [False] * total + [True] * int(np.sum(is_dense))
-            self.colours.append((colour, total := total + int(np.sum(is_dense))))
-            colour_of[first : first + size] = number + colour
-            entries.append((first + rows[sparse], columns[sparse]))
-            first, number = first + size, number + total
-        rows, columns = (np.concatenate(x) for x in zip(*entries, strict=True))
-        self.sparse, self.dense = np.flatnonzero(~np.array(kinds)), np.flatnonzero(kinds)
-        self.dense_rows = np.flatnonzero(dense)
-        self.active = slice(int(columns.min()), width := int(columns.max()) + 1)
-        width -= self.active.start
+        (self.size, self.num_columns), self.dense_rows = shape, np.flatnonzero(dense)
+        self.colours, of_dense, (rows, columns, colour) = _coloured(shape, found, dense)
+        self.sparse_colours, self.dense_colours = (
+            np.flatnonzero(~of_dense),
+            np.flatnonzero(of_dense),
+        )
+        colour = np.searchsorted(self.sparse_colours, colour)
+        self.active = slice(int(columns.min()), int(columns.max()) + 1)
+        width = self.active.stop - self.active.start
+        self.owners = np.full((len(self.sparse_colours), width), self.size)
+        self.owners[colour, columns - self.active.start] = rows
         order, block, coupled = self._ordered(rows, columns)
         self.iterative = block == 0
-        block = max(block, 1)
-        num_blocks = -(-len(order) // block)
-        self.rows = np.full(num_blocks * block, m)
-        self.rows[: len(order)] = order
-        real = self.rows < m
-        self.places = np.zeros(m, int)
-        self.places[self.rows[real]] = np.flatnonzero(real)
-        self.places[self.dense_rows] = self.rows.size + np.arange(len(self.dense_rows))
-        self.rows = self.rows.reshape(num_blocks, block)
-
-        colour = np.searchsorted(self.sparse, colour_of[rows])
-        self.owners = np.full((len(self.sparse), width), m)
-        self.owners[colour, columns - self.active.start] = rows
-        place = self.places[rows]
-        held = place // block * n + columns
-        pairs = np.unique(held)
-        local = np.arange(len(pairs)) - np.searchsorted(pairs, pairs // n * n)
-        size = int(local.max()) + 1
-        self.elements = np.full((num_blocks, block, size), self.owners.size)
-        at = local[np.searchsorted(pairs, held)]
-        element = colour * width + columns - self.active.start
-        self.elements[place // block, place % block, at] = element
-        self.overlap = None
-        if coupled:
-            after = np.minimum(np.searchsorted(pairs, pairs + n), len(pairs) - 1)
-            self.overlap = np.full((num_blocks, size), size)
-            shared = np.where(pairs[after] == pairs + n, local[after], size)
-            self.overlap[pairs // n, local] = shared
+        self.rows, self.places = self._placed(order, max(block, 1))
+        stored = colour * width + columns - self.active.start
+        self.elements, self.overlap = self._in_blocks(rows, columns, stored, coupled)
 
     def _ordered(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, int, bool]:
-        """An order of the sparse rows, the size of blocks, zero where that would be too large, and
-        whether consecutive blocks are coupled. Padding is a row past the end."""
+        """An order of the sparse rows, in which a row past the end is padding; the size of the
+        blocks, zero if they would be too large; and whether consecutive blocks are coupled.
+
+        Two rows are neighbours if they share a component, because then their product in the Gram
+        matrix is not zero. If neighbours form small groups, as the bonds of molecules do, each
+        group is a block, and blocks are not coupled. Otherwise we look for an order in which
+        neighbours are near each other. With blocks as long as the largest distance, each block is
+        coupled to the next one only.
+        """
         sparse = np.setdiff1d(np.arange(self.size), self.dense_rows)
         ones = np.ones(len(rows), np.int8)
         matrix = sp.csr_matrix((ones, (rows, columns)), (self.size, self.num_columns))[sparse]
@@ -133,8 +118,9 @@ class Pattern:
             rank = np.arange(len(sparse)) - starts[labels[by_label]]
             order[labels[by_label] * block + rank] = sparse[by_label]
             return order, block, False
+        # The algorithm of Cuthill and McKee makes the band of a symmetric matrix narrow.
         narrowed = sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True)
-        # The order that is given comes first: where it is as good, nothing has to be moved.
+        # The given order comes first. If it is as good, it is kept, and nothing has to be moved.
         orders = np.arange(len(sparse)), narrowed
         a, b = graph.nonzero()
         widths = [int(np.max(np.abs(np.argsort(x)[a] - np.argsort(x)[b]))) for x in orders]
@@ -143,19 +129,75 @@ class Pattern:
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
+    def _placed(self, order: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
+        """`rows` and `places`, for the rows in this order and blocks of this size."""
+        rows = np.full(-(-len(order) // block) * block, self.size)
+        rows[: len(order)] = order
+        real = rows < self.size
+        places = np.zeros(self.size, int)
+        places[rows[real]] = np.flatnonzero(real)
+        places[self.dense_rows] = rows.size + np.arange(len(self.dense_rows))
+        return rows.reshape(-1, block), places
+
+    def _in_blocks(
+        self, rows: np.ndarray, columns: np.ndarray, stored: np.ndarray, coupled: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """`elements` and `overlap`, for the elements of sparse rows and where each is stored."""
+        (num_blocks, block), n = self.rows.shape, self.num_columns
+        # A block and a component on which it depends are one number. Within a block we count the
+        # components in ascending order.
+        place = self.places[rows]
+        pair = place // block * n + columns
+        pairs = np.unique(pair)
+        number = np.arange(len(pairs)) - np.searchsorted(pairs, pairs // n * n)
+        size = int(number.max()) + 1
+        elements = np.full((num_blocks, block, size), self.owners.size)
+        elements[place // block, place % block, number[np.searchsorted(pairs, pair)]] = stored
+        if not coupled:
+            return elements, None
+        after = np.minimum(np.searchsorted(pairs, pairs + n), len(pairs) - 1)
+        overlap = np.full((num_blocks, size), size)
+        overlap[pairs // n, number] = np.where(pairs[after] == pairs + n, number[after], size)
+        return elements, overlap
+
     def taken_apart(self, x: Float[Array, " m"]) -> tuple[Array, Array]:
-        """Numbers for the rows of the blocks, and for the dense ones."""
+        """A number for each row as those for the rows of the blocks, and those for dense rows."""
         return _take(x, self.rows), x[self.dense_rows]
 
     def joined(self, blocks: Array, dense: Array) -> Float[Array, " m"]:
-        """The opposite."""
+        """The opposite of `taken_apart`."""
         return _take(jnp.concatenate([blocks.reshape(-1), dense]), self.places)
+
+
+def _coloured(
+    shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray
+) -> tuple[list[tuple[np.ndarray, int]], np.ndarray, tuple[np.ndarray, ...]]:
+    """The colours of each entry of the manifold; whether a colour is that of a dense row; and the
+    rows, columns and colours of the elements of sparse rows, counted over all entries.
+
+    Each entry is differentiated by itself, so it has its own colours: first those of its sparse
+    rows, then one for each dense row.
+    """
+    colours, of_dense, elements, first = [], [], [], 0
+    for size, (rows, columns) in found:
+        is_dense = dense[first : first + size]
+        rows, columns = rows[~is_dense[rows]], columns[~is_dense[rows]]
+        kept = _asdex().SparsityPattern.from_coo(rows, columns, (size, shape[1]))
+        colour, number = _asdex().color_rows(kept)
+        colour = np.where(is_dense, number + np.cumsum(is_dense) - 1, colour)
+        elements.append((first + rows, columns, len(of_dense) + colour[rows]))
+        of_dense += [False] * number + [True] * int(np.sum(is_dense))
+        colours.append((colour, number + int(np.sum(is_dense))))
+        first += size
+    rows, columns, colour = (np.concatenate(x) for x in zip(*elements, strict=True))
+    return colours, np.array(of_dense, bool), (rows, columns, colour)
 
 
 def pattern_of(
     parts: Sequence[Callable[[Array], Array]], sizes: Sequence[int], y: Any
 ) -> Pattern | None:
-    """The pattern of the Jacobian of these functions, if it is worth while."""
+    """The pattern of the Jacobian of these functions; `None` if they are few, or if it is not
+    sparse or cannot be found."""
     m, n = sum(sizes), y.size
     if m < LEAST_CONSTRAINTS:
         return None
@@ -166,6 +208,7 @@ def pattern_of(
             stacklevel=2,
         )
         return None
+    # Equal functions have equal jaxprs and equal constants.
     traced = [jax.make_jaxpr(part)(y) for part in parts]
     keys = tuple((str(x.jaxpr), *map(_content, _constants(x))) for x in traced)
     if keys not in _KNOWN:
@@ -176,7 +219,7 @@ def pattern_of(
     if pattern is None and m * n * y.dtype.itemsize > _LARGE:
         warnings.warn(
             f"The Jacobian of the {m} constraints is not sparse, or its pattern is not known when "
-            f"the solve is traced: it takes {m * n * y.dtype.itemsize / 2**30:.1f} GiB. A function "
+            f"the solve is traced: it takes {m * n * y.dtype.itemsize / _GIB:.1f} GiB. A function "
             "that selects components by an array of indices must close over it, as a numpy array, "
             "not take it from `args`.",
             stacklevel=2,
@@ -184,12 +227,13 @@ def pattern_of(
     return pattern
 
 
-# What was found, by the functions.
+# The patterns that were found, by their functions. Detection takes seconds for large systems.
 _KNOWN: dict[Any, Pattern | None] = {}
 
 
 @ft.cache
 def _asdex() -> Any:
+    """The package that finds sparsity patterns by abstract interpretation, if it is installed."""
     try:
         import asdex
     except ImportError:
@@ -207,13 +251,18 @@ def _constants(closed: Any) -> Iterator[Any]:
 
 
 def _content(x: Any) -> Any:
-    """A key for a constant of a function; the value of a tracer is not known."""
+    """A key for a constant of a function. The value of a tracer is not known, only its shape."""
     if isinstance(x, jax.core.Tracer):
         return x.shape, x.dtype
     return np.shape(x), np.asarray(x).tobytes()
 
 
 def _entries(closed: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The rows and columns of the elements of a Jacobian that can differ from zero.
+
+    Constants of which the values are not known, because they are tracers, become arguments of the
+    function: the pattern is one for all their values.
+    """
     unknown = [i for i, x in enumerate(closed.consts) if isinstance(x, jax.core.Tracer)]
 
     def fn(y: Array, *others: Array) -> Array:
@@ -229,6 +278,8 @@ def _entries(closed: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
+    """The pattern, if few rows are dense and at most a quarter of the elements of the others can
+    differ from zero."""
     counts = np.concatenate([np.bincount(r, minlength=size) for size, (r, _) in found])
     dense = counts > _DENSE_ROW * max(1, np.median(counts))
     if np.sum(dense) > _DENSE_ROWS_MAX or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
@@ -237,9 +288,10 @@ def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
 
 
 class SparseRows(eqx.Module):
-    """The rows of a Jacobian, or of another matrix with its pattern.
+    """The rows `U` of a Jacobian, or of another matrix with its pattern.
 
-    - `colours`: the sums of the sparse rows of each colour.
+    - `colours`: for each colour the sum of its sparse rows. As these share no component, each
+      element of the sum is an element of one row, which `Pattern.owners` tells.
     - `dense`: the rows that are dense.
     """
 
@@ -259,7 +311,7 @@ class SparseRows(eqx.Module):
             seeds = np.arange(total)[:, None] == colour
             rows.append(jax.vmap(vjp)(seeds.astype(value.dtype))[0])
         rows = jnp.concatenate(rows)
-        sparse, dense = rows[pattern.sparse][:, pattern.active], rows[pattern.dense]
+        sparse, dense = rows[pattern.sparse_colours][:, pattern.active], rows[pattern.dense_colours]
         return jnp.concatenate(values), cls(sparse, dense, pattern)
 
     def __len__(self) -> int:
@@ -274,9 +326,10 @@ class SparseRows(eqx.Module):
         largest = jnp.max(jnp.abs(_take(self.colours, self.pattern.elements)), axis=2)
         sizes = self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
         sizes = jnp.where(sizes > 0, sizes, 1)
-        of = jnp.where(self.pattern.owners < len(self), _take(sizes, self.pattern.owners), 1)
+        owned = self.pattern.owners < len(self)
+        size = jnp.where(owned, _take(sizes, self.pattern.owners), 1)
         dense = self.dense / sizes[self.pattern.dense_rows, None]
-        return sizes, SparseRows(self.colours / of, dense, self.pattern)
+        return sizes, SparseRows(self.colours / size, dense, self.pattern)
 
     def times(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """`U x`."""
@@ -300,7 +353,9 @@ class SparseRows(eqx.Module):
             over, width = pattern.overlap[:, None], pattern.overlap.shape[1]
 
             def coupling(rows: Array, later: Array) -> Array:
-                """The products of the rows of each block with those of the next."""
+                """The products of the rows of each block with those of the next. They are sums over
+                the components that both have, so the next rows are taken at the components of the
+                first."""
                 later = jnp.concatenate([later[1:], jnp.zeros_like(later[:1])])
                 later = jnp.take_along_axis(later, np.minimum(over, width - 1), axis=2)
                 return jnp.sum(rows[:, :, None] * jnp.where(over < width, later, 0)[:, None], 3)
@@ -322,12 +377,14 @@ class SparseRows(eqx.Module):
 
 
 class BlockGram(eqx.Module):
-    """A Gram matrix in blocks.
+    """A Gram matrix `U Vᵀ` in blocks. It need not be symmetric, as `U` and `V` may differ.
 
-    - `diagonal`, `following`, `preceding`: the blocks on the diagonal, and those that couple each
-      block to the next, in its own rows and in those of the next.
-    - `columns`, `rows`, `corner`: the products with dense rows, and of dense rows.
-    - `factors`: the two matrices of which it is the product, where it is applied as such.
+    - `diagonal`: the blocks on the diagonal.
+    - `following`, `preceding`: the blocks that couple each block to the next, in its own rows and
+      in those of the next; `None` if blocks are not coupled.
+    - `columns`, `rows`, `corner`: the products of sparse rows with dense ones, of dense rows with
+      sparse ones, and of dense rows.
+    - `factors`: `U` and `V` themselves, if the system is solved by iteration.
     """
 
     diagonal: Float[Array, "blocks block block"]
@@ -343,10 +400,13 @@ class BlockGram(eqx.Module):
         return self.pattern.size
 
     def factored(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
-        """The solution of the system, as a function of its right side."""
+        """The solution of the system, as a function of its right side. Dense rows are eliminated
+        last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
         added = _ADDED * block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps)
+        # A diagonal element is zero for padding, and for a constraint without a gradient. With a
+        # one in its place the multiplier of such a row is its right side.
         unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)
         diagonal = jnp.where(eye, unit, self.diagonal)
         if self.factors is None:
@@ -370,7 +430,9 @@ class BlockGram(eqx.Module):
         return solve
 
     def _iteration(self, diagonal: Array) -> Callable[[Array], Array]:
-        """Stabilised conjugate gradients, because the matrix need not be symmetric."""
+        """The solution by the stabilised biconjugate gradient method (H. A. van der Vorst, "Bi-
+        CGSTAB", *SIAM J. Sci. Stat. Comput.* 13 (1992), 631-644), because the matrix need not be
+        symmetric. The preconditioner is the diagonal."""
         factors, zero = self.factors or (), jnp.zeros(len(self.corner), diagonal.dtype)
 
         def product(left: SparseRows, right: SparseRows, x: Array) -> Array:
@@ -379,6 +441,8 @@ class BlockGram(eqx.Module):
             )[0]
 
         def solve(product: Callable[[Array], Array], b: Array) -> Array:
+            # The iterations of Newton's method correct what an inexact solution leaves, so this is
+            # less accurate than could be had.
             tol = float(jnp.finfo(b.dtype).eps) ** (3 / 4)
             return bicgstab(product, b, tol=tol, M=lambda x: x / diagonal[..., 0])[0]
 
@@ -406,8 +470,8 @@ def _times(a: Array, b: Array) -> Array:
 
 
 def _inverse(matrix: Float[Array, "blocks k k"]) -> Float[Array, "blocks k k"]:
-    """The inverses of small matrices, by sweeps, without a search for pivots: Gram matrices do not
-    need one."""
+    """The inverses of small matrices in all blocks, by Gauss-Jordan elimination in place. There is
+    no search for pivots, which positive definite matrices such as Gram matrices do not need."""
     for k in range(matrix.shape[1]):
         pivot = 1 / matrix[:, k, k]
         row, column = matrix[:, k, :] * pivot[:, None], matrix[:, :, k]
@@ -420,8 +484,13 @@ def _inverse(matrix: Float[Array, "blocks k k"]) -> Float[Array, "blocks k k"]:
 def _reduced(
     diagonal: Array, following: Array | None, preceding: Array | None
 ) -> Callable[[Float[Array, "blocks k"]], Float[Array, "blocks k"]]:
-    """The solution of a block tridiagonal system by cyclic reduction. `following[i]` couples row
-    `i` to block `i + 1`, `preceding[i]` row `i + 1` to block `i`; the last of both are zero."""
+    """The solution of a block tridiagonal system by cyclic reduction (G. H. Golub and C. F. Van
+    Loan, *Matrix Computations*, Johns Hopkins 2013, 4.5), as a function of its right side.
+
+    The rows with odd numbers are eliminated, all at once, which leaves a block tridiagonal system
+    of half the size for those with even numbers, and so on. `following[i]` couples row `i` to block
+    `i + 1`, and `preceding[i]` couples row `i + 1` to block `i`; the last of both are zero.
+    """
 
     def before(x: Array) -> Array:
         return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
@@ -445,10 +514,12 @@ def _reduced(
             x = jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(fill, x.dtype), x[:1].shape)])
         return x[0::2], x[1::2]
 
+    # If the number of blocks is odd, a block of ones is added, which is coupled to none.
     middle, odd = even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
     right, odd_right = even_and_odd(following)
-    odd_left, left = even_and_odd(preceding)  # in the rows of the odd block, and of the next even
+    # These couple the odd block to the one before, and the next even block to the odd one.
+    odd_left, left = even_and_odd(preceding)
     inverse = _inverse(odd)
     from_right, from_left = _times(right, inverse), before(_times(left, inverse))
     middle = middle - _times(from_right, odd_left) - _times(from_left, before(odd_right))

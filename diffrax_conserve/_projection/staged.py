@@ -24,7 +24,7 @@ class Staged(AbstractProjection):
     example errors of the velocities do not move the positions. Compare it with the joint
     projection, which may be more or less accurate.
 
-    Success is judged for all parts at the returned state.
+    The projection succeeds if all parts hold at the returned state.
 
     !!! example
 
@@ -80,8 +80,8 @@ class Staged(AbstractProjection):
             y, info = projection.solve(_restricted(problem, self.names[:number], projection, y), y)
             infos.append(info)
         count = sum(info.num_steps for info in infos)
-        # The last stage has judged all parts, by its own tolerances.
-        return y, problem.judge(candidate, y, count, ok=infos[-1].ok)
+        # The last stage has tested all parts, by its own tolerances.
+        return y, problem.report(candidate, y, count, ok=infos[-1].ok)
 
 
 Staged.__init__.__doc__ = r"""**Arguments:**
@@ -98,7 +98,8 @@ Staged.__init__.__doc__ = r"""**Arguments:**
 def _restricted(
     problem: Problem, keys: tuple[Any, ...], projection: AbstractProjection, candidate: Array
 ) -> Problem:
-    """The problem restricted to the entries with these keys, in the metric of the projection."""
+    """The problem restricted to the entries with these keys, in the metric and with the tolerances
+    of the projection. A metric that is a function is evaluated at the candidate of the stage."""
     y = jax.eval_shape(ravel, problem.like)
     wanted = [key in keys for key in problem.keys]
     sizes = [eqx.filter_eval_shape(part, y).size for part in problem.equations.parts]

@@ -133,7 +133,11 @@ class TangentField(eqx.Module):
         return self._solve(t, y, args)[2]
 
     def _solve(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y, Values]:
-        """The given field, its correction, and the multipliers."""
+        """The given field, its correction, and the multipliers.
+
+        Let `ġ` be the derivative of the functions along the given field, `∂_t g + G f`. It should
+        be `rate - gain · g`, so the correction must change it by the difference of both, `wrong`.
+        """
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
         values = conserved_values(self.manifold, t, y, args)
@@ -150,6 +154,8 @@ class TangentField(eqx.Module):
         wrong = (wanted - along).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
+            """`M⁻¹ Gᵀ λ` and `λ`, where `G M⁻¹ Gᵀ λ = wrong`. The rows of `G` are divided by their
+            sizes, and so is the right side."""
             vector, wrong = given
             _, jacobian = equations.linearise(vector)
             sizes, rows = scaled_rows(equations.scaled(jacobian))

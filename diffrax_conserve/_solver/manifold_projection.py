@@ -170,34 +170,40 @@ class ManifoldProjection(ForwardingSolver):
         solver_state: State,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
-        # diffrax evaluates a kept stage for all lanes while one is in its first step. A stage at
-        # the projected state amplifies the error of the root finder of an implicit method;
-        # `QUICSORT` keeps none, and cannot be told of a jump.
+        # A solver with the property "first same as last" keeps the slope at the candidate for the
+        # next step, which starts at the projected state. Told of a jump, it evaluates the slope
+        # there anew. It is told so in every step, because while one lane of a batch is in its first
+        # step, diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend
+        # on the others. There are two exceptions. In an implicit method the kept slope fits the
+        # last stage, which its root finder has solved; a slope at the projected state would amplify
+        # the error of the root finder. `QUICSORT` keeps none, and refuses to be told.
         keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
         state = solver_state
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
         )
+        # The projection. `start` is its target with the balances at the start of the step, from
+        # which dense output integrates them to any time in the step; `target` is that at the end.
         change = moved(y0, candidate)
         motion = state.moved_by(change, candidate)
         start = self._target(terms, t1, state, motion, candidate, args).following(t0, y0)
-        # Evaluated only where it is needed.
+        # The dense output of the step is needed only for balances, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
-        units, cannot_start = (
-            start.units(t0, y0),
-            self._cannot_start(start, state, t0, y0, made_jump),
-        )
+        # Whether it succeeded, and if not, whether a shorter step could.
+        units = start.units(t0, y0)
+        cannot_start = self._cannot_start(start, state, t0, y0, made_jump)
         states = y0, candidate, y1
         failed = cause_of_failure(info.ok, cannot_start, states, units, self.max_correction)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
         statistics = state.statistics.add(
             info, due, None if error is None else length(ravel(error), units)
         )
-        # A lane that ended is evaluated until the last one ends. NaN takes no iterations.
+        # The last state of a solve that failed is NaN. In a batch such a lane is evaluated until
+        # the last one ends, and NaN costs no iterations.
         y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         dense_info = dict(
             inner=dense_info,
@@ -207,10 +213,14 @@ class ManifoldProjection(ForwardingSolver):
             target=PackedTarget(start),
             due=due,
         )
-        # A huge error makes an adaptive solve try a smaller step. A failure that is final is
-        # accepted, and its result ends the solve. The norm of an infinite complex number is NaN.
-        shown = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
-        error = jtu.tree_map(lambda e: jnp.where(failed > 0, shown.astype(e.dtype), e), error)
+        # diffrax looks at the result of a step only if the step is accepted. So a failed step
+        # reports a huge error, by which an adaptive controller rejects it and tries a shorter one.
+        # A failure that is final reports no error: the step is accepted, and its result ends the
+        # solve. The error is huge but finite, because the norm of an infinite complex number would
+        # be NaN.
+        reported = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
+        error = jtu.tree_map(lambda e: jnp.where(failed > 0, reported.astype(e.dtype), e), error)
+        # If the wrapped solver has failed by itself, its own result is kept.
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
@@ -254,7 +264,8 @@ class ManifoldProjection(ForwardingSolver):
         lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
             return lost
-        first = jnp.all(state.motion == 0)
+        first = jnp.all(state.motion == 0)  # it is zero only before the first step
+        # If not every step is projected, a later step may well start off the constraint.
         fresh = first if self.every > 1 else first | made_jump
         equations = target.equations(t0, y0)
         off = lax.cond(

@@ -8,6 +8,9 @@ import jax.tree_util as jtu
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._projection.scalars import written_out
 
+# The method averages the slopes with the weights 1, 2, 2, 1, of which this is the sum.
+_WEIGHTS = 1 + 2 + 2 + 1
+
 
 @final
 class RK4(dfx.AbstractSolver[None]):
@@ -63,7 +66,7 @@ class RK4(dfx.AbstractSolver[None]):
         middle = t0 + (t1 - t0) / 2
         control = terms.contr(t0, t1)
 
-        # A stage is the increment `h f` over the whole step.
+        # As in diffrax, a stage is the increment `h f` over the whole step.
         def stage(t: RealScalarLike, y: Y) -> Y:
             return terms.vf_prod(t, y, args, control)
 
@@ -76,7 +79,7 @@ class RK4(dfx.AbstractSolver[None]):
             k3 = stage(middle, moved(y0, 0.5, k2))
             k4 = stage(t1, moved(y0, 1.0, k3))
             return jtu.tree_map(
-                lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / 6, y0, k1, k2, k3, k4
+                lambda y, a, b, c, d: y + (a + 2 * (b + c) + d) / _WEIGHTS, y0, k1, k2, k3, k4
             )
 
         y1 = written_out(end, y0)

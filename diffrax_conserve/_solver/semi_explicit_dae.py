@@ -23,12 +23,17 @@ from .manifold_projection import ManifoldProjection
 
 Algebraic = Callable[[RealScalarLike, Any, Any, Args], Values]
 
-# Newton's method ends after this many corrections: one for each thermal voltage by which the guess
-# of the voltage at a diode is too large, a few in a solve.
+# Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
+# rough guess it may need many: if the voltage at a diode is guessed too large, each correction
+# lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
 _MAX_STEPS = 500
-# A correction is shortened to this share until it helps, at most down to the least share.
-_SHORTER, _LEAST_SHARE = 1 / 4, 1e-9
-# A pivot below this many units of roundoff for each unknown is one of roundoff.
+# A correction that does not help is shortened to this share of itself.
+_SHORTER = 1 / 4
+# At this share of a correction we give up. In float64 a correction that is as large as the unknown
+# then still changes half of its digits, so that the functions could show an effect.
+_LEAST_SHARE = 1e-9
+# A pivot counts as roundoff if it is at most this many units of roundoff for each unknown, in a
+# matrix with elements of size one; as in `_projection/elimination.py`.
 _LEAST_PIVOT = 4
 
 
@@ -198,7 +203,7 @@ class _Root(AbstractProjection):
         x, z = _pair(problem.state(candidate))
         root = _solved(self.g, problem.t, x, z, problem.args)
         y = jnp.concatenate([ravel(x), root])
-        return y, problem.judge(candidate, y)
+        return y, problem.report(candidate, y)
 
 
 def _pair(y: Any) -> tuple[Any, Any]:
@@ -252,7 +257,8 @@ def _root(fn: Any, t: Array, x: Y, z: Float[Array, " m"], args: Args) -> Float[A
 
 @_root.def_jvp
 def _root_jvp(primals: Any, tangents: Any) -> Any:
-    """`fn` at the root does not change, whatever the guess: `g_z ż = -ġ` at constant `z`."""
+    """By the implicit function theorem: `g` stays zero at the root, so `g_z ż = -ġ`, where `ġ` is
+    the tangent of `g` at constant `z`. The root does not depend on the guess."""
     fn, t, x, _, args = primals
     t_fn, t_t, t_x, _, t_args = tangents
     root = _root(*primals)
@@ -263,6 +269,7 @@ def _root_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def _divided(jacobian: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`jacobian⁻¹ b`, computed in units in which all elements are about one."""
     if b.size == 1:
         return b / jacobian[0]
     rows, columns = lax.stop_gradient(_sizes(jacobian))
@@ -314,8 +321,13 @@ class _Iterate(NamedTuple):
 def _algebraic_newton(
     residual: Callable[[Array], Array], z: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Damped Newton's method. A correction is accepted if the next one with the same Jacobian is
-    shorter, which does not depend on the units of the equations; NaN is not."""
+    """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
+    Nonlinear Problems*, Springer 2004, 3.3).
+
+    A correction is accepted if the one after it, computed with the same Jacobian, is shorter. So
+    the test compares changes of `z`, and does not depend on the units of the equations. A
+    correction that is NaN is not accepted. The iteration ends with NaN if there is no root.
+    """
     eps = float(jnp.finfo(z.dtype).eps)
 
     def body(now: _Iterate) -> _Iterate:
@@ -327,10 +339,14 @@ def _algebraic_newton(
         size = size + eps**0.5 * jnp.max(size, initial=0)
         size = jnp.where(size > 0, size, 1)
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
+        # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
+        # for half of that gain.
         better = then <= (1 - now.share / 2) * before
-        # The next corrections shrink at least by the same ratio, to what is left after both.
+        # The later corrections shrink at least by the same ratio, `then / before`. So the one that
+        # would follow both is at most `then² / before`, which is roundoff here.
         settled = better & (now.share == 1) & (then * then <= eps * before)
-        found = settled | (~better & (before <= eps**0.5))  # or no better because of roundoff
+        # If the correction is at most `√ε` and does not help, roundoff keeps it from helping.
+        found = settled | (~better & (before <= eps**0.5))
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
         going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)

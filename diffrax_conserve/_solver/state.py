@@ -1,5 +1,9 @@
 """The solver state of a `ManifoldProjection`, and how a step fails: why, and whether a shorter step
-could be better."""
+could be better.
+
+diffrax forgets the solver state of a step that it rejects. So no rule here can count attempts or
+compare a step with the last one that failed: each must tell from the step alone.
+"""
 
 import dataclasses
 from typing import Any, final
@@ -47,13 +51,18 @@ FIRST = register(
     "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
     "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
 )
-# The causes of a failure, in the order of their messages.
+# The causes of a failure, in the order of their messages above, of which `FIRST` is the first. Zero
+# is no failure.
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
-# By fewer units of roundoff a component moves by the rounding of a few stages, and a time by that
-# of a few additions.
-_AT_ROUNDOFF, _INSTANT = 64, 8
-# Corrections are shorter than the error estimate of their step, which is that of a method of lower
-# order. Where they are this many times as long, the quantity is probably not conserved.
+# If a step moves a component by at most this many units of roundoff of itself, it may move it by
+# rounding alone: a dozen stages are added up, each with an error of a few units.
+_AT_ROUNDOFF = 64
+# A step of at most this many units of roundoff of the time is no time: the controller computes the
+# ends of a step by a few additions.
+_INSTANT = 8
+# Corrections are usually shorter than the error estimate of their step, because that is the
+# estimate for a method of lower order. If one is longer by this factor, the quantity is probably
+# not conserved. The number is a choice.
 _SUSPICIOUS = 10
 
 
@@ -105,6 +114,8 @@ class ProjectionStatistics(eqx.Module):
     def add(
         self, info: ProjectionInfo, due: Array | None, error: Array | None
     ) -> "ProjectionStatistics":
+        """The statistics after one more step, with the report on its projection, whether one was
+        due, and the length of the error estimate."""
         return ProjectionStatistics(
             self.num_projections + (1 if due is None else due.astype(int)),
             self.num_iterations + info.num_steps,
@@ -159,6 +170,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 class State(eqx.Module):
     """What later steps need.
 
+    - `inner`: the state of the wrapped solver.
     - `values`, `hidden`, `gained`: as in a `Target`.
     - `motion`: the largest change of each component in one step so far, at least the root of
       roundoff of the component itself; zero before the first step.
@@ -176,18 +188,23 @@ class State(eqx.Module):
     statistics: ProjectionStatistics
 
     def moved_by(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
-        """`motion` after a step. It is this maximum that is carried, floor included, because a
-        maximum outside would keep XLA from compiling the loop of a small solve as one function."""
+        """`motion` after a step that changed the components by `change`.
+
+        A component that hardly moves counts as moving by `√ε` of itself, which is a floor. We carry
+        the maximum including this floor. If the floor were applied later, XLA could not compile the
+        loop of a small solve as one function, which would make it slower.
+        """
         least = float(jnp.finfo(change.dtype).eps) ** 0.5 * jnp.abs(ravel(end))
         return jnp.maximum(self.motion, jnp.maximum(change, least))
 
     def next(self, **fields: Any) -> "State":
+        """The state after a step, with these fields."""
         num_steps = None if self.num_steps is None else self.num_steps + 1
         return dataclasses.replace(self, num_steps=num_steps, **fields)
 
 
 def moved(start: Y, end: Y) -> Float[Array, " n"]:
-    """How far each component moves."""
+    """How far each component moves from one state to another."""
     return jnp.abs(ravel(end) - ravel(start))
 
 
@@ -200,9 +217,13 @@ def started(
 
 
 def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a state violates a `Constraint` by more than the root of roundoff, relative to its
-    terms and to their changes in a step. The changes count because all terms may be roundoff, as
-    those of `q v = 0` where a pendulum passes a horizontal position."""
+    """Whether a state violates a `Constraint` by more than `√ε`, relative to the sizes of its terms
+    and of their changes in a step.
+
+    The tolerance is much larger than that of a projection, because initial states are often given
+    with a few digits less. The changes count because all terms may be roundoff at one state, such
+    as those of `q · v = 0` where a component of a pendulum passes zero.
+    """
     g, jacobian = equations.linearise(y)
     sizes = jnp.abs(y) if equations.motion is None else jnp.abs(y) + equations.motion
     limit = shown_terms(jacobian, sizes) + equations.hidden
@@ -224,7 +245,8 @@ def cause_of_failure(
     result of its projection."""
     last, candidate, result = (ravel(y) for y in states)
     correction = result - candidate
-    finite = jnp.abs(jnp.sum(correction)) < jnp.inf  # one sum is one kernel
+    # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
+    finite = jnp.abs(jnp.sum(correction)) < jnp.inf
     cause = jnp.where(ok, 0, jnp.where(finite, _NOT_REACHED, _NOT_FINITE))
     if max_correction is not None:
         limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, units)
@@ -237,10 +259,9 @@ def is_final(
 ) -> Bool[Array, ""]:
     """Whether a step that failed is so short that no shorter one is better.
 
-    diffrax forgets the solver state of a step that it rejects. So nothing can count attempts, and
-    that a solve is hopeless must be seen from the step alone: it moves each component by no more
-    than roundoff, or no time passes. Time is measured by the first step too, because many solves
-    start at zero, beside which every step is long.
+    A controller answers a failed step by a shorter one. That ends when a step moves each component
+    by no more than roundoff, or when no time passes. Time is compared with the length of the first
+    step too, because many solves start at zero, beside which every step is long.
     """
     size = jnp.abs(ravel(candidate))
     still = jnp.all(moved <= _AT_ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size)

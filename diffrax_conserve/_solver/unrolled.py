@@ -83,8 +83,9 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
         solver_state: None,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, None, dfx.RESULTS]:
-        # "First same as last" would save nothing: in a batch both branches of the choice between
-        # the last slope and a new one are computed, and a projected state has a new slope.
+        # In a method with the property "first same as last" the last slope of a step is the first
+        # of the next. Keeping it would save nothing: a projected state has another slope, and in a
+        # batch both the kept and a new slope are computed before one is chosen.
         del solver_state, made_jump
         tableau = self.solver.tableau
         control = terms.contr(t0, t1)
@@ -94,7 +95,7 @@ class Unrolled(dfx.AbstractAdaptiveSolver[Any]):
             y = _displaced(y0, row, increments)
             time = t0 + float(fraction) * (t1 - t0)
             increments.append(terms.vf_prod(time, y, args, control))
-        # "Solution same as last": the last stage is evaluated at the solution.
+        # In a method with the property "solution same as last" the last stage is at the solution.
         y1 = y if tableau.ssal else _displaced(y0, tableau.b_sol, increments)
         error = _combined(tableau.b_error, increments)
         k = jtu.tree_map(lambda *leaves: jnp.stack(leaves), *increments)

@@ -10,12 +10,14 @@ from .terms import innermost
 
 
 def _of_innermost(name: str) -> Any:
+    """A property that reads an attribute of the solver inside all wrappers."""
     return property(lambda self: getattr(innermost(self.solver), name))
 
 
 class ForwardingSolver(dfx.AbstractWrappedSolver[Any]):
-    """The base of our wrappers. diffrax forwards `isinstance` to the innermost solver, then reads
-    the attributes of its kind from the wrapper."""
+    """The base of our wrappers. For diffrax a wrapper is an instance of the classes of the solver
+    inside, such as of an implicit solver. It then reads the attributes of such a solver from the
+    wrapper, which therefore must have them all."""
 
     term_structure = _of_innermost("term_structure")
     term_compatible_contr_kwargs = _of_innermost("term_compatible_contr_kwargs")

@@ -12,9 +12,12 @@ from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike,
 from .._options import check_counts
 from .._projection.options import option
 
-# The largest change of the midpoint, in units of roundoff, after which the iteration stops. It
-# converges fast, so what is left is much smaller: less than the rounding of the state.
+# The iteration stops after a change of at most this many units of roundoff. It converges fast, so
+# what is left is much smaller than the change, and less than the rounding of the state.
 _ACCEPTED = 4
+# The chord iteration may take this many iterations, by default. Each gains a constant factor, so
+# for steps that are not too long 16 digits need fewer.
+_MAX_STEPS = 30
 
 
 @final
@@ -50,7 +53,7 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
     """
 
     root_finder: optx.AbstractRootFinder | None = option(None)
-    root_find_max_steps: int = option(30, static=True)
+    root_find_max_steps: int = option(_MAX_STEPS, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
@@ -93,8 +96,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         del solver_state, made_jump
         middle, control = t0 + (t1 - t0) / 2, terms.contr(t0, t1)
         k0 = terms.vf_prod(t0, y0, args, control)
-        # The unknown is the increment in units of what is rounded in the step: then tolerances mean
-        # the same whatever the units of the state are.
+        # The unknown is the increment `h f`, in units of what is rounded when it is added to the
+        # state. So tolerances mean the same whatever the units of the state are.
         units = jtu.tree_map(_size, y0, k0)
 
         def increment(x: Y) -> Y:
@@ -138,6 +141,8 @@ ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 
 
 def _size(y: Any, k: Any) -> Any:
+    """The size of each component, `|y| + |k|`. One that is zero counts as large as the largest, and
+    if all are zero, as one."""
     size = jnp.abs(y) + jnp.abs(k)
     size = jnp.where(size > 0, size, jnp.max(size, initial=0))
     return jnp.where(size > 0, size, jnp.ones_like(size))

@@ -1,4 +1,13 @@
-"""RATTLE: velocity Verlet for positions and velocities with constraints."""
+"""RATTLE: velocity Verlet for positions and velocities with constraints.
+
+A step kicks the velocities by half of the forces, moves the positions such that the constraints
+hold at the end (SHAKE), kicks the velocities again, and projects them to those that keep the
+constraints.
+
+The velocities at the end of a step belong to a linear system with the matrix `G M⁻¹ Gᵀ` there. The
+multipliers of the positions in the next step are found by an iteration for which the same matrix is
+good enough, because that is where the step starts. So the matrix is factored once in a step.
+"""
 
 import functools as ft
 from collections.abc import Callable
@@ -28,7 +37,7 @@ from .._projection.elimination import (
 )
 from .._projection.equations import ON, Equations, Jacobian, any_lane, length, shown_terms
 from .._projection.metric import spread
-from .._projection.options import check_state, option
+from .._projection.options import MAX_STEPS, check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.sparse import BlockGram, SparseRows
 from .._solver.diffrax_private import member
@@ -37,16 +46,21 @@ from .._solver.terms import is_backsolve, is_ode, time_direction
 from .._tree import ravel, tree_shapes, tree_stop_gradient, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf, root
 
-# Up to this many numbers of the positions sums over them are written out.
+# For up to this many coordinates, sums over them are written out, so that XLA fuses them. Compile
+# time grows with their number; the number is a choice.
 _WRITTEN_OUT_COLUMNS = 32
-# Solves of the linear system for the velocities: the first, and one that removes its roundoff.
+# The linear system for the velocities is solved this many times: once, and once more for what is
+# left, which is the roundoff of the first solution.
 _SOLVES = 2
 
 
 class _Linear(eqx.Module):
-    """The constraints at one position: the Jacobian `G`, and the inverse of `G M⁻¹ Gᵀ`, by which
-    both the velocities there and the positions of the next step are found; of many constraints the
-    blocks of that matrix."""
+    """The constraints at one position.
+
+    - `jacobian`: `G`.
+    - `inverse`: the inverse of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By
+      it both the velocities at this position and the positions of the next step are found.
+    """
 
     jacobian: Jacobian
     inverse: Float[Array, "m m"] | BlockGram
@@ -60,6 +74,15 @@ class _Linear(eqx.Module):
 
 
 class _State(eqx.Module):
+    """What the next step needs.
+
+    - `at`: the constraints at its start.
+    - `slope`: the force divided by the masses, at its start.
+    - `multiplier`: that of the last step, the first guess for the next.
+    - `hidden`: the part of the scales that the gradients do not show.
+    - `off`: whether the start of the solve was off the constraint, so that every step fails.
+    """
+
     at: _Linear
     slope: PyTree[Array]
     multiplier: Float[Array, " m"]
@@ -120,7 +143,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
 
     constraint: Manifold
     masses: PyTree[ArrayLike]
-    max_steps: int = option(50, static=True)
+    max_steps: int = option(MAX_STEPS, static=True)
 
     term_structure: ClassVar = (dfx.AbstractTerm, dfx.AbstractTerm)
     interpolation_cls: ClassVar = ShorterStep
@@ -204,7 +227,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
         equations = self._equations(t0, q, args, hidden, direction)
         drift = self._drift(terms, t0, v, args)
         at, rate = self._linear(equations, t0, q, args, direction, drift, ravel(v))
-        # By the Cauchy-Schwarz inequality no rate is larger than the product of these lengths.
+        # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
+        # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
+        # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
         squares = jax.tree.map(jnp.square, equations.scaled(at.jacobian))
         lengths = jnp.sqrt(_times(squares, jnp.ones_like(ravel(v))))
         limit = lengths * length(drift(ravel(v)), equations.units) + jnp.abs(rate)
@@ -239,7 +264,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
         equations = self._equations(t1, q0, args, state.hidden, direction)
         kicked = _once(v + h / 2 * ravel(slope))
 
-        # The unknown is the displacement that a multiplier causes, `h² λ / 2`.
+        # The unknown is `h² λ / 2`, which a multiplier `λ` contributes to the positions. Unlike `λ`
+        # itself it is well determined when the step is short.
         def halfway(displacement: Array) -> Array:
             force = _combined(displacement, at.jacobian)
             return kicked + per_step * equations.scaled(equations.scaled(force))
@@ -279,12 +305,14 @@ class RATTLE(dfx.AbstractSolver[Any]):
         return target.equations(t, q)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
-        """`q'` of velocities, both as vectors."""
+        """The function from velocities `v`, or momenta, to `q'`, both as vectors."""
         return lambda p: ravel(terms[0].vf(t, unravel(p, v), args))
 
     def _gram(self, equations: Equations, jacobian: Jacobian, drift: Any, p: Array) -> Any:
-        """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear; with many
-        constraints it is taken as diagonal, which matters for the speed of the iteration alone."""
+        """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear: so its derivative is
+        applied to each row. With many constraints the derivative is taken as diagonal. If it is
+        not, the matrix is only approximate, and the iterations converge more slowly, to the same
+        result."""
         forces = equations.scaled(equations.scaled(jacobian))
         if isinstance(jacobian, SparseRows):
             speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
@@ -302,7 +330,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         drift: Any,
         p: Array,
     ) -> tuple[_Linear, Float[Array, " m"]]:
-        """The constraints at a position, and their partial derivative in time."""
+        """The constraints at a position, and their partial derivative `∂_t g`."""
         jacobian = _once(equations.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
         t = t * direction
@@ -330,7 +358,8 @@ broadcast, the state is no pair of positions and velocities that are alike, or a
 
 
 def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse; of constraints that depend on each other one that keeps multipliers small."""
+    """The inverse of a Gram matrix. If constraints depend on each other, it does not exist, and
+    what is returned solves consistent systems with small multipliers."""
     sizes = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1))
     unit = gram / sizes[:, None] / sizes
     if len(gram) > WRITTEN_OUT_MAX:
@@ -340,7 +369,7 @@ def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
     return jnp.sum(right[:, :, None] * left[:, None, :], axis=0) / sizes[:, None] / sizes
 
 
-# Otherwise XLA evaluates it for each use.
+# Without a barrier XLA would evaluate an expression once for each use of it.
 _once = lax.optimization_barrier
 
 
@@ -353,12 +382,14 @@ def _combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
 
 
 def _times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`rows x`."""
     if len(rows) > WRITTEN_OUT_MAX:
         return times(rows, x)
     return jnp.sum(rows * x, axis=1)
 
 
 def _gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
+    """`rows othersᵀ`, written out if it is small."""
     if len(rows) > WRITTEN_OUT_MAX or rows.shape[1] > _WRITTEN_OUT_COLUMNS:
         return gram_matrix(rows, others)
     return sum(a[:, None] * b[None] for a, b in zip(rows.T, others.T, strict=True))  # pyright: ignore
@@ -368,7 +399,10 @@ def _iterated(
     equations: Equations, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
 ) -> tuple[Float[Array, " m"], Array]:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
-    step: an iteration evaluates the constraint and nothing else."""
+    step: an iteration evaluates the constraint and nothing else. Returns the multipliers and what
+    `counter` has left, from a `guess`."""
+    # The residuals are compared with their scales at the start of the step, for coordinates as
+    # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
     scale, solve = equations.scale(at.jacobian, sizes), at.factored()
 
@@ -376,9 +410,10 @@ def _iterated(
         x, left = carry
         g = _once(equations.residual(_once(position(x))))
         level, _ = equations.level(g, scale)
-        # Iterations end with one more, which is cheap and leaves only roundoff. But there is none
-        # where the guess is a solution, as in a shorter step of hardly any length, in which the
-        # roundoff of the positions would be a large velocity.
+        # The iteration ends with one more than needed, which is cheap and leaves only roundoff: so
+        # after the first test a state does not count as settled. At the first test it may. Then the
+        # guess is a solution, and in a step of hardly any length, such as to a saved time just
+        # after the start, a correction of roundoff of the positions would be a large velocity.
         level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
         left = after_test(level, left, extra=1, gives_up=left > 0)
         return jnp.where(left > 0, x - solve(g), x), left
@@ -390,7 +425,8 @@ def _iterated(
 def _on_tangent(
     equations: Equations, at: _Linear, rate: Array, drift: Any, p: Array
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-    """Velocities that keep the constraint, and whether they do so to roundoff."""
+    """The velocities nearest to `p` that keep the constraint, `∂_t g + G v = 0`, and whether they
+    do so to roundoff."""
     solve = at.factored()
 
     def moved(x: Array) -> Array:
@@ -405,7 +441,8 @@ def _on_tangent(
         return x, None
 
     x, _ = root(residual, jnp.zeros_like(rate), iterate, gram_solve)
-    # Multipliers of neighbours, as in a taut chain, are large and cancel: the terms are rounded.
+    # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
+    # velocities is that of the terms, and not of their sum.
     terms = equations.scaled(
         equations.scaled(_combined(jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian)))
     )

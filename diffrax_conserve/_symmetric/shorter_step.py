@@ -43,7 +43,7 @@ class ShorterStep(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        # Strict inequalities keep the derivative in time at the ends of the step.
+        # A time exactly at an end is inside, so that there is a derivative in time.
         t = jnp.where(t0 < self.t0, self.t0, jnp.where(t0 > self.t1, self.t1, t0))
         of: Any = self.step.unpack()
         return of.solver.step(of.terms, self.t0, t, self.y0, of.args, of.state, False)[0]
@@ -55,15 +55,17 @@ def root(
     iterate: Callable[[Any], tuple[Any, Any]],
     solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]],
 ) -> tuple[Any, Any]:
-    """The root that `iterate(guess)` finds, and what else it returns. The derivative is that of the
-    implicit function theorem, by the dense Jacobian and `solve(matrix, vector)`."""
+    """The root of `residual` that `iterate(guess)` finds, and what else that returns. The
+    derivative of the root follows from the implicit function theorem, by the dense Jacobian and
+    `solve(matrix, vector)`. The rest has none."""
 
     def tangent(linear: Callable[[Any], Any], right: Any) -> Any:
         flat, like = _flat(right), jax.eval_shape(lambda: right)
         matrix = jax.jacfwd(lambda x: _flat(linear(unflatten(x, like))))(jnp.zeros_like(flat))
         return unflatten(solve(matrix, flat), like)
 
-    # JAX gives what else is returned a tangent of its own type, which integers cannot have.
+    # `custom_root` gives the rest a tangent of its own type, which integers and booleans cannot
+    # have. So they pass as numbers of the type of the root.
     _, like = jax.eval_shape(iterate, guess)
     dtype = jax.tree.leaves(guess)[0].dtype
 
@@ -76,4 +78,5 @@ def root(
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:
+    """The elements of a tree of vectors as one vector."""
     return jnp.concatenate(jax.tree.leaves(tree))

@@ -20,7 +20,7 @@ from .._projection.chord import after_test, counter
 from .._projection.elimination import combined, gram_matrix, gram_solve, scaled_rows, times
 from .._projection.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, any_lane, length
 from .._projection.implicit import certain
-from .._projection.options import check_state
+from .._projection.options import MAX_STEPS, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.rk4 import RK4
@@ -31,12 +31,21 @@ from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf, root
 
-# The defect of the equation for the state, in units of roundoff of the state, from which one more
-# iteration is enough, and at which it is only the rounding of the state.
-_NEARLY_SOLVED, _SOLVED = 64, 2
+# The equation for the end of the step counts as nearly solved if its defect is at most this many
+# units of roundoff of the state. From there one more iteration is enough, because each reduces the
+# defect by much more than this factor.
+_NEARLY_SOLVED = 64
+# At this many units of roundoff the defect is only the rounding of the state and of the sum.
+_SOLVED = 2
+# Where a coefficient of a tableau should be zero, the sum of two others may be this, because they
+# are given with 16 digits. Elsewhere the relative tolerance of numpy applies.
+_ZERO_COEFFICIENT = 1e-14
 
 
 class _State(eqx.Module):
+    """What the next step needs: the state of the wrapped solver, the conserved values, the part of
+    the scales that the gradients do not show, the last multiplier as a guess, and statistics."""
+
     inner: Any
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
@@ -45,8 +54,17 @@ class _State(eqx.Module):
 
 
 class _Iterate(NamedTuple):
-    """The unknowns, the state and the multiplier; the inner step with that multiplier; and how far
-    the equations are from being solved."""
+    """One iterate of the two equations of a step.
+
+    - `y`, `multiplier`: the unknowns, the state `y_{n+1}` and `μ`.
+    - `candidate`: the end of the inner step with this multiplier, `ỹ_{n+1}`.
+    - `wrong`: what the next change of the multiplier must correct, the residual of the constraints
+      and what the defect of the equation for the state will change in it.
+    - `noise`: that of the residuals.
+    - `rows`: the gradients at `y`, in the units.
+    - `left`, `num_steps`: the tests that are left, see `chord.counter`, and the inner steps made.
+    - `result`: that of the inner step.
+    """
 
     y: Float[Array, " n"]
     multiplier: Float[Array, " m"]
@@ -117,7 +135,7 @@ class SymmetricProjection(ForwardingSolver):
         metric: PyTree[ArrayLike] = 1.0,
         rtol: float | Array | None = None,
         atol: float | Array | None = None,
-        max_steps: int = 50,
+        max_steps: int = MAX_STEPS,
     ):
         self.solver = solver  # pyright: ignore[reportIncompatibleVariableOverride]
         self.manifold = manifold
@@ -173,7 +191,8 @@ class SymmetricProjection(ForwardingSolver):
         start, end = (target.equations(t, y0).dense() for t in (t0, t1))
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
-            # A symmetric method has no memory: what it keeps for the next step is not used.
+            # A symmetric method has no memory, so we discard the state of the wrapped solver. The
+            # last argument tells it not to use what it kept.
             given = terms, t0, t1, unravel(y, y0), args, state.inner, True
             y1, _, _, _, result = self.solver.step(*given)
             return ravel(y1), result
@@ -192,7 +211,7 @@ class SymmetricProjection(ForwardingSolver):
         )
         y1 = _differentiable(y1, certain(end, found.candidate, y1, end.linearise(y1)[1]))
         problem = target.problem(t1, y0)
-        info = problem.judge(found.candidate, y1, found.num_steps, ok=found.left != -1)
+        info = problem.report(found.candidate, y1, found.num_steps, ok=found.left != -1)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
         failed = cause_of_failure(info.ok, off, (vector, found.candidate, y1), None, None)
         inner_failed = found.result != dfx.RESULTS.successful
@@ -236,15 +255,20 @@ def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Fl
 def _iterated(
     start: Equations, end: Equations, inner: Any, y0: Array, multiplier: Array, max_steps: int
 ) -> _Iterate:
-    """Simplified Newton's method for `μ`, with the matrix `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`.
+    """Simplified Newton's method for `μ`, with the matrix `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`, where `G₀` and
+    `G₁` are the gradients at both ends of the step.
 
-    The exact one has the derivative of `g` along the inner step, `G₁ Φ' M⁻¹ G₀ᵀ`, for the second
-    term. The exact flow keeps integrals off the manifold too, so both agree up to the error of the
-    step, and no step is differentiated."""
+    The exact matrix has `G₁ Φ' M⁻¹ G₀ᵀ` for the second term, with the derivative `Φ'` of the inner
+    step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
+    So both agree up to the error of the step, and no step needs to be differentiated.
+    """
     sizes, first = scaled_rows(start.scaled(start.linearise(y0)[1]))
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 
     def tested(multiplier: Array, near: Array | None, left: Array, count: Array) -> _Iterate:
+        """The iterate with this multiplier. The gradients at its end are needed to compute the end
+        itself, so they are first taken from `near`, those of the last iterate, or at the candidate.
+        By those at the end we measure the defect that this leaves."""
         candidate, result = inner(y0 + start.moved(combined(multiplier * sizes, first)))
         rows = end.scaled(end.linearise(candidate)[1]) if near is None else near
         y = candidate + end.moved(combined(multiplier, rows))
@@ -270,7 +294,7 @@ def _iterated(
         gram = gram0 + gram_matrix(rows, rows)
         change = gram_solve(gram, last.wrong / sizes, last.noise / sizes) / sizes
         found = tested(last.multiplier - change, last.rows, last.left, last.num_steps + 1)
-        # A lane that is done waits for the others.
+        # In a batch a lane that is done stays as it is while others go on.
         return jtu.tree_map(lambda a, b: jnp.where(last.left > 0, a, b), found, last)
 
     first_iterate = tested(multiplier, None, counter(max_steps), jnp.asarray(1))
@@ -278,7 +302,9 @@ def _iterated(
 
 
 def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) -> Array:
-    """Solves for the tangents of the state, of the given size, and of the multiplier."""
+    """Solves the linear system for the tangents of the state, of the given size, and of the
+    multiplier, by eliminating the state. Only the rest, the Schur complement, may be singular, if
+    constraints depend on each other."""
     (a, b), (c, d) = (jnp.split(rows, [size], axis=1) for rows in jnp.split(matrix, [size]))
     above, below = jnp.split(right, [size])
     along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
@@ -288,7 +314,8 @@ def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) 
 
 @jax.custom_jvp
 def _differentiable(y: Float[Array, " n"], factor: Float[Array, ""]) -> Float[Array, " n"]:
-    """`y`, whose tangent is multiplied by one, or NaN where it is not determined."""
+    """`y`, whose tangent is multiplied by a factor: one, or NaN if the tangent is not
+    determined."""
     del factor
     return y
 
@@ -320,11 +347,12 @@ def _check_symmetric(solver: Any) -> None:
 
 
 def _is_symmetric(tableau: dfx.ButcherTableau) -> bool:
-    """`a[s+1-i, s+1-j] + a[i, j] = b[j]` (Hairer, Lubich and Wanner, V.2)."""
+    """Whether a Runge-Kutta method is symmetric, `a[s+1-i, s+1-j] + a[i, j] = b[j]` (Hairer, Lubich
+    and Wanner, V.2)."""
     b = np.asarray(tableau.b_sol)
     a = np.zeros((b.size, b.size))
     for i, row in enumerate(tableau.a_lower):
         a[i + 1, : i + 1] = row
     if tableau.a_diagonal is not None:
         a += np.diag(tableau.a_diagonal)
-    return bool(np.allclose(a + a[::-1, ::-1], b, atol=1e-14))
+    return bool(np.allclose(a + a[::-1, ::-1], b, atol=_ZERO_COEFFICIENT))

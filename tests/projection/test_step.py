@@ -91,7 +91,7 @@ class Seen(dfc.AbstractProjection):
         start = (problem.t != step.t0) | (jnp.max(jnp.abs(step.y0 - candidate)) < 1e-14)
         right = inside & start & (step.t1 != step.t0)
         y = jnp.where(right, candidate, jnp.nan)
-        return y, problem.judge(candidate, y)
+        return y, problem.report(candidate, y)
 
 
 def test_a_projection_sees_the_step_of_every_candidate():
@@ -111,7 +111,7 @@ class Unseeing(Seen):
 
     def solve(self, problem, candidate):
         assert problem.step is None
-        return candidate, problem.judge(candidate, candidate)
+        return candidate, problem.report(candidate, candidate)
 
 
 def test_what_asks_for_no_step_gets_none_and_saves_none():

@@ -1,4 +1,4 @@
-"""Attack: candidates from anywhere; success is judged at the returned state, in long double.
+"""Attack: candidates from anywhere; success is decided at the returned state, in long double.
 
 The candidate is 1e-16 to 1e5 of its size away from a state of the manifold, one lane in five at an
 ordinary 1e-3; one value in ten is a random one, which may not be reachable. A `ClosedForm` returns

@@ -111,7 +111,7 @@ def test_it_prints_what_it_returns_also_projected(capsys):
 
 
 @pytest.mark.parametrize("bend", [1.0, -1.0])
-def test_derivatives_by_args_are_judged(bend, monkeypatch, capsys):
+def test_derivatives_by_args_are_compared(bend, monkeypatch, capsys):
     monkeypatch.setattr(CLOCK, lambda *args: 1.0)
     family = Rotation(0.0, bend, args_domain=dfc.learned.Box(0.5, 1.5))
     found = dfc.learned.compare(family, spring, STATES[:5], args=1.0)

@@ -111,7 +111,7 @@ def refused_from_start(
     return jnp.where(h * time_direction(terms, h) >= 0, refused, _BACKWARDS)
 
 
-def judged(
+def with_result(
     step: StepResult, refused: Refused, h: Array, t1: RealScalarLike, max_step: Any
 ) -> StepResult:
     """`step` with its result. An adaptive controller tries again with a smaller step if this one

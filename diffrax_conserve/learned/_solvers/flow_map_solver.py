@@ -16,7 +16,7 @@ from ..._projection.options import option
 from .._networks.flat import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
-from .checks import Refused, check_learned_terms, check_output, judged, refused_from_start
+from .checks import Refused, check_learned_terms, check_output, refused_from_start, with_result
 from .policies import Policy, StepResult, StepsOutside, as_policy, check_policy, outcome, step_of
 from .sweeps import Increment, correct, estimate, increment
 
@@ -141,7 +141,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
             counted = counted.add(t0, inside & accurate)
             by = lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args)  # noqa: E731
             step = outcome(self.outside, step, inside, accurate, by)
-        step = judged(step, refused, h, t1, flow_map.max_step)
+        step = with_result(step, refused, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, _State(refused, counted), step.result
 

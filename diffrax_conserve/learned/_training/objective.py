@@ -239,7 +239,7 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     # linear. Through the projection, which forgets a displacement along the gradients, the problem
     # would be singular: with all weights damped alike a pendulum took 1,240 epochs in place of 120,
     # for a hundred times the error. An accurate candidate is near the manifold, and its projection
-    # as accurate; the best model is chosen, and judged, with the layer.
+    # as accurate; the best model is chosen, and measured, with the layer.
     of_candidate = isinstance(optimiser, LevenbergMarquardt)
 
     def at_one(vector: Array, point: Points) -> Array:

@@ -1,4 +1,4 @@
-"""The windows of a PINN: each starts at the end of the previous one, and is judged by its error.
+"""The windows of a PINN: each starts at the end of the previous one, and has an error of its own.
 
 A window whose error is too large is cut in halves, which are trained from new weights. So the
 windows become short where the solution changes fast, as the steps of an adaptive solver do.
@@ -56,9 +56,9 @@ def train_windows(
                 lambda carry, of=objective, limit=limit: windows.own_error(of.best(carry)) <= limit,
                 windows.own_error,
             )
-            shown = windows.judged(state, objective.best(carry))
+            shown = windows.improved(state, objective.best(carry))
             if ended in ("seconds", "interrupt", "progress"):
-                # A continued training judges the window at its end.
+                # A continued training decides about the window at its end.
                 break
             state, ended = windows.next(shown), "epochs"
             shown = state
@@ -121,7 +121,7 @@ class _Windows:
         size = np.max([np.asarray(path.size[0]) for path in paths], axis=0)
         return [relative(path.largest[0], size, self.pinn.y0) for path in paths]
 
-    def judged(self, state: FitState, window: Window) -> FitState:
+    def improved(self, state: FitState, window: Window) -> FitState:
         """The state with `window` in the place of the present one, if that is better."""
         k, error = state.present, self.own_error(window)
         if state.errors[k] <= error:
