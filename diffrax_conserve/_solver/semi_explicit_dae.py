@@ -17,6 +17,7 @@ from .._custom_types import Args, RealScalarLike, State, Values, Y
 from .._manifold import Constraint, exactly, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
+from .._projection.equations import ROUNDOFF_MULTIPLE
 from .._projection.options import check_state
 from .._tree import ravel, tree_shapes, tree_tangents, unravel
 from .manifold_projection import ManifoldProjection
@@ -198,7 +199,8 @@ class _Root(AbstractProjection):
         x, z = _pair(problem.state(candidate))
         root = _solved(self.g, problem.t, x, z, problem.args)
         y = jnp.concatenate([ravel(x), root])
-        return y, problem.judge(candidate, y)
+        # Newton's method knows the roundoff of `g` at this state, and is NaN if it misses the root.
+        return y, problem.judge(candidate, y, ok=jnp.all(jnp.isfinite(y)))
 
 
 def _pair(y: Any) -> tuple[Any, Any]:
@@ -305,6 +307,8 @@ class _Factored(NamedTuple):
 
 class _Iterate(NamedTuple):
     z: Float[Array, " m"]
+    g: Float[Array, " m"]
+    tried: Float[Array, " m"]  # the last `g` that was computed, perhaps of what was not accepted
     share: Float[Array, ""]  # of the correction to try next
     tries: Int[Array, ""]
     found: Bool[Array, ""]
@@ -319,23 +323,36 @@ def _algebraic_newton(
     eps = float(jnp.finfo(z.dtype).eps)
 
     def body(now: _Iterate) -> _Iterate:
-        factored = _Factored.of(jax.jacfwd(residual)(now.z))
-        step = factored.correction(residual(now.z))
+        jacobian = jax.jacfwd(residual)(now.z)
+        factored = _Factored.of(jacobian)
+        step = factored.correction(now.g)
         trial = now.z + now.share * step
-        after = factored.correction(residual(trial))
+        g = residual(trial)
+        after = factored.correction(g)
         size = jnp.maximum(jnp.abs(now.z), jnp.abs(trial))
-        size = size + eps**0.5 * jnp.max(size, initial=0)
+        # An unknown near zero is compared with the change that the largest term of one of its
+        # equations stands for, whatever the units of the others are.
+        slopes = jnp.abs(jacobian)
+        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
+        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+        size = size + eps**0.5 * jnp.min(least, axis=0, initial=jnp.inf)
         size = jnp.where(size > 0, size, 1)
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         better = then <= (1 - now.share / 2) * before
         # The next corrections shrink at least by the same ratio, to what is left after both.
         settled = better & (now.share == 1) & (then * then <= eps * before)
-        found = settled | (~better & (before <= eps**0.5))  # or no better because of roundoff
+        # Or no better because of roundoff: that of the terms, or of others inside `g`, which is the
+        # same for a correction and for a shorter one.
+        terms = jnp.sum(slopes * jnp.abs(now.z), axis=1)
+        rounded = (jnp.abs(now.g) <= ROUNDOFF_MULTIPLE * eps * terms) | (g == now.tried)
+        found = settled | (~better & ((before <= eps**0.5) | jnp.all(rounded)))
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
         going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
-        return _Iterate(z, share, now.tries + 1, found & factored.regular(), going)
+        kept = jnp.where(better, g, now.g)
+        return _Iterate(z, kept, g, share, now.tries + 1, found & factored.regular(), going)
 
     start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
-    end = lax.while_loop(lambda now: now.going, body, _Iterate(z, *start))
+    first = _Iterate(z, residual(z), jnp.full_like(z, jnp.nan), *start)
+    end = lax.while_loop(lambda now: now.going, body, first)
     return jnp.where(end.found, end.z, jnp.nan)

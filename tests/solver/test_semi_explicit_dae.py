@@ -257,6 +257,29 @@ def test_newton_finds_the_voltage_at_a_diode():
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
+@pytest.mark.parametrize("c", [0.1, 3.0, 100.0])
+def test_an_unknown_that_ends_at_zero(c):
+    """There the roundoff of the constants inside `g` is larger than all terms that its gradient
+    shows. `x = exp(-t)`."""
+    dae = dfc.SemiExplicitDAE(lambda t, x, z, c: -x, lambda t, x, z, c: jnp.exp(z) * c - c - x)
+    steps, saveat = dict(controller=dfx.ConstantStepSize(), dt0=0.1), dfx.SaveAt(t1=True)
+    one = jnp.ones(())
+    found = solve(dae, dfx.Tsit5(), one, one, jnp.array(c), t1=40.0, saveat=saveat, **steps)
+    assert found.result == dfx.RESULTS.successful
+    assert abs(found.ys[1][0]) <= 4 * EPS
+    again = dae.consistent(jnp.zeros(()), jnp.zeros(()), args=jnp.array(c))
+    assert abs(again[1]) <= 4 * EPS
+
+
+def test_an_ill_conditioned_matrix():
+    matrix = 1 / (jnp.arange(8)[:, None] + jnp.arange(8) + 1.0)
+    dae = dfc.SemiExplicitDAE(lambda t, x, z, a: -x, lambda t, x, z, a: a @ z - x)
+    x = matrix @ jnp.ones(8)
+    steps = dict(controller=dfx.ConstantStepSize(), dt0=1e-2, saveat=dfx.SaveAt(t1=True))
+    found = solve(dae, dfx.Tsit5(), x, jnp.zeros(8), matrix, **steps)
+    assert largest(matrix @ found.ys[1][0] - np.exp(-1) * x) < 1e-8
+
+
 def test_units_change_nothing():
     """Equations and unknowns in other units: `A z + z³ = b`, with `A` not diagonally dominant."""
     key = jax.random.key(1)
