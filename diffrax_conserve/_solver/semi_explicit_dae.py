@@ -308,7 +308,7 @@ class _Factored(NamedTuple):
 class _Iterate(NamedTuple):
     z: Float[Array, " m"]
     g: Float[Array, " m"]
-    tried: Float[Array, " m"]  # the last `g` that was computed, perhaps of what was not accepted
+    tried: Float[Array, " m"]  # `g` of a correction that was not accepted
     share: Float[Array, ""]  # of the correction to try next
     tries: Int[Array, ""]
     found: Bool[Array, ""]
@@ -342,15 +342,17 @@ def _algebraic_newton(
         # The next corrections shrink at least by the same ratio, to what is left after both.
         settled = better & (now.share == 1) & (then * then <= eps * before)
         # Or no better because of roundoff: that of the terms, or of others inside `g`, which is the
-        # same for a correction and for a shorter one.
+        # same for a correction and for a shorter one. A much shorter one proves nothing.
         terms = jnp.sum(slopes * jnp.abs(now.z), axis=1)
-        rounded = (jnp.abs(now.g) <= ROUNDOFF_MULTIPLE * eps * terms) | (g == now.tried)
+        same = (g == now.tried) & (now.share >= _SHORTER**3)
+        rounded = same | (jnp.abs(now.g) <= ROUNDOFF_MULTIPLE * eps * terms)
         found = settled | (~better & ((before <= eps**0.5) | jnp.all(rounded)))
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
         going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
         kept = jnp.where(better, g, now.g)
-        return _Iterate(z, kept, g, share, now.tries + 1, found & factored.regular(), going)
+        tried = jnp.where(better, jnp.nan, g)
+        return _Iterate(z, kept, tried, share, now.tries + 1, found & factored.regular(), going)
 
     start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
     first = _Iterate(z, residual(z), jnp.full_like(z, jnp.nan), *start)
