@@ -257,18 +257,12 @@ def test_newton_finds_the_voltage_at_a_diode():
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
-@pytest.mark.parametrize("c", [0.1, 3.0, 100.0])
-def test_an_unknown_that_ends_at_zero(c):
+def test_an_unknown_that_is_zero():
     """There the roundoff of the constants inside `g` is larger than all terms that its gradient
-    shows. `x = exp(-t)`."""
-    dae = dfc.SemiExplicitDAE(lambda t, x, z, c: -x, lambda t, x, z, c: jnp.exp(z) * c - c - x)
-    steps, saveat = dict(controller=dfx.ConstantStepSize(), dt0=0.1), dfx.SaveAt(t1=True)
-    one = jnp.ones(())
-    found = solve(dae, dfx.Tsit5(), one, one, jnp.array(c), t1=40.0, saveat=saveat, **steps)
-    assert found.result == dfx.RESULTS.successful
-    assert abs(found.ys[1][0]) <= 4 * EPS
-    again = dae.consistent(jnp.zeros(()), jnp.zeros(()), args=jnp.array(c))
-    assert abs(again[1]) <= 4 * EPS
+    shows."""
+    dae = dfc.SemiExplicitDAE(lambda *_: 0.0, lambda t, x, z, a: a * (z + 0.1) - x)
+    for a in jnp.array([3.0, 0.3, 49.0]):
+        assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
 
 
 def test_an_ill_conditioned_matrix():
