@@ -213,8 +213,11 @@ def pattern_of(
     keys = tuple((str(x.jaxpr), *map(_content, _constants(x))) for x in traced)
     if keys not in _KNOWN:
         with jax.ensure_compile_time_eval():
-            found = [(size, _entries(x, y)) for size, x in zip(sizes, traced, strict=True)]
-            _KNOWN[keys] = _sparse((m, n), found)
+            try:
+                found = [(size, _entries(x, y)) for size, x in zip(sizes, traced, strict=True)]
+                _KNOWN[keys] = _sparse((m, n), found)
+            except NotImplementedError:  # an operation that asdex does not know
+                _KNOWN[keys] = None
     pattern = _KNOWN[keys]
     if pattern is None and m * n * y.dtype.itemsize > _LARGE:
         warnings.warn(

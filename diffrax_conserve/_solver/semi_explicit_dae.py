@@ -17,7 +17,9 @@ from .._custom_types import Args, RealScalarLike, State, Values, Y
 from .._manifold import Constraint, exactly, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
+from .._projection.equations import ROUNDOFF_MULTIPLE, any_lane, shown_terms
 from .._projection.options import check_state
+from .._projection.roundoff import hidden_terms
 from .._tree import ravel, tree_shapes, tree_tangents, unravel
 from .manifold_projection import ManifoldProjection
 
@@ -203,7 +205,8 @@ class _Root(AbstractProjection):
         x, z = _pair(problem.state(candidate))
         root = _solved(self.g, problem.t, x, z, problem.args)
         y = jnp.concatenate([ravel(x), root])
-        return y, problem.report(candidate, y)
+        # Newton's method knows the roundoff of `g` at this state, and is NaN if it misses the root.
+        return y, problem.report(candidate, y, ok=jnp.all(jnp.isfinite(y)))
 
 
 def _pair(y: Any) -> tuple[Any, Any]:
@@ -314,7 +317,7 @@ class _Iterate(NamedTuple):
     z: Float[Array, " m"]
     share: Float[Array, ""]  # of the correction to try next
     tries: Int[Array, ""]
-    found: Bool[Array, ""]
+    settled: Bool[Array, ""]
     going: Bool[Array, ""]
 
 
@@ -331,12 +334,18 @@ def _algebraic_newton(
     eps = float(jnp.finfo(z.dtype).eps)
 
     def body(now: _Iterate) -> _Iterate:
-        factored = _Factored.of(jax.jacfwd(residual)(now.z))
+        jacobian = jax.jacfwd(residual)(now.z)
+        factored = _Factored.of(jacobian)
         step = factored.correction(residual(now.z))
         trial = now.z + now.share * step
         after = factored.correction(residual(trial))
         size = jnp.maximum(jnp.abs(now.z), jnp.abs(trial))
-        size = size + eps**0.5 * jnp.max(size, initial=0)
+        # An unknown near zero is compared with the change that the largest term of one of its
+        # equations stands for, whatever the units of the others are.
+        slopes = jnp.abs(jacobian)
+        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
+        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+        size = size + eps**0.5 * jnp.min(least, axis=0, initial=jnp.inf)
         size = jnp.where(size > 0, size, 1)
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
@@ -344,14 +353,23 @@ def _algebraic_newton(
         better = then <= (1 - now.share / 2) * before
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
-        settled = better & (now.share == 1) & (then * then <= eps * before)
+        settled = better & (now.share == 1) & (then * then <= eps * before) & factored.regular()
         # If the correction is at most `√ε` and does not help, roundoff keeps it from helping.
-        found = settled | (~better & (before <= eps**0.5))
+        stuck = ~better & (before <= eps**0.5)
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
-        going = ~found & (before < jnp.inf) & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
-        return _Iterate(z, share, now.tries + 1, found & factored.regular(), going)
+        going = ~settled & ~stuck & (before < jnp.inf)
+        going = going & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
+        return _Iterate(z, share, now.tries + 1, settled, going)
 
     start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
     end = lax.while_loop(lambda now: now.going, body, _Iterate(z, *start))
-    return jnp.where(end.found, end.z, jnp.nan)
+
+    def at_roundoff() -> Bool[Array, ""]:
+        """Whether the state where the iteration ended is a root as far as rounding lets us see."""
+        g, jacobian, hidden = hidden_terms(residual, end.z)
+        limit = ROUNDOFF_MULTIPLE * eps * (shown_terms(jacobian, end.z) + hidden)
+        return jnp.all(jnp.abs(g) <= limit) & _Factored.of(jacobian).regular()
+
+    found = lax.cond(any_lane(~end.settled), at_roundoff, lambda: jnp.asarray(True))
+    return jnp.where(end.settled | found, end.z, jnp.nan)

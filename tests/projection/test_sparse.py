@@ -161,6 +161,14 @@ def test_what_is_not_sparse_is_told(monkeypatch: pytest.MonkeyPatch):
         dfc.project(MANIFOLDS["spins"][0], jnp.ones((NUM, 3)))
 
 
+def test_an_operation_of_which_no_pattern_is_known_has_a_dense_jacobian():
+    inverses = dfc.Constraint(lambda t, y, args: jnp.trace(jnp.linalg.inv(y), axis1=1, axis2=2) - 2)
+    y = jnp.eye(2) + 0.1 * jr.normal(jr.key(0), (NUM, 2, 2))
+    projected, info = dfc.project(inverses, y, projection=dfc.SimplifiedNewton())
+    assert info.ok
+    assert jnp.max(jnp.abs(inverses.fn(0.0, projected, None))) < 1e-14
+
+
 def test_a_solve_keeps_spins_and_their_energy():
     spins = MANIFOLDS["spins"][0]
     energy = dfc.FirstIntegral(lambda t, y, args: -jnp.sum(y[1:] * y[:-1]) - jnp.sum(y[:, 2] ** 2))

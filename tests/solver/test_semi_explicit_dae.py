@@ -257,6 +257,23 @@ def test_newton_finds_the_voltage_at_a_diode():
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
+def test_an_unknown_that_is_zero():
+    """There the roundoff of the constants inside `g` is larger than all terms that its gradient
+    shows."""
+    dae = dfc.SemiExplicitDAE(lambda *_: 0.0, lambda t, x, z, a: a * (z + 0.1) - x)
+    for a in jnp.array([3.0, 0.3, 49.0]):
+        assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
+
+
+def test_an_ill_conditioned_matrix():
+    matrix = 1 / (jnp.arange(8)[:, None] + jnp.arange(8) + 1.0)
+    dae = dfc.SemiExplicitDAE(lambda t, x, z, a: -x, lambda t, x, z, a: a @ z - x)
+    x = matrix @ jnp.ones(8)
+    steps = dict(controller=dfx.ConstantStepSize(), dt0=1e-2, saveat=dfx.SaveAt(t1=True))
+    found = solve(dae, dfx.Tsit5(), x, jnp.zeros(8), matrix, **steps)
+    assert largest(matrix @ found.ys[1][0] - np.exp(-1) * x) < 1e-8
+
+
 def test_units_change_nothing():
     """Equations and unknowns in other units: `A z + z³ = b`, with `A` not diagonally dominant."""
     key = jax.random.key(1)
