@@ -219,8 +219,9 @@ def _relative_sizes(
 
     terms = terms_at(vector, jacobian)
     # Where each term is zero nothing is tested, unless that is so beside the state too, as it is of
-    # a parameter among the components.
-    sizes = 0.1 * (jnp.abs(vector) + jnp.max(jnp.abs(vector), initial=0))
+    # a parameter among the components. Others may have other units: only a zero has their size.
+    sizes = jnp.abs(vector)
+    sizes = 0.1 * jnp.where(sizes == 0, jnp.max(sizes, initial=0), sizes)
     beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
     idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field.
