@@ -45,6 +45,16 @@ def test_the_worst_state_of_a_batch_is_named():
         assert "NOT conserved, see state 2" in str(report)
 
 
+@pytest.mark.parametrize("metres", [1.0, 1e11])
+def test_states_at_rest_test_nothing_in_any_units(metres):
+    """A position, a mass and a speed, of which the last is zero at every state."""
+    wrong = dfc.FirstIntegral(lambda t, y, args: jnp.sqrt(y[1]) * y[2] ** 2)
+    ys = jnp.array([[1.0, 2.0, 0.0], [1.5, 1.0, 0.0]]) * jnp.array([metres, 1.0, 1.0])
+    report = check_invariance(lambda t, y, args: jnp.stack([y[2], 0.0, 9.8]), wrong, ys)
+    assert not report.ok
+    assert "NOT TESTED" in str(report)
+
+
 def test_explicit_time_is_part_of_the_derivative():
     def f(t, y, args):
         return y

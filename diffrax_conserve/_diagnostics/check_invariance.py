@@ -243,7 +243,10 @@ def _relative_sizes(
     # If each term of the derivative is zero, its sum tells nothing, as at an equilibrium. Only if
     # the terms are zero beside the state too they are zero everywhere, such as those of an integral
     # which is a parameter among the components. The other state is in a direction without pattern.
-    sizes = _BESIDE * (jnp.abs(vector) + jnp.max(jnp.abs(vector), initial=0))
+    # Components may have different units, so each moves by a share of itself. Only a zero has the
+    # size of the others.
+    sizes = jnp.abs(vector)
+    sizes = _BESIDE * jnp.where(sizes == 0, jnp.max(sizes, initial=0), sizes)
     beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
     idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field, so that its value is less accurate than its size tells. If

@@ -171,10 +171,12 @@ def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
     _, _, _, units = _scaled(equations, y)
     _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
     right = jnp.zeros_like(unknowns) if right is None else right
-    columns = jnp.where(units > 0, units, 1)
-    rows = jnp.concatenate([columns[: y.size], sizes / columns[y.size :]])
-    matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns) / rows[:, None] * columns
-    tangent = -columns * _shortest(matrix, right / rows)
+    matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns)
+    # A component that is never moved has no unit, but its tangent is known: that of the candidate.
+    known = jnp.where(units == 0, right, 0)
+    right = right - combined(known, matrix.T)
+    rows = jnp.concatenate([jnp.where(units == 0, 1, units)[: y.size], sizes / units[y.size :]])
+    tangent = -known - units * _shortest(matrix / rows[:, None] * units, right / rows)
     # Only the nearest point has a derivative, so it is NaN where only the first phase succeeded.
     # The result of a failed projection is discarded, and its derivative must stay finite.
     sure = certain(equations, candidate, y, equations.linearise(y)[1])

@@ -61,6 +61,25 @@ def test_gradient_agrees_with_finite_differences(projection):
         assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(part)), name
 
 
+@each_projection
+def test_a_component_that_is_never_moved_may_have_any_unit(projection):
+    """The state is radial, at the distance `sqrt(1 - k z)`."""
+    projection = eqx.tree_at(
+        lambda p: p.metric, projection, jnp.array([1.0, 1.0, jnp.inf]), is_leaf=lambda x: x is None
+    )
+    circle = dfc.Constraint(lambda t, y, k: y[0] ** 2 + y[1] ** 2 + k * y[2] - 1)
+    found = jax.jit(
+        jax.jacfwd(lambda y, k: dfc.project(circle, y, args=k, projection=projection)[0])
+    )
+    exact = jax.jacfwd(
+        lambda y: jnp.append(y[:2] * jnp.sqrt((1 - y[2]) / jnp.sum(y[:2] ** 2)), y[2])
+    )
+    for k in 1.0, 1e12, 1e28:
+        y, units = jnp.array([1.01, 0.1, 0.01]), np.array([1, 1, k])
+        got = found(y / units, k) / units * units[:, None]
+        np.testing.assert_allclose(got, exact(y), atol=1e-12)
+
+
 @pytest.mark.slow
 @each_projection
 def test_second_derivatives(projection):
