@@ -33,9 +33,9 @@ _LEAST_PIVOT = 4
 # Algorithms*, SIAM 2002, 2.8 and 10.1), so that a pivot which should be zero stays positive.
 _ADDED = 16
 # And where no iterative refinement follows, at least this power of roundoff: the noise in the
-# residuals of dependent constraints becomes an error of all others, in the ratio of roundoff to what
-# is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit, of which
-# five are independent, does not converge.
+# residuals of dependent constraints becomes an error of all others, in the ratio of roundoff to
+# what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit, of
+# which five are independent, does not converge.
 _ADDED_POWER = 3 / 4
 # So many steps of iterative refinement remove from a solution the error that the addition causes.
 # Each multiplies it by what was added, divided by the smallest eigenvalue of the scaled matrix.

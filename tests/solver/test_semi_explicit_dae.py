@@ -265,6 +265,20 @@ def test_an_unknown_that_is_zero():
         assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
 
 
+def test_a_solve_that_comes_to_rest():
+    """All that a gradient shows of `c exp(z) - c - x` vanishes there, and its roundoff does not."""
+    dae = dfc.SemiExplicitDAE(lambda t, x, z, c: -x, lambda t, x, z, c: c * jnp.exp(z) - c - x)
+
+    @jax.jit
+    @jax.vmap
+    def end(c):
+        options = dict(args=c, controller=dfx.ConstantStepSize(), dt0=0.1, t1=40.0)
+        sol = solve(dae, dfx.Tsit5(), jnp.ones(()), jnp.ones(()), saveat=dfx.SaveAt(t1=True), **options)
+        return sol.ys[1][0]
+
+    assert largest(end(10 ** jnp.linspace(-2.0, 2.0, 9))) < 4 * EPS
+
+
 def test_an_ill_conditioned_matrix():
     matrix = 1 / (jnp.arange(8)[:, None] + jnp.arange(8) + 1.0)
     dae = dfc.SemiExplicitDAE(lambda t, x, z, a: -x, lambda t, x, z, a: a @ z - x)
