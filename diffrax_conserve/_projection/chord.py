@@ -141,9 +141,10 @@ def _of_few(
     written_out: bool = False,
 ) -> Solved:
     """For up to four constraints: each iteration has a Jacobian and an elimination of its own."""
-    may_start_again = directions is None and equations.magnitude.size > 1
-    # After so many iterations, and the test that follows them, this is what `left` is.
+    # After so many iterations, and the test that follows them, this is what `left` is. One more
+    # iteration would be too few to start again; 1 is what is left in the extra iteration, too.
     left_then = max_steps - FROZEN_STEPS
+    may_start_again = directions is None and equations.magnitude.size > 1 and left_then > 1
 
     def start(y: Any) -> Any:
         """The candidate and the directions, which the iterations share."""

@@ -272,9 +272,9 @@ def test_a_solve_that_comes_to_rest():
     @jax.jit
     @jax.vmap
     def end(c):
-        options = dict(args=c, controller=dfx.ConstantStepSize(), dt0=0.1, t1=40.0)
-        sol = solve(dae, dfx.Tsit5(), jnp.ones(()), jnp.ones(()), saveat=dfx.SaveAt(t1=True), **options)
-        return sol.ys[1][0]
+        steps = dict(controller=dfx.ConstantStepSize(), dt0=0.1, saveat=dfx.SaveAt(t1=True))
+        one = jnp.ones(())
+        return solve(dae, dfx.Tsit5(), one, one, args=c, t1=40.0, **steps).ys[1][0]
 
     assert largest(end(10 ** jnp.linspace(-2.0, 2.0, 9))) < 4 * EPS
 
