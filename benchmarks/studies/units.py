@@ -291,6 +291,62 @@ def energy_alone():
         yield f"{name}, RK4, on the energy alone: error over plain (largest)", max(ratios), target
 
 
+def spinning(t, y, args):
+    """A unit quaternion, and the angular velocity in the body; the moments of inertia 1, 2, 3."""
+    del t, args
+    q, w = y[:4], y[4:]
+    turn = jnp.array([-q[1:] @ w, *(q[0] * w + jnp.cross(q[1:], w))]) / 2
+    return jnp.concatenate([turn, jnp.cross(INERTIA * w, w) / INERTIA])
+
+
+def in_space(t, y, args):
+    """The angular momentum."""
+    del t, args
+    q, x = y[:4], INERTIA * y[4:]
+    return x + 2 * jnp.cross(q[1:], jnp.cross(q[1:], x) + q[0] * x)
+
+
+INERTIA = jnp.array([1.0, 2.0, 3.0])
+SPINNING = {
+    "length": dfc.Constraint(lambda t, y, args: jnp.sum(y[:4] ** 2) - 1),
+    "energy": dfc.FirstIntegral(lambda t, y, args: jnp.sum(INERTIA * y[4:] ** 2) / 2),
+    "momentum": dfc.FirstIntegral(in_space),
+}
+
+
+def attitudes():
+    """Fast spins, of which quaternion and velocity have different frequencies."""
+    spin, lanes = 200.0, few(50, 2)
+    y0 = jr.normal(jr.key(0), (lanes, 7))
+    y0 = y0.at[:, :4].divide(jnp.linalg.norm(y0[:, :4], axis=1, keepdims=True))
+    y0 = y0.at[:, 4:].multiply(spin / jnp.linalg.norm(y0[:, 4:], axis=1, keepdims=True))
+    sizes = jnp.array([1.0] * 4 + [spin] * 3)
+    ts = jnp.linspace(0.0, 0.4, few(201, 11))
+    by_size = dfc.SimplifiedNewton(metric=1 / sizes**2)
+    solvers = [
+        dfx.Tsit5(),
+        dfc.ManifoldProjection(dfx.Tsit5(), SPINNING),
+        dfc.ManifoldProjection(dfx.Tsit5(), SPINNING, projection=by_size),
+    ]
+
+    @jax.jit
+    def run(rtol):
+        options = dict(rtol=rtol, atol=rtol * sizes, saveat=dfx.SaveAt(ts=ts))
+        found = []
+        for solver in solvers:
+            sol = jax.vmap(lambda y, s=solver: solve(spinning, s, 0.4, 1e-4, y, **options))(y0)
+            found.append((sol.ys, dfx.is_okay(sol.result)))
+        return found
+
+    exact = jax.jit(jax.vmap(lambda y: truth(spinning, y, ts)))(y0) / sizes
+    for rtol in few((1e-4, 1e-6, 1e-8), (1e-4,)):
+        plain, mine, sized = (lane_errors(ys / sizes, exact, ok) for ys, ok in run(rtol))
+        for name, errors in {"default": mine, "1/size^2": sized}.items():
+            name, ratio = f"attitudes, {rtol:g}, {name}", errors / plain
+            say(f"{name}: median {np.median(ratio):.2g}, worst {max(ratio):.2g}")
+            yield f"{name}: median of the error over plain", np.median(ratio), 1
+
+
 def catalogue():
     worst = {}
     for name in few(dfc.systems.names(), ("rigid-body",)):
@@ -383,7 +439,8 @@ def long_steps():
         yield f"long steps, {name}: share of successes with a state off the manifold", share, 0.01
 
 
-PARTS = (powers_of_two, planets, other_times, events, energy_alone, catalogue, cost, long_steps)
+NATURE = (powers_of_two, planets, other_times, events, energy_alone, attitudes)
+PARTS = (*NATURE, catalogue, cost, long_steps)
 
 
 def main():
