@@ -193,6 +193,25 @@ def planets():
     yield "planets in metres: median error over plain (largest of all methods)", max(medians), 0.1
 
 
+def circles():
+    """Exactly circular orbits, of which the manifold has a dimension less than its functions tell.
+    They begin anywhere, and are solved for five turns with fixed steps of low order."""
+    lanes, turn = few(40, 4), 2 * np.pi
+    anomaly = np.linspace(0, turn, lanes, endpoint=False)
+    y0 = Orbits(1.0, 1.0, np.zeros(lanes), anomaly=anomaly).y0
+    cases = ((dfc.RK4(), 20), (dfc.RK4(), 100), (dfx.Bosh3(), 60), (dfx.Heun(), 150))
+    for solver, steps in few(cases, cases[:1]):
+        for name, projection in (("default", ITERATIONS[0]), ("metric=1.0", EUCLIDEAN)):
+            kept = dfc.ManifoldProjection(solver, KEPLER, projection=projection)
+
+            def okay(y, kept=kept, steps=steps):
+                return dfx.is_okay(solve(kepler, kept, 5 * turn, turn / steps, y, 1.0).result)
+
+            failed = int(np.sum(~jax.jit(jax.vmap(okay))(y0)))
+            title = f"circles, {type(solver).__name__} in {steps} steps a turn, {name}"
+            yield f"{title}: failed of {lanes}", failed, 0
+
+
 def other_times():
     """200 orbits: those that are off by 3 times the error at the steps around them."""
     units = {"m": (EARTH, 7e6, 4e7), "km": (EARTH / 1e9, 7e3, 4e4), "atomic": (1.0, 1.0, 9.0),
@@ -439,7 +458,7 @@ def long_steps():
         yield f"long steps, {name}: share of successes with a state off the manifold", share, 0.01
 
 
-NATURE = (powers_of_two, planets, other_times, events, energy_alone, attitudes)
+NATURE = (powers_of_two, planets, circles, other_times, events, energy_alone, attitudes)
 PARTS = (*NATURE, catalogue, cost, long_steps)
 
 
