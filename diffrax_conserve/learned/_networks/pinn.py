@@ -1,6 +1,6 @@
 """A physics-informed network: one solution, as a function of time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -12,11 +12,13 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._options import check_counts
-from ..._tree import unflatten
+from ..._printing import is_traced
+from ..._tree import tree_all_finite, unflatten
 from .cores import MLP, Activation
 from .flat import (
     as_state,
     check_key,
+    check_one,
     check_scalars,
     check_within,
     flatten,
@@ -68,7 +70,8 @@ class Window(AbstractTrainable):
 
     def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
         del points
-        return stacked_vectors(rates)
+        # Relative to each leaf. A single leaf keeps its units.
+        return stacked_vectors(rates) * (jnp.max(self.scale) / self.scale)
 
     def weights(self) -> MLP:
         return self.net
@@ -137,6 +140,8 @@ class PINN(eqx.Module):
         if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)
+        if not is_traced(y0) and not tree_all_finite(y0):
+            raise ValueError(f"`y0` is {y0}, which is not finite.")
         self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
         dtype, n, count = working_dtype(y0), flatten(y0).size, windows
 
@@ -151,6 +156,7 @@ class PINN(eqx.Module):
     def __call__(self, t: RealScalarLike) -> Y:
         """The state at time `t`. Outside the interval, which is known outside of `jit`, a
         `ValueError`."""
+        check_one("t", t, "pinn")
         check_within("t", t, self.t0, self.t1)
         return self.window(self._index(t))(t)
 
@@ -193,6 +199,20 @@ class PINN(eqx.Module):
         for name, value in {**vars(self), "nets": nets, "y0s": y0s, "edges": tuple(edges)}.items():
             object.__setattr__(other, name, value)
         return other
+
+    def rescaled(self, field: Callable[[Any, Y], Y]) -> "PINN":
+        """With a guess of the size of leaves that are zero at first, as velocities at rest are."""
+        sizes, rate, length = flatten(self.y0), flatten(field(self.t0, self.y0)), self.t1 - self.t0
+        # A little later, because what starts at rest has no rate at first.
+        y = unflatten(sizes + 0.01 * length * rate, self.y0)
+        later = flatten(field(self.t0 + 0.01 * length, y))
+        guess = length * jnp.maximum(jnp.abs(rate), jnp.abs(later))
+        guess = jtu.tree_map(_magnitude, unflatten(guess, self.y0))
+        is_zero = jtu.tree_map(lambda x: jnp.full(x.shape, jnp.all(x == 0)), self.y0)
+        scale = jnp.where(
+            flatten(is_zero) & jnp.isfinite(flatten(guess)), flatten(guess), self.scale
+        )
+        return eqx.tree_at(lambda p: p.scale, self, scale)
 
     def _index(self, t: RealScalarLike) -> IntScalarLike:
         if self.windows == 1:

@@ -124,6 +124,7 @@ def fit(
     created = time.perf_counter()
     check_types(key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
+    model = model.rescaled(problem.field) if isinstance(model, PINN) else model
     problem = dataclasses.replace(problem, sharding=checked_sharding(sharding, problem.recipe))
     target = None if target is None else float(target)
     loop = Loop(problem, key, target, seconds or math.inf, progress, created)

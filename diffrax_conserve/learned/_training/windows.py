@@ -201,7 +201,8 @@ class _Windows:
             f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of "
             f"the largest component, above {self.wrong:.2g}. Window {k} of {errors.size}, from "
             f"{edges[k]:.6g} to {edges[k + 1]:.6g}, has an estimated error of {errors[k]:.2g} by "
-            "itself. Use more windows, more `width` or more `epochs`, or a recipe with `retries`.",
+            "itself. Use more windows, more `width` or more `epochs`, or a recipe with `retries`. "
+            "Put quantities of unlike units into different leaves.",
             stacklevel=4,
         )
 
