@@ -17,6 +17,7 @@ from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import (
     as_states,
     check_key,
+    check_one,
     check_scalars,
     check_within,
     flatten,

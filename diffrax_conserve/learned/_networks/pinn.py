@@ -202,16 +202,15 @@ class PINN(eqx.Module):
 
     def rescaled(self, field: Callable[[Any, Y], Y]) -> "PINN":
         """With a guess of the size of leaves that are zero at first, as velocities at rest are."""
-        sizes, rate, length = flatten(self.y0), flatten(field(self.t0, self.y0)), self.t1 - self.t0
-        # A little later, because what starts at rest has no rate at first.
-        y = unflatten(sizes + 0.01 * length * rate, self.y0)
+        y0, length = self.y0, self.t1 - self.t0
+        rate = flatten(field(self.t0, y0))
+        # A little later, because the position of what starts at rest has no rate at first.
+        y = unflatten(flatten(y0) + 0.01 * length * rate, y0)
         later = flatten(field(self.t0 + 0.01 * length, y))
-        guess = length * jnp.maximum(jnp.abs(rate), jnp.abs(later))
-        guess = jtu.tree_map(_magnitude, unflatten(guess, self.y0))
-        is_zero = jtu.tree_map(lambda x: jnp.full(x.shape, jnp.all(x == 0)), self.y0)
-        scale = jnp.where(
-            flatten(is_zero) & jnp.isfinite(flatten(guess)), flatten(guess), self.scale
-        )
+        guess = length * jnp.maximum(jnp.abs(rate), jnp.abs(later)).astype(self.scale.dtype)
+        guess = flatten(jtu.tree_map(_magnitude, unflatten(guess, y0)))
+        is_zero = flatten(jtu.tree_map(lambda x: jnp.full(x.shape, jnp.all(x == 0)), y0))
+        scale = jnp.where(is_zero & jnp.isfinite(guess), guess, self.scale)
         return eqx.tree_at(lambda p: p.scale, self, scale)
 
     def _index(self, t: RealScalarLike) -> IntScalarLike:
