@@ -124,12 +124,11 @@ def fit(
     created = time.perf_counter()
     check_types(key, recipe, state, progress, target=target, seconds=seconds)
     network, problem = checked(model, vector_field, key, sample, data, args, recipe, manifold)
-    model = model.rescaled(problem.field) if isinstance(model, PINN) else model
     problem = dataclasses.replace(problem, sharding=checked_sharding(sharding, problem.recipe))
     target = None if target is None else float(target)
     loop = Loop(problem, key, target, seconds or math.inf, progress, created)
     if isinstance(model, PINN):
-        return train_windows(loop, model, manifold, state)
+        return train_windows(loop, model.rescaled(problem.field), manifold, state)
     trained, log = _train_flow_map(loop, network, state)
     trained: Any = trained.flow_map if isinstance(trained, OfPairs) else trained
     # A function is its own weights.
