@@ -88,9 +88,10 @@ class PINN(eqx.Module):
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
     with a fully connected network $N$ of time scaled to $[-1, 1]$, and the largest component $S$ of
-    each leaf of $u_0$. With a `layer`, the output is projected to the manifold of the conserved
-    values at $(t_0, u_0)$. A long interval is divided into `windows`, each with its own network
-    that starts where the last one ends: small networks on short intervals are easier to train.
+    each leaf of $u_0$; [`diffrax_conserve.fit`][] guesses that of a leaf that is zero. With a
+    `layer`, the output is projected to the manifold of the conserved values at $(t_0, u_0)$. A long
+    interval is divided into `windows`, each with its own network that starts where the last one
+    ends: small networks on short intervals are easier to train.
 
     Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
     [`diffrax_conserve.PINNSolver`][].

@@ -203,8 +203,7 @@ def _check_layer(network: Any, problem: Problem, starts: Points) -> None:
     """Raises unless the conserved values are finite, and warns if the field does not conserve them,
     because then the network cannot become the solution."""
     layer = network.layer
-    with one_of(starts.y0s, layer.args):
-        values = stacked_vectors(_values(layer, starts))
+    values = stacked_vectors(_values(layer, starts))
     _check_finite("The conserved values of the `layer` are", np.asarray(values), starts.y0s)
     entries = {name: x for name, x in named_entries(layer.manifold) if isinstance(x, FirstIntegral)}
     if problem.vector_field is None or not entries:
