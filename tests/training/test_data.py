@@ -88,7 +88,7 @@ def test_trajectories_are_solutions():
         (
             dict(data=(TS, EXACT.at[0, 0].set(jnp.nan))),
             ValueError,
-            "1 numbers in `data` are not finite",
+            "numbers in `data` are not finite",
         ),
         (dict(data=(100 * TS[:, ::4], EXACT[:, ::4])), ValueError, "No two times"),
         (dict(), TypeError, "needs a `vector_field`"),
