@@ -68,7 +68,7 @@ def check_function(name: str, fn: Any, call: str, returns: str) -> None:
     """Raises unless `fn` takes as many arguments as `call`, such as `"fn(t, y, args)"`."""
     remedy = f"Pass a function `{call}` that returns {returns}."
     if not callable(fn):
-        raise TypeError(f"{name} is {fn!r}, which is not callable. {remedy}")
+        raise TypeError(f"{name} is of type `{type(fn).__name__}`, not callable. {remedy}")
     try:
         given = inspect.signature(fn)
     except ValueError:  # some builtins have no signature
@@ -106,13 +106,15 @@ def calling(name: str, call: str, *given: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def one_of(states: Any) -> Iterator[None]:
-    """Tells with an error of a function what it was called with: one of `states`."""
+def one_of(states: Any, args: Any) -> Iterator[None]:
+    """Tells with an error of a function what it was called with: one of `states`, and `args`."""
     try:
         yield
     except Exception as error:
         one = jtu.tree_map(lambda x: jnp.asarray(x)[0], states)
         error.add_note(f"Here a state is {eqx.tree_pformat(one)}. {ONE_STATE}")
+        if args is None:
+            error.add_note("Here `args` is `None`: pass `args=` if the function needs any.")
         raise
 
 

@@ -166,7 +166,7 @@ def check_invariance(
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = _ROUNDOFF * float(jnp.finfo(ts.dtype).eps)
-    with one_of(ys):
+    with one_of(ys, args):
         found = _measure(vector_field, manifold, ts, ys, args)
     entries = [
         _entry_of_report(name, entry, rtol, *map(np.asarray, measured))

@@ -18,8 +18,9 @@ from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
-from ._networks.flat import as_states, check_scalars, check_within, stacked_vectors
+from ._networks.flat import as_states, check_scalars, check_within, flatten, stacked_vectors
 from ._networks.flow_map import args_domain_of, as_flow_map, known_args
+from ._solvers.checks import check_output
 from ._solvers.flow_map_solver import FlowMapSolver
 
 # Substeps that are tried for an equal error.
@@ -151,6 +152,7 @@ def compare(
         ```
     """
     flow_map, states = as_flow_map(flow_map), as_states(states)
+    y0 = jtu.tree_map(lambda x: x[0], states)
     check_vector_field(vector_field)
     check_scalars(step=step, above=0.0)
     if manifold is not None:
@@ -160,10 +162,10 @@ def compare(
     h = jnp.asarray(step, jnp.result_type(float))
     known = known_args(flow_map, args)
     term = dfx.ODETerm(vector_field)
-    with one_of(states):
+    with one_of(states, args):
+        check_output(flow_map, (y0, *known, h), y0, "flow_map")
         exact = _exact(term, states, h, args)
-    sizes = [jnp.full(x[0].size, jnp.max(jnp.abs(x))) for x in jtu.tree_leaves(exact)]
-    unit = jnp.maximum(jnp.concatenate(sizes), float(jnp.finfo(h.dtype).tiny))
+    unit = flatten(jtu.tree_map(lambda u, x: jnp.full(x.shape, u), _units(exact), y0))
 
     def errors(solver: dfx.AbstractSolver, count: int) -> np.ndarray:
         found = _solved(solver, term, states, h, h / count, args)
@@ -223,12 +225,25 @@ def _solved(
 
 @eqx.filter_jit
 def _exact(term: Any, y0s: Any, h: Array, args: Args) -> Any:
-    return jax.vmap(lambda y0: _reference(term, y0, h, args))(y0s)
+    units = _units(y0s)
+    return jax.vmap(lambda y0: _reference(term, y0, h, args, units))(y0s)
 
 
-def _reference(term: Any, y0: Any, h: Array, args: Args) -> Any:
+def _units(ys: Any) -> Any:
+    """The largest component of each leaf, or 1 if all are zero."""
+    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), ys)
+    return jtu.tree_map(lambda size: jnp.where(size > 0, size, 1), sizes)
+
+
+def _reference(term: Any, y0: Any, h: Array, args: Args, units: Any) -> Any:
     eps = float(jnp.finfo(h.dtype).eps)
-    controller = dfx.PIDController(rtol=100 * eps, atol=100 * eps)
+
+    def norm(error: Any) -> Array:
+        scaled = jtu.tree_map(lambda e, u: jnp.max(jnp.abs(e), initial=0) / u, error, units)
+        return jnp.max(jnp.stack(jtu.tree_leaves(scaled)))
+
+    # Its own tolerances are in units of the state.
+    controller = dfx.PIDController(rtol=0, atol=100 * eps, norm=norm)
     found = dfx.diffeqsolve(
         term, dfx.Dopri8(), 0.0, h, None, y0, args, stepsize_controller=controller,
         adjoint=dfx.ForwardMode(), max_steps=100_000, throw=False,
@@ -239,11 +254,11 @@ def _reference(term: Any, y0: Any, h: Array, args: Args) -> Any:
 @eqx.filter_jit
 def _jacobians(flow_map: Any, term: Any, y0s: Any, h: Array, args: Args) -> tuple[Array, Array]:
     vector, restore = ravel_pytree(args)
-    flat = lambda y: ravel_pytree(y)[0]  # noqa: E731
+    flat, units = lambda y: ravel_pytree(y)[0], _units(y0s)
 
     def both(y0: Any) -> tuple[Array, Array]:
         learned = lambda a: flat(flow_map(y0, *known_args(flow_map, restore(a)), h))  # noqa: E731
-        exact = lambda a: flat(_reference(term, y0, h, restore(a)))  # noqa: E731
+        exact = lambda a: flat(_reference(term, y0, h, restore(a), units))  # noqa: E731
         return jax.jacfwd(learned)(vector), jax.jacfwd(exact)(vector)
 
     return jax.vmap(both)(y0s)

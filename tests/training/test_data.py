@@ -85,7 +85,11 @@ def test_trajectories_are_solutions():
         (dict(data=(TS[0], EXACT[0])), ValueError, "leading axes"),
         (dict(data=(TS, EXACT[:, :-1])), ValueError, "leading axes"),
         (dict(data=(TS[:, ::-1], EXACT)), ValueError, "must increase"),
-        (dict(data=(TS, EXACT.at[0, 0].set(jnp.nan))), ValueError, "be finite"),
+        (
+            dict(data=(TS, EXACT.at[0, 0].set(jnp.nan))),
+            ValueError,
+            "numbers in `data` are not finite",
+        ),
         (dict(data=(100 * TS[:, ::4], EXACT[:, ::4])), ValueError, "No two times"),
         (dict(), TypeError, "needs a `vector_field`"),
         (dict(data=(TS, EXACT), sample=lambda key: EAST), TypeError, "`sample` is only used with"),

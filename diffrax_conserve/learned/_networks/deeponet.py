@@ -17,6 +17,7 @@ from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import (
     as_states,
     check_key,
+    check_one,
     check_scalars,
     check_within,
     flatten,
@@ -133,6 +134,7 @@ class DeepONet(AbstractFlowMap):
         expected = "(y0, h)" if self.args_domain is None else "(y0, args, h)"
         if len(step) != expected.count(","):
             raise TypeError(f"This `DeepONet` is called as `{expected}`.")
+        check_one("h", step[-1], "lambda h: deeponet(y0, h)")
         check_within("h", step[-1], 0.0, self.max_step)
         candidate = self.candidate(y0, *step)
         if self.layer is None:
@@ -144,7 +146,10 @@ class DeepONet(AbstractFlowMap):
         *args, h = step
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
-            raise ValueError(f"This `DeepONet` is for states of {size} numbers, not {start.size}.")
+            raise ValueError(
+                f"This `DeepONet` is for states of {size} numbers, not {start.size}. Map it over "
+                "several states: `jax.vmap(deeponet, (0, None))(states, h)`."
+            )
         h = jnp.asarray(h).astype(start.dtype)
         known = self._known(args)
         if isinstance(self.domain, Box):

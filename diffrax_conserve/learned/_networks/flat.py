@@ -62,6 +62,15 @@ def check_within(name: str, value: Any, first: float, last: float) -> None:
         )
 
 
+def check_one(name: str, value: Any, function: str) -> None:
+    """Raises unless `value` is one number, not an array of them."""
+    if np.ndim(value):
+        raise ValueError(
+            f"`{name}` has shape {np.shape(value)}, but the network takes one number. For several "
+            f"write `jax.vmap({function})({name}s)`."
+        )
+
+
 def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`y` with arrays as leaves; raises unless they are real and floating-point."""
     leaves = jtu.tree_leaves(y)
@@ -80,23 +89,25 @@ def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]
     return jtu.tree_map(floating, y)
 
 
-def as_states(states: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
+def as_states(
+    states: PyTree[Shaped[ArrayLike, "..."]], name: str = "states"
+) -> PyTree[Float[Array, "..."]]:
     """`as_state` of states that are stacked along a leading axis; raises unless they are."""
     if callable(states):
         raise TypeError(
-            "`states` is a function. Draw states from it: "
-            "`jax.vmap(states)(jax.random.split(key, 1000))`."
+            f"`{name}` is a function. Draw states from it: "
+            "`jax.vmap(function)(jax.random.split(key, 1000))`."
         )
     states = as_state(states)
     shapes = [jnp.shape(x) for x in jtu.tree_leaves(states)]
     lengths = {shape[:1] for shape in shapes}
     if len(lengths) != 1 or lengths == {()} or lengths == {(0,)}:
         raise ValueError(
-            "`states` must be one state or more, stacked along a leading axis, but the leaves have "
-            f"shapes {shapes}. " + ONE_STATE
+            f"`{name}` must be one state or more, stacked along a leading axis, but the leaves "
+            f"have shapes {shapes}. " + ONE_STATE
         )
     if not is_traced(states) and not all(np.all(np.isfinite(x)) for x in jtu.tree_leaves(states)):
-        raise ValueError("`states` holds a state that is not finite. Leave it out.")
+        raise ValueError(f"`{name}` holds a state that is not finite. Leave it out.")
     return states
 
 

@@ -123,8 +123,9 @@ def as_flow_map(model: AbstractFlowMap | Callable[..., Any]) -> AbstractFlowMap:
         return model
     if not (callable(model) and hasattr(model, "max_step")):
         raise TypeError(
-            f"`flow_map` is {model!r}, which is no flow map. Pass a `DeepONet`, or a Module that "
-            "is called as `(y0, h) -> y` and has an attribute `max_step`, the longest step."
+            f"`flow_map` is of type `{type(model).__name__}`, which is no flow map. Pass a "
+            "`DeepONet`, or a Module that is called as `(y0, h) -> y` and has an attribute "
+            "`max_step`, the longest step."
         )
     return FlowMap(model)
 

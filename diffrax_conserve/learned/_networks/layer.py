@@ -90,7 +90,12 @@ class ConservativeLayer(eqx.Module):
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
         """The conserved values of the solution through `y0`."""
-        return conserved_values(self.manifold, t0, y0, self.args)
+        try:
+            return conserved_values(self.manifold, t0, y0, self.args)
+        except Exception as error:
+            if self.args is None:
+                error.add_note("The layer has no `args`: `ConservativeLayer(manifold, args=args)`.")
+            raise
 
     def equations(
         self, candidate: Y, t: RealScalarLike, start: tuple[RealScalarLike, Y]

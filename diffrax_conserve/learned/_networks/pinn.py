@@ -1,6 +1,6 @@
 """A physics-informed network: one solution, as a function of time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -12,11 +12,13 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from ..._custom_types import IntScalarLike, RealScalarLike, Y
 from ..._options import check_counts
-from ..._tree import unflatten
+from ..._printing import is_traced
+from ..._tree import tree_all_finite, unflatten
 from .cores import MLP, Activation
 from .flat import (
     as_state,
     check_key,
+    check_one,
     check_scalars,
     check_within,
     flatten,
@@ -68,7 +70,8 @@ class Window(AbstractTrainable):
 
     def measured(self, points: Points, rates: Y) -> Float[Array, "points n"]:
         del points
-        return stacked_vectors(rates)
+        # Relative to each leaf. A single leaf keeps its units.
+        return stacked_vectors(rates) * (jnp.max(self.scale) / self.scale)
 
     def weights(self) -> MLP:
         return self.net
@@ -85,9 +88,10 @@ class PINN(eqx.Module):
     $$u(t) = u_0 + \frac{t - t_0}{t_1 - t_0} S N(t)$$
 
     with a fully connected network $N$ of time scaled to $[-1, 1]$, and the largest component $S$ of
-    each leaf of $u_0$. With a `layer`, the output is projected to the manifold of the conserved
-    values at $(t_0, u_0)$. A long interval is divided into `windows`, each with its own network
-    that starts where the last one ends: small networks on short intervals are easier to train.
+    each leaf of $u_0$; [`diffrax_conserve.fit`][] guesses that of a leaf that is zero. With a
+    `layer`, the output is projected to the manifold of the conserved values at $(t_0, u_0)$. A long
+    interval is divided into `windows`, each with its own network that starts where the last one
+    ends: small networks on short intervals are easier to train.
 
     Train it by [`diffrax_conserve.fit`][], which cuts windows that are too long, and step it by
     [`diffrax_conserve.PINNSolver`][].
@@ -137,6 +141,8 @@ class PINN(eqx.Module):
         if not -jnp.inf < t0 < t1 < jnp.inf:
             raise ValueError(f"`t0` must be less than `t1`, but they are {t0} and {t1}.")
         y0, length = as_state(y0), float(t1) - float(t0)
+        if not is_traced(y0) and not tree_all_finite(y0):
+            raise ValueError(f"`y0` is {y0}, which is not finite.")
         self.edges = (*(float(t0) + length / windows * k for k in range(windows)), float(t1))
         dtype, n, count = working_dtype(y0), flatten(y0).size, windows
 
@@ -151,6 +157,7 @@ class PINN(eqx.Module):
     def __call__(self, t: RealScalarLike) -> Y:
         """The state at time `t`. Outside the interval, which is known outside of `jit`, a
         `ValueError`."""
+        check_one("t", t, "pinn")
         check_within("t", t, self.t0, self.t1)
         return self.window(self._index(t))(t)
 
@@ -193,6 +200,19 @@ class PINN(eqx.Module):
         for name, value in {**vars(self), "nets": nets, "y0s": y0s, "edges": tuple(edges)}.items():
             object.__setattr__(other, name, value)
         return other
+
+    def rescaled(self, field: Callable[[Any, Y], Y]) -> "PINN":
+        """With a guess of the size of leaves that are zero at first, as velocities at rest are."""
+        y0, length = self.y0, self.t1 - self.t0
+        rate = flatten(field(self.t0, y0))
+        # A little later, because the position of what starts at rest has no rate at first.
+        y = unflatten(flatten(y0) + 0.01 * length * rate, y0)
+        later = flatten(field(self.t0 + 0.01 * length, y))
+        guess = length * jnp.maximum(jnp.abs(rate), jnp.abs(later)).astype(self.scale.dtype)
+        guess = flatten(jtu.tree_map(_magnitude, unflatten(guess, y0)))
+        is_zero = flatten(jtu.tree_map(lambda x: jnp.full(x.shape, jnp.all(x == 0)), y0))
+        scale = jnp.where(is_zero & jnp.isfinite(guess), guess, self.scale)
+        return eqx.tree_at(lambda p: p.scale, self, scale)
 
     def _index(self, t: RealScalarLike) -> IntScalarLike:
         if self.windows == 1:

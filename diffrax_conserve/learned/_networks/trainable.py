@@ -28,7 +28,9 @@ class Points(NamedTuple):
 def checked_part(name: str, part: Any, kind: type) -> Any:
     """`part`; raises unless it is `None` or a `kind`."""
     if not isinstance(part, kind | None):
-        raise TypeError(f"`{name}` is {part!r}, but it must be a `{kind.__name__}`.")
+        raise TypeError(
+            f"`{name}` is of type `{type(part).__name__}`, but it must be a `{kind.__name__}`."
+        )
     return part
 
 

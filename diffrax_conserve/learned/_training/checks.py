@@ -1,5 +1,6 @@
 """What `fit` is given, checked before compilation, as a network and a problem."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,8 @@ from jaxtyping import Array, PRNGKeyArray
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, Y
-from ..._manifold import check_manifold, check_vector_field
+from ..._diagnostics.check_invariance import check_invariance
+from ..._manifold import FirstIntegral, check_manifold, check_vector_field, named_entries
 from ..._options import one_of
 from ..._tree import ravel
 from .._networks.deeponet import DeepONet
@@ -22,7 +24,7 @@ from .._networks.flat import check_key, check_scalars, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map
 from .._networks.pinn import PINN
 from .._networks.taylor import Taylor
-from .._networks.trainable import checked_part
+from .._networks.trainable import Points, checked_part
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
@@ -85,9 +87,13 @@ def checked(
         network, problem = model.window(0), Problem(vector_field, args, None, None, recipe)
     else:
         network, problem = _of_flow_map(model, vector_field, sample, data, args, recipe)
+    starts = network.starts(problem.draw(network, jr.split(key)[0]))
+    if vector_field is not None:
+        _check_field(network, problem, starts)
+    if network.layer is not None:
+        _check_layer(network, problem, starts)
     if vector_field is None:
         return network, problem
-    _check_field(network, problem, jr.split(key)[0])
     return _with_taylor(network, problem, vector_field), problem
 
 
@@ -160,20 +166,15 @@ def _rate_of_change(problem: Problem) -> Array:
     return jnp.median(jax.vmap(at)(jr.split(jr.key(0), 64)))
 
 
-def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
+def _check_field(network: Any, problem: Problem, starts: Points) -> None:
     """Raises unless the field fits the states, is finite, and for a flow map is autonomous."""
-    starts = network.starts(problem.draw(network, key))
     y0 = jtu.tree_map(lambda x: x[0], starts.y0s)
-    with one_of(starts.y0s):
+    with one_of(starts.y0s, problem.args):
+        if isinstance(network, AbstractFlowMap):
+            check_output(network, (y0, starts.ts[0]), y0, "model")
         check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
     now = np.asarray(_rates(problem, starts.ts, starts.y0s))
-    wrong = np.flatnonzero(~np.all(np.isfinite(now), axis=1))
-    if wrong.size:
-        y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), starts.y0s)
-        raise ValueError(
-            f"`vector_field` is not finite at {wrong.size} of {len(now)} initial states, for "
-            f"example at {y0}."
-        )
+    _check_finite("`vector_field` is", now, starts.y0s)
     if isinstance(network, AbstractFlowMap):
         size = np.max(np.abs(now))
         # Over hundreds of steps: a dose may be given late.
@@ -186,6 +187,63 @@ def _check_field(network: Any, problem: Problem, key: PRNGKeyArray) -> None:
                     f"{change:.3g}, where its largest component is {size:.3g}. A flow map is for "
                     "autonomous equations. Make time a component of the state, of rate one."
                 )
+
+
+def _check_finite(what: str, values: np.ndarray, y0s: Y) -> None:
+    wrong = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    if wrong.size:
+        y0 = jtu.tree_map(lambda x: np.asarray(x[wrong[0]]), y0s)
+        raise ValueError(
+            f"{what} not finite at {wrong.size} of {len(values)} initial states, for example at "
+            f"{y0}."
+        )
+
+
+def _check_layer(network: Any, problem: Problem, starts: Points) -> None:
+    """Raises unless the conserved values are finite, and warns if the field does not conserve them,
+    because then the network cannot become the solution."""
+    layer = network.layer
+    values = stacked_vectors(_values(layer, starts))
+    _check_finite("The conserved values of the `layer` are", np.asarray(values), starts.y0s)
+    entries = {name: x for name, x in named_entries(layer.manifold) if isinstance(x, FirstIntegral)}
+    if problem.vector_field is None or not entries:
+        return
+    flow_map = isinstance(network, AbstractFlowMap)
+    ts, ys = _shortly_after(problem, starts, network.max_step if flow_map else network.length)
+    field = eqx.Partial(_field_of, problem)
+    report = check_invariance(field, entries, ys, t=ts, args=layer.args, rtol=_CONSERVED)
+    for entry in report.entries:
+        if not entry.defect <= _CONSERVED:
+            warnings.warn(
+                f"`vector_field` does not conserve `{entry.name}` of the `layer`: its derivative "
+                f"is {entry.defect:.1g} of the size of its terms. The network cannot become the "
+                "solution. Check both, and the `args` of the layer, by `check_invariance`.",
+                stacklevel=4,
+            )
+
+
+# The derivative of a first integral, relative to its terms, is roundoff. Single precision has much
+# of it at rest, where these terms are small.
+_CONSERVED = 1e-2
+
+
+@eqx.filter_jit
+def _values(layer: Any, starts: Points) -> Any:
+    return jax.vmap(layer.values)(starts.ts, starts.y0s)
+
+
+@eqx.filter_jit
+def _shortly_after(problem: Problem, starts: Points, length: Any) -> tuple[Array, Y]:
+    """Times and states a little later. At rest itself any function of the velocity is constant."""
+    few = jtu.tree_map(lambda x: x[:64], starts)
+    h = jnp.sqrt(jnp.finfo(few.ts.dtype).eps) * length
+    rates = jax.vmap(problem.field)(few.ts, few.y0s)
+    return few.ts + h, jtu.tree_map(lambda y, f: y + (h * f).astype(y.dtype), few.y0s, rates)
+
+
+def _field_of(problem: Problem, t: Any, y: Y, args: Args) -> Y:
+    del args  # those of the layer
+    return problem.field(t, y)
 
 
 @eqx.filter_jit

@@ -65,7 +65,7 @@ def reachable_states(
         states = dfc.learned.reachable_states(system.vector_field, y0s, 5.0, key=key)
         ```
     """
-    count = jtu.tree_leaves(as_states(y0s))[0].shape[0]
+    count = jtu.tree_leaves(as_states(y0s, "y0s"))[0].shape[0]
     times = jr.uniform(key, (count, 1), minval=0.0, maxval=duration)
     _, ys = trajectories(vector_field, y0s, times, args=args, solver=solver, dt0=dt0, rtol=1e-6)
     ys = jtu.tree_map(lambda x: x[:, 0], ys)
@@ -113,7 +113,7 @@ def trajectories(
         ```
     """
     check_vector_field(vector_field)
-    count = jtu.tree_leaves(as_states(y0s))[0].shape[0]
+    count = jtu.tree_leaves(as_states(y0s, "y0s"))[0].shape[0]
     times = jnp.asarray(ts, float)
     times = jnp.broadcast_to(times, (count, times.shape[-1]))
     if atol is None:
@@ -131,7 +131,7 @@ def trajectories(
         )  # fmt: skip
         return found.ys, (found.result == dfx.RESULTS.successful) & tree_all_finite(found.ys)
 
-    with one_of(y0s):
+    with one_of(y0s, args):
         ys, good = eqx.filter_jit(jax.vmap(solution))(y0s, times)
     return _the_good((times, ys), good)
 
@@ -148,7 +148,7 @@ def _the_good(ys: Any, good: Array) -> Any:
 def as_sampler(sample: Any) -> Sampler | None:
     """A function as it is; for stacked states one that draws from them, with replacement."""
     given = sample is None or callable(sample)
-    return sample if given else eqx.Partial(_one_of, as_states(sample))
+    return sample if given else eqx.Partial(_one_of, as_states(sample, "sample"))
 
 
 def _one_of(states: Y, key: PRNGKeyArray) -> Y:
@@ -209,9 +209,13 @@ def as_data(data: Any, flow_map: AbstractFlowMap) -> Data:
             f"In `data` the times have shape {ts.shape} and the states leading axes {shapes}, but "
             "all must be `(n, k)`: n trajectories, with k times each."
         )
-    finite = [np.all(np.isfinite(y)) for y in (ts, *jtu.tree_leaves(ys))]
-    if not all(finite) or np.any(np.diff(ts, axis=1) <= 0):
-        raise ValueError("The times in `data` must increase, and all its numbers be finite.")
+    if wrong := sum(np.sum(~np.isfinite(y)) for y in (ts, *jtu.tree_leaves(ys))):
+        raise ValueError(f"{wrong} numbers in `data` are not finite. Leave these trajectories out.")
+    if (wrong := np.flatnonzero(np.any(np.diff(ts, axis=1) <= 0, axis=1))).size:
+        raise ValueError(
+            f"The times of each trajectory in `data` must increase, but those of {wrong.size}, for "
+            f"example of `ts[{wrong[0]}]`, do not."
+        )
     longest = float(flow_map.max_step) * (1 + 1e-6)
     last = np.stack([np.searchsorted(t, t + longest, side="right") - 1 for t in ts])
     places = np.argwhere(last > np.arange(ts.shape[1]))

@@ -81,6 +81,21 @@ def window_errors(window: Window, problem: Problem, initial: Float[Array, " n"])
     return path_errors(window, problem, paths, lengths, initial[None], 2 * problem.recipe.points)
 
 
+@eqx.filter_jit
+def roundoff(window: Window, count: int) -> Float[Array, " n"]:
+    """The largest roundoff in the states, which is not in the defect: the derivative is computed
+    by itself. It is what distinguishes two states at nearly the same time, but for that."""
+    ts = window.start + window.length * jnp.linspace(0, 1, count, dtype=window.start.dtype)
+    short = jnp.finfo(ts.dtype).eps ** (2 / 3) * window.length
+    later = ts + jnp.maximum(short, 2 * jnp.spacing(jnp.abs(ts)))
+
+    def states(ts: Array) -> Array:
+        return stacked_vectors(jax.vmap(window)(ts))
+
+    ys, changes = jax.jvp(states, (ts,), (later - ts,))
+    return jnp.max(jnp.abs(states(later) - ys - changes), axis=0)
+
+
 def flow_map_error(flow_map: AbstractFlowMap, problem: Problem, key: PRNGKeyArray) -> float:
     """The root mean square of the error of the longest step, or without a vector field at pairs of
     the data, relative as in `relative`."""

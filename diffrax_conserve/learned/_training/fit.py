@@ -45,10 +45,10 @@ def fit(
 
     Minimises the mean over collocation points of $|u'(t) - f(t, u(t))|^2$ for the output $u$ of the
     network, with $u'$ by forward-mode automatic differentiation; of a `DeepONet` each component in
-    units of its deviation over the initial states. From `data` a flow map learns pairs of states
-    along the trajectories, one step of any length apart: the loss is that of the differences, each
-    component relative to the root mean square change by a step. With a vector field the squared
-    defect is added, relative to the median of $|f|^2$.
+    units of its deviation over the initial states, of a `PINN` each leaf relative to its size. From
+    `data` a flow map learns pairs of states along the trajectories, one step of any length apart:
+    the loss is that of the differences, each component relative to the root mean square change by a
+    step. With a vector field the squared defect is added, relative to the median of $|f|^2$.
 
     Updates that are not finite are skipped. The best model is returned, not the last. `log.error`
     estimates the error of its solution. A `DeepONet` gets the Taylor polynomial of its recipe.
@@ -128,7 +128,7 @@ def fit(
     target = None if target is None else float(target)
     loop = Loop(problem, key, target, seconds or math.inf, progress, created)
     if isinstance(model, PINN):
-        return train_windows(loop, model, manifold, state)
+        return train_windows(loop, model.rescaled(problem.field), manifold, state)
     trained, log = _train_flow_map(loop, network, state)
     trained: Any = trained.flow_map if isinstance(trained, OfPairs) else trained
     # A function is its own weights.

@@ -64,8 +64,8 @@ class Recipe(eqx.Module):
         check_scalars(least=0.0, optional=False, retries=self.retries, taylor=self.taylor)
         if not isinstance(self.optimiser, optax.GradientTransformation | SecondOrder):
             raise TypeError(
-                f"`optimiser` is {self.optimiser!r}, but it must be one of optax, or "
-                "`diffrax_conserve.learned.SPRING()` or `LevenbergMarquardt()`."
+                f"`optimiser` is of type `{type(self.optimiser).__name__}`, but it must be one of "
+                "optax, or `diffrax_conserve.learned.SPRING()` or `LevenbergMarquardt()`."
             )
 
 
@@ -104,6 +104,8 @@ def second_order(model: eqx.Module, *, epochs: int | None = None) -> Recipe:
     - `model`: a [`diffrax_conserve.PINN`][], or a flow map.
     - `epochs`: the number of updates; more reduce the error, down to what the network can do.
     """
+    if not isinstance(model, eqx.Module):
+        raise TypeError(f"`model` is {model!r}, but it must be the network that is trained.")
     # With 2,000 columns a QR factorisation takes about as long as SPRING's Cholesky factorisation.
     updates = lambda default: default if epochs is None else epochs  # noqa: E731
     if isinstance(model, PINN) and tree_size(model.window(0).net) <= 2000:

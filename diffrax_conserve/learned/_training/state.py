@@ -5,10 +5,10 @@ from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from ..._tree import tree_shapes
 from .objective import Carry
 
 
@@ -56,8 +56,12 @@ class FitState(eqx.Module):
     def continued(self, epochs: int, first: "FitState") -> "FitState":
         """This state, if a training of so many epochs can go on from it; `first` is that of a new
         training."""
-        if jtu.tree_structure(self.carry.weights) != jtu.tree_structure(first.carry.weights):
-            raise ValueError("`state` is that of a training of another kind of network.")
+        # All but the records, whose length is that of the training.
+        own, new = (carry._replace(losses=0, criteria=0) for carry in (self.carry, first.carry))
+        if tree_shapes(own.weights) != tree_shapes(new.weights):
+            raise ValueError("`state` is that of a training of another network.")
+        if tree_shapes(own) != tree_shapes(new):
+            raise ValueError("`state` is that of a training with another optimiser.")
         if self.done >= epochs or (self.finished and len(self.networks) > 1):
             raise ValueError(
                 f"The training of `state` has made all its {self.done} epochs. Give a recipe with "

@@ -23,7 +23,7 @@ from .._networks.cores import fresh, initial_slope
 from .._networks.flat import flatten
 from .._networks.pinn import PINN, Window
 from .._networks.trainable import Points
-from .errors import relative, warn_off_manifold, window_errors
+from .errors import relative, roundoff, warn_off_manifold, window_errors
 from .loop import FitLog, Loop
 from .state import FitState
 
@@ -116,8 +116,10 @@ class _Windows:
         for window in state.networks:
             # A window may start at another state. The solution is continuous, but for roundoff.
             error = error + flatten(end) - flatten(window.y0) + jnp.spacing(flatten(end)) / 2
-            paths.append(window_errors(window, self.loop.problem, error))
-            error, (_, end) = paths[-1].end[0], _end(window)
+            path = window_errors(window, self.loop.problem, error)
+            error, (_, end) = path.end[0], _end(window)
+            rounded = roundoff(window, self.loop.problem.recipe.points)
+            paths.append(path._replace(largest=path.largest + rounded))
         size = np.max([np.asarray(path.size[0]) for path in paths], axis=0)
         return [relative(path.largest[0], size, self.pinn.y0) for path in paths]
 
@@ -201,7 +203,8 @@ class _Windows:
             f"The trained `PINN` is not the solution: its estimated error is {max(along):.2g} of "
             f"the largest component, above {self.wrong:.2g}. Window {k} of {errors.size}, from "
             f"{edges[k]:.6g} to {edges[k + 1]:.6g}, has an estimated error of {errors[k]:.2g} by "
-            "itself. Use more windows, more `width` or more `epochs`, or a recipe with `retries`.",
+            "itself. Use more windows, more `width` or more `epochs`, or a recipe with `retries`. "
+            "Put quantities of unlike units into different leaves.",
             stacklevel=4,
         )
 
