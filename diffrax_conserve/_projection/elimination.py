@@ -16,6 +16,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy as jsp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from .sparse import BlockGram, SparseRows
@@ -161,4 +162,4 @@ def _added(gram: Float[Array, "m m"], power: float = 1) -> Float[Array, "m m"]:
     small."""
     eps = float(jnp.finfo(gram.dtype).eps)
     roundoff = max(_ADDED * eps, eps**power) * len(gram) ** 0.5
-    return roundoff * jnp.eye(len(gram), dtype=jnp.promote_types(gram.dtype, jnp.float32))
+    return roundoff * jnp.eye(len(gram), dtype=np.promote_types(gram.dtype, np.float32))

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._tree import tree_tangents
@@ -155,7 +156,7 @@ def _sines(equations: Equations, jacobian: Any) -> Float[Array, " m"]:
     In a QR decomposition it is the diagonal element of `R` divided by the length of the column. A
     gradient that is zero counts as orthogonal to all others."""
     _, unit = scaled_rows(equations.scaled(jacobian))
-    columns = unit.astype(jnp.promote_types(unit.dtype, jnp.float32)).T  # LAPACK has no float16
+    columns = unit.astype(np.promote_types(unit.dtype, np.float32)).T  # LAPACK has no float16
     norms = jnp.linalg.norm(columns, axis=0)
     lengths = jnp.abs(jnp.diagonal(jnp.linalg.qr(columns, mode="r")))
     # If there are more constraints than unknowns, those that are left over depend on the others.

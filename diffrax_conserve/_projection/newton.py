@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .base import Problem, ProjectionInfo
@@ -73,7 +74,7 @@ class Newton(AbstractNewton):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        if jnp.promote_types(candidate.dtype, jnp.float32) != candidate.dtype:
+        if np.promote_types(candidate.dtype, np.float32) != candidate.dtype:
             # LAPACK has no half precision, in which the derivative would need singular values.
             raise TypeError(
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
