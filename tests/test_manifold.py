@@ -60,8 +60,12 @@ PARTS = dfx.SaveAt(ts=[0.0, 1.0], fn=lambda t, y, args: y[:2], dense=True)
 MISTAKES = [
     (lambda: wrap(rotational_energy), TypeError, r"manifold.*FirstIntegral\(fn\)"),
     (lambda: wrap({"energy": rotational_energy}), TypeError, r"manifold\['energy'\]"),
-    (lambda: FirstIntegral(3), TypeError, r"`fn` of a `FirstIntegral` is 3, .*`fn\(t, y, args\)`"),
-    (lambda: Constraint("sphere"), TypeError, r"`fn` of a `Constraint` is 'sphere'"),
+    (
+        lambda: FirstIntegral(3),
+        TypeError,
+        r"`fn` of a `FirstIntegral` is of type `int`, .*`fn\(t, y, args\)`",
+    ),
+    (lambda: Constraint("sphere"), TypeError, r"`fn` of a `Constraint` is of type `str`"),
     (lambda: FirstIntegral(lambda y: y[0]), TypeError, r"parameters `\(y\)`.*`fn\(t, y, args\)`"),
     (lambda: FirstIntegral(jnp.sum, rate=lambda t, y: y), TypeError, r"`\(t, y\)`.*`rate\(t, y, a"),
     (lambda: FirstIntegral(jnp.sum, rate=3), TypeError, "rate"),
@@ -81,7 +85,7 @@ MISTAKES = [
         (lambda f=f: f(integral=FirstIntegral(looped)), ValueError, A_CALLED)
         for f in (check, lambda integral: run({"a": integral}))
     ),
-    (lambda: dfc.systems.hamiltonian_vector_field(ENERGY), TypeError, "`hamiltonian` is FirstInt"),
+    (lambda: dfc.systems.hamiltonian_vector_field(ENERGY), TypeError, "is of type `FirstIntegral`"),
     (lambda: dfc.ClosedForm(lambda t, y, args: y), TypeError, r"`fn\(t, y, args, values\)`"),
     *((lambda x=x: wrap(x), ValueError, "nothing to conserve") for x in ((), [], {}, None)),
     (lambda: run(FirstIntegral(lambda t, y, args: ())), ValueError, "no array"),

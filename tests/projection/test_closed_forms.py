@@ -135,7 +135,7 @@ def test_wrong_input_is_explained():
         formula(closed_forms.density_matrix())(jnp.ones((2, 3)))
     with pytest.raises(TypeError, match="is real"):
         formula(closed_forms.rotation_matrix())(jnp.eye(2) + 0j)
-    with pytest.raises(TypeError, match="`where` is 'R'"):
+    with pytest.raises(TypeError, match="`where` is of type `str`"):
         closed_forms.unit_vector("R")
     _, info = dfc.project(
         dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1),
