@@ -68,8 +68,9 @@ test: $(TEST) ## run the tests, without the slow ones
 
 # uv can choose the lowest versions that `pyproject.toml` allows; pip cannot.
 LOWEST := $(VENV)/lowest
-PROMISED := tests/laws/test_projection.py tests/solver/test_diffrax.py tests/solver/test_learned.py \
-  tests/test_check.py tests/test_find.py tests/test_manifold.py tests/training/test_fit.py
+PROMISED := tests/laws/test_projection.py tests/solver/test_conformance.py tests/solver/test_diffrax.py \
+  tests/solver/test_learned.py tests/test_check.py tests/test_find.py tests/test_manifold.py \
+  tests/training/test_fit.py
 
 lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of jax, diffrax and the rest
 	$(BIN)/python -m pip install --quiet uv
