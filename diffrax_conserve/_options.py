@@ -98,24 +98,29 @@ def calling(name: str, call: str, *given: Any) -> Iterator[None]:
         known = dict(zip(parameters(call), given, strict=True))
         shown = (f"{p} = {textwrap.shorten(eqx.tree_pformat(x), 200)}" for p, x in known.items())
         note = f"{name} was called as `{call}`, here with {', '.join(shown)}."
-        if "NoneType" in str(error) and known.get("args", "") is None:
-            note += " It seems to need `args`: pass them here too."
+        note += _needs(error, known.get("args", ""))
         if note not in getattr(error, "__notes__", []):
             error.add_note(note)
         raise
 
 
 @contextlib.contextmanager
-def one_of(states: Any, args: Any) -> Iterator[None]:
-    """Tells with an error of a function what it was called with: one of `states`, and `args`."""
+def one_of(states: Any, args: Any = ()) -> Iterator[None]:
+    """Tells with an error of a function what it was called with: one of `states`, and `args`, if no
+    `calling` inside tells that."""
     try:
         yield
     except Exception as error:
         one = jtu.tree_map(lambda x: jnp.asarray(x)[0], states)
-        error.add_note(f"Here a state is {eqx.tree_pformat(one)}. {ONE_STATE}")
-        if args is None:
-            error.add_note("Here `args` is `None`: pass `args=` if the function needs any.")
+        note = f"Here a state is {eqx.tree_pformat(one)}. {ONE_STATE}"
+        error.add_note(note + _needs(error, args))
         raise
+
+
+def _needs(error: Exception, args: Any) -> str:
+    if args is None and "NoneType" in str(error):
+        return " The function seems to need `args`: pass them here too."
+    return ""
 
 
 ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."

@@ -45,8 +45,8 @@ _NUM_STATES = 100
 # roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
 # order one at almost every state.
 _ROUNDOFF = 1e4
-# The distance to another state at which a derivative is looked at too, as a share of each component
-# and of the largest one.
+# The distance to another state at which a derivative is looked at too, as a share of each
+# component.
 _BESIDE = 0.1
 
 
@@ -166,7 +166,7 @@ def check_invariance(
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
         rtol = _ROUNDOFF * float(jnp.finfo(ts.dtype).eps)
-    with one_of(ys, args):
+    with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
     entries = [
         _entry_of_report(name, entry, rtol, *map(np.asarray, measured))

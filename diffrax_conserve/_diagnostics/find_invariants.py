@@ -164,7 +164,7 @@ def find_invariants(
                 f"least {2 * len(names)}: one half to find combinations, one to verify them. Give "
                 "more states, or a smaller `basis`."
             )
-        with one_of(ys, args):
+        with one_of(ys):
             samples = _sampled(functions, vector_field, ts, ys, args, names)
     _check_position(samples, names)
     found = _independent(samples, _combinations(samples))

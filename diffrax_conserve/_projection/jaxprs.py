@@ -2,7 +2,7 @@
 equations, as one would overload operators in Python, and searched for the programs inside. What
 depends on the version of JAX is in this file only."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax.extend.core as jex
@@ -42,7 +42,7 @@ def walk(
 def outputs(eqn: Any, *inputs: Any) -> list[Any]:
     """The values of an equation for given inputs, computed by JAX."""
     given = eqn.primitive.get_bind_params(eqn.params)
-    # Before version 0.9 the functions inside stood apart from the parameters.
+    # Before version 0.10 the functions inside stood apart from the parameters.
     functions, params = given if isinstance(given, tuple) else ((), given)
     outs = eqn.primitive.bind(*functions, *inputs, **params)
     return outs if eqn.primitive.multiple_results else [outs]
@@ -53,7 +53,8 @@ def closed_jaxpr(jaxpr: Any) -> jex.ClosedJaxpr:
     return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
 
 
-def jaxprs_inside(eqn: Any) -> Iterator[jex.ClosedJaxpr]:
+def jaxprs_inside(eqn: Any) -> list[jex.ClosedJaxpr]:
     """The programs that an equation runs, such as the body of a loop."""
     is_jaxpr = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731
-    return map(closed_jaxpr, filter(is_jaxpr, jtu.tree_leaves(eqn.params, is_leaf=is_jaxpr)))
+    found = filter(is_jaxpr, jtu.tree_leaves(eqn.params, is_leaf=is_jaxpr))
+    return [closed_jaxpr(x) for x in found]

@@ -170,7 +170,7 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
         (x,) = outputs(eqn, *inputs)
         return [(changed(x, x), _COMPUTED)]
-    if name in _FUNCTIONS or any(True for _ in jaxprs_inside(eqn)):
+    if name in _FUNCTIONS or jaxprs_inside(eqn):
         inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
     return [(x, kind) for x in outputs(eqn, *inputs)]
 

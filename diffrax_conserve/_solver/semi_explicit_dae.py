@@ -354,7 +354,8 @@ def _algebraic_newton(
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
         settled = better & (now.share == 1) & (then * then <= eps * before) & factored.regular()
-        # If the correction is at most `√ε` and does not help, roundoff keeps it from helping.
+        # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
+        # helping. Whether it is, we ask once, at the end.
         stuck = ~better & (before <= eps**0.5)
         z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)

@@ -18,7 +18,14 @@ from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.rk4 import RK4
-from ._networks.flat import as_states, check_scalars, check_within, flatten, stacked_vectors
+from ._networks.flat import (
+    as_states,
+    check_scalars,
+    check_within,
+    flatten,
+    largest,
+    stacked_vectors,
+)
 from ._networks.flow_map import args_domain_of, as_flow_map, known_args
 from ._solvers.checks import check_output
 from ._solvers.flow_map_solver import FlowMapSolver
@@ -165,7 +172,7 @@ def compare(
     with one_of(states, args):
         check_output(flow_map, (y0, *known, h), y0, "flow_map")
         exact = _exact(term, states, h, args)
-    unit = flatten(jtu.tree_map(lambda u, x: jnp.full(x.shape, u), _units(exact), y0))
+    unit = flatten(jtu.tree_map(lambda ys, y: jnp.full(y.shape, largest(ys)), exact, y0))
 
     def errors(solver: dfx.AbstractSolver, count: int) -> np.ndarray:
         found = _solved(solver, term, states, h, h / count, args)
@@ -225,14 +232,8 @@ def _solved(
 
 @eqx.filter_jit
 def _exact(term: Any, y0s: Any, h: Array, args: Args) -> Any:
-    units = _units(y0s)
+    units = jtu.tree_map(largest, y0s)
     return jax.vmap(lambda y0: _reference(term, y0, h, args, units))(y0s)
-
-
-def _units(ys: Any) -> Any:
-    """The largest component of each leaf, or 1 if all are zero."""
-    sizes = jtu.tree_map(lambda x: jnp.max(jnp.abs(x), initial=0), ys)
-    return jtu.tree_map(lambda size: jnp.where(size > 0, size, 1), sizes)
 
 
 def _reference(term: Any, y0: Any, h: Array, args: Args, units: Any) -> Any:
@@ -254,7 +255,7 @@ def _reference(term: Any, y0: Any, h: Array, args: Args, units: Any) -> Any:
 @eqx.filter_jit
 def _jacobians(flow_map: Any, term: Any, y0s: Any, h: Array, args: Args) -> tuple[Array, Array]:
     vector, restore = ravel_pytree(args)
-    flat, units = lambda y: ravel_pytree(y)[0], _units(y0s)
+    flat, units = lambda y: ravel_pytree(y)[0], jtu.tree_map(largest, y0s)
 
     def both(y0: Any) -> tuple[Array, Array]:
         learned = lambda a: flat(flow_map(y0, *known_args(flow_map, restore(a)), h))  # noqa: E731

@@ -71,6 +71,12 @@ def check_one(name: str, value: Any, function: str) -> None:
         )
 
 
+def largest(leaf: Array) -> Float[Array, ""]:
+    """The size of the largest component of a leaf, or 1 if all are zero."""
+    size = jnp.max(jnp.abs(leaf), initial=0)
+    return jnp.where(size > 0, size, 1)
+
+
 def as_state(y: PyTree[Shaped[ArrayLike, "..."]]) -> PyTree[Float[Array, "..."]]:
     """`y` with arrays as leaves; raises unless they are real and floating-point."""
     leaves = jtu.tree_leaves(y)

@@ -22,6 +22,7 @@ from .flat import (
     check_scalars,
     check_within,
     flatten,
+    largest,
     stacked_vectors,
     working_dtype,
 )
@@ -242,5 +243,4 @@ PINN.__init__.__doc__ = r"""**Arguments:**
 
 
 def _magnitude(leaf: Array) -> Array:
-    largest = jnp.max(jnp.abs(leaf)) if leaf.size else jnp.ones((), leaf.dtype)
-    return jnp.broadcast_to(jnp.where(largest > 0, largest, 1), leaf.shape)
+    return jnp.broadcast_to(largest(leaf), leaf.shape)

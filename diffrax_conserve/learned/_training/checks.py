@@ -32,6 +32,10 @@ from .objective import Problem, VectorField
 from .recipe import Recipe, second_order
 from .state import FitState
 
+# The derivative of a first integral, relative to its terms, is roundoff. Single precision has much
+# of it at rest, where these terms are small.
+_CONSERVED = 1e-2
+
 
 def check_types(key: Any, recipe: Any, state: Any, progress: Any, **limits: Any) -> None:
     """Raises unless these arguments of `fit` are of the right types, and the limits positive."""
@@ -220,11 +224,6 @@ def _check_layer(network: Any, problem: Problem, starts: Points) -> None:
                 "solution. Check both, and the `args` of the layer, by `check_invariance`.",
                 stacklevel=4,
             )
-
-
-# The derivative of a first integral, relative to its terms, is roundoff. Single precision has much
-# of it at rest, where these terms are small.
-_CONSERVED = 1e-2
 
 
 @eqx.filter_jit
