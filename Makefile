@@ -8,6 +8,9 @@ WORKERS ?= 2
 BIN := $(VENV)/bin
 export JAX_PLATFORMS ?= cpu
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Images of containers often forbid Python to keep what it compiled. Then each process compiles all
+# of JAX anew, which takes 4 s, and there are a hundred.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 # Two targets would run pip in the same environment.

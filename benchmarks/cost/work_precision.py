@@ -50,8 +50,8 @@ SMOKE = Settings(
     rounds=1,
     tolerances=(1e-6, 1e-10),
     batch_tolerances=(1e-8, 1e-10),
-    trajectories=16,
-    lanes=8,
+    trajectories=4,
+    lanes=2,
 )
 
 
