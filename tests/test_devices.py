@@ -120,6 +120,7 @@ def test_a_batch_over_eight_devices_is_the_batch_on_one():
     assert found == {"equal": True, "devices": 8, "all-reduces": 0}
 
 
+@pytest.mark.slow
 def test_a_training_over_two_devices_is_that_on_one():
     alone, spread, devices, refused = answer(start(2, "train_over_two_devices"))
     assert devices == 2

@@ -6,11 +6,16 @@ from collections.abc import Callable, Iterable
 import pytest
 
 
-def some_of(arguments: str, cases: Iterable, *, ids: Iterable[str], period: int) -> Callable:
+def some_of(
+    arguments: str, cases: Iterable, *, ids: Iterable[str] | None = None, period: int
+) -> Callable:
     """Parametrises a test by all `cases`; one in `period` runs by default, others for each test.
 
     Which ones follows from the name of the test, so that several laws reach all cases together.
     """
+
+    cases = list(cases)
+    ids = map(str, cases) if ids is None else ids
 
     def decorate(test: Callable) -> Callable:
         first = zlib.crc32(test.__name__.encode()) % period

@@ -5,13 +5,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 
 from ..problems import RIGID_BODY, rigid_body, solve
+from ..thinned import some_of
 
 EPS = float(np.finfo(float).eps)
 # Of implicit methods, which keep their last stage, lanes depend on each other within the tolerance.
@@ -64,7 +64,7 @@ def check(solver, controller, y0, kinds, dt0):
     return rejected
 
 
-@pytest.mark.parametrize("solver", ADAPTIVE, ids=lambda x: type(x).__name__)
+@some_of("solver", ADAPTIVE, ids=[type(x).__name__ for x in ADAPTIVE], period=2)
 @given(
     kinds=st.permutations([*KINDS, GOOD]),
     y0=st.lists(st.floats(0.8, 1.6), min_size=15, max_size=15),

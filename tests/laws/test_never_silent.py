@@ -16,6 +16,7 @@ from hypothesis import example, given
 import diffrax_conserve as dfc
 
 from ..problems import KEPLER, kepler, solve
+from ..thinned import some_of
 
 PROJECTIONS = {
     "simplified": dfc.SimplifiedNewton(),
@@ -47,11 +48,11 @@ def projected(projection, y, value, args):
     return found, info.result == optx.RESULTS.successful, info.ok
 
 
+EACH = [(name, dtype) for dtype in (np.float64, np.float32) for name in PROJECTIONS]
 coordinates = st.floats(-3, 3, allow_nan=False).map(lambda x: round(x, 6))
 
 
-@pytest.mark.parametrize("name", PROJECTIONS)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@some_of("name, dtype", EACH, ids=[f"{name}-{dtype.__name__}" for name, dtype in EACH], period=2)
 @given(
     state=st.tuples(coordinates, coordinates, coordinates),
     direction=st.tuples(coordinates, coordinates, coordinates),
@@ -112,7 +113,7 @@ def test_the_roundoff_that_counts_is_that_at_the_result(name):
     assert np.all(off[ok] <= 64), (np.max(off[ok]), np.sum(off[ok] > 64))
 
 
-@pytest.mark.parametrize("factor", [5.97e24, 1e-27])
+@some_of("factor", [5.97e24, 1e-27], period=2)
 @given(st.tuples(*[st.floats(-1, 1)] * 2), st.floats(0.5, 2))
 def test_units_do_not_matter_in_single_precision(factor, displacement, size):
     """The energy of a planet in joules, or of an atom: squares of its gradient overflow, or vanish,

@@ -12,11 +12,12 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..problems import solve as one_solve
+from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
-BOTH = pytest.mark.parametrize(
-    "kind", [dfc.SimplifiedNewton, dfc.Newton], ids=["simplified", "newton"]
-)
+KINDS = {"simplified": dfc.SimplifiedNewton, "newton": dfc.Newton}
+BOTH = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+ONE_OF_BOTH = some_of("kind", KINDS.values(), ids=KINDS, period=2)
 BALANCES = dfc.FirstIntegral(lambda t, y, args: args @ y)
 
 
@@ -67,7 +68,7 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
-@BOTH
+@ONE_OF_BOTH
 def test_units_of_constraints_do_not_matter_in_single_precision(kind):
     atoms, values, candidates = (
         x.astype("float32") for x in chemistry(np.random.default_rng(2), MANY)
@@ -109,7 +110,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind):
     assert jnp.quantile(residual, 0.999) <= 4 * EPS
 
 
-@BOTH
+@ONE_OF_BOTH
 def test_derivatives_are_those_of_differences(kind):
     """With a component at each bound, in a metric, and through both."""
     projection = kind(lower=(0.0, jnp.array([0.0, -9.0])), upper=(1.0, jnp.array([9.0, 0.25])))
@@ -125,7 +126,7 @@ def test_derivatives_are_those_of_differences(kind):
     dct.assert_gradients(fn, x, rtol=1e-7)
 
 
-@BOTH
+@ONE_OF_BOTH
 def test_what_cannot_be_fails(kind):
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
     y = jnp.array([0.3, -0.2, 0.5])

@@ -11,6 +11,8 @@ from jaxtyping import Array
 
 import diffrax_conserve as dfc
 
+from ..thinned import some_of
+
 RNG = np.random.default_rng(0)
 FACTOR = RNG.normal(size=(4, 4)) + 3 * np.eye(4)
 MATRIX = FACTOR @ FACTOR.T
@@ -21,7 +23,7 @@ BOTH = {
 START = jnp.array([0.6, -0.8]), jnp.array([0.9, 0.4, -0.3, 0.7])
 
 
-@pytest.mark.parametrize("method", [dfc.SimplifiedNewton, dfc.Newton])
+@some_of("method", [dfc.SimplifiedNewton, dfc.Newton], ids=["SimplifiedNewton", "Newton"], period=2)
 def test_a_matrix_is_the_euclidean_metric_in_other_coordinates(method: Any):
     """With `M = L Lᵀ` the nearest point is Euclidean in `z = Lᵀ v`, and its derivatives follow."""
     there = lambda v: v @ FACTOR  # noqa: E731
@@ -40,7 +42,7 @@ def test_a_matrix_is_the_euclidean_metric_in_other_coordinates(method: Any):
         (_, z), info = dfc.project(other, y, projection=method(metric=(2.0, 1.0)))
         return jnp.where(info.ok, back(z), jnp.nan)
 
-    for found in (lambda fn: fn(START[1]), lambda fn: jax.jacrev(fn)(START[1])):
+    for found in (lambda fn: jax.jit(fn)(START[1]), lambda fn: jax.jit(jax.jacrev(fn))(START[1])):
         np.testing.assert_allclose(found(by_matrix), found(by_coordinates), atol=1e-11)
 
 

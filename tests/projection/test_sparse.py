@@ -17,6 +17,8 @@ from diffrax_conserve._projection import sparse
 from diffrax_conserve._projection.elimination import combined, gram_matrix, gram_solve, times
 from diffrax_conserve._projection.equations import Equations, equations_of
 
+from ..thinned import some_of
+
 NUM = 40
 
 
@@ -51,7 +53,7 @@ MOMENTUM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y, axis=0))
 CASES = [*((name, jnp.float64) for name in MANIFOLDS), ("triangles", jnp.float32)]
 
 
-@pytest.mark.parametrize(("name", "dtype"), CASES)
+@some_of("name, dtype", CASES, period=2)
 def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: Any):
     """With an energy and a momentum beside the sparse rows, and in units of its own for each
     component, for a symmetric matrix and for one that is not."""
@@ -101,7 +103,7 @@ def _walk(name: str) -> tuple[Any, Array, Any]:
     return {"many": at(entry.fn), "z": at(ENERGY.fn)}, y, 1e-3 * jr.normal(key[1], y.shape)
 
 
-@pytest.mark.parametrize("name", ["spins", "ring", "lattice"])
+@pytest.mark.parametrize("name", ["spins", "lattice", pytest.param("ring", marks=pytest.mark.slow)])
 def test_derivatives_are_those_by_differences(name: str):
     """Of a projection, in both modes: blocks, coupled blocks, and an iteration."""
     manifold, y, change = _walk(name)

@@ -12,6 +12,7 @@ import diffrax_conserve.testing as dct
 
 from .. import problems
 from ..problems import drift_of, evaluated, largest
+from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
 
@@ -120,7 +121,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     assert gained == pytest.approx(lost, rel=1e-2)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+@some_of("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"], period=2)
 def test_a_damped_system_comes_to_rest(dtype):
     """The roundoff of a long sum would keep the energy from its least value."""
     options = dict(saveat=dfx.SaveAt(t1=True), t1=60.0, dt0=0.04, max_steps=None, throw=False)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 
 from ..learned import EAST, Scale, oscillator
+from ..thinned import some_of
 
 KEY = jr.key(5)
 Y0S = 2 * jr.normal(jr.key(1), (40, 2))
@@ -100,7 +101,7 @@ def test_data_that_make_no_sense(options, error, match):
         dfc.fit(network(), key=KEY, **options)
 
 
-@pytest.mark.parametrize("exponent", [0.1, 0.5, 0.75])
+@some_of("exponent", [0.1, 0.5, 0.75], period=3)
 def test_exact_zeros_train_in_box_cox_coordinates(exponent):
     ts = jnp.broadcast_to(jnp.linspace(0, 2, 9), (40, 9))
     ys = jnp.exp(Y0S)[:, None] * jnp.exp(-ts[..., None] * jnp.array([1.0, 3.0]))
