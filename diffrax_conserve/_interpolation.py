@@ -27,7 +27,7 @@ from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import has_bounds
 from ._projection.descent import descend
 from ._projection.equations import any_lane, length
-from ._projection.within_bounds import AbstractNewton
+from ._projection.within_bounds import AbstractNewton, nearest_within
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
 
 # The second attempt at a projection makes at most this many damped steps, as many as `Newton` by
@@ -60,7 +60,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
     a step is. Where that fails, damped steps with fresh gradients are tried from the same state.
     Where they fail too, or lead further away than the step is long, the value is the moved
-    interpolant itself, which is off the manifold by the error of the interpolation.
+    interpolant itself, which is off the manifold by the error of the interpolation. Of a projection
+    with bounds it is the nearest value within them, because an interpolant can meet a balance, and
+    so look like a success, with a concentration that is negative.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
 
@@ -138,7 +140,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         attempts = [project, damped] if damps else [project]
         # `_first_of` has a derivative rule too, so its functions are converted likewise.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
-        y, _ = _first_of(attempts, vector)
+        y, failed = _first_of(attempts, vector)
+        within = nearest_within(target.projection, problem.like, y)
+        y = jnp.where(failed < len(attempts), y, within)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 

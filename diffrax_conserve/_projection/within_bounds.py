@@ -166,6 +166,17 @@ class AbstractNewton(AbstractProjection):
         return Box(spread("lower", low, like), spread("upper", high, like))
 
 
+def nearest_within(
+    projection: AbstractProjection, like: Any, y: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """The nearest vector to `y` within the bounds of a projection, or of all of its stages."""
+    parts = jtu.tree_leaves(projection, is_leaf=lambda x: isinstance(x, AbstractNewton))
+    for part in parts:
+        box = part.box(like) if isinstance(part, AbstractNewton) else None
+        y = y if box is None else box.clip(y)
+    return y
+
+
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
     """Raises if a lower bound is above its upper bound, as far as both are known and have the same
     structure. If one is a tracer, `Box.clip` returns NaN instead."""

@@ -161,3 +161,21 @@ def test_a_solve_stays_within_the_bounds_between_its_steps_too():
     assert jnp.min(solve()) < -0.1
     assert jnp.min(kept) >= 0
     assert jnp.max(jnp.abs(jnp.sum(kept, 1) - 1)) < 4e-15
+
+
+@pytest.mark.parametrize(
+    "projection",
+    [dfc.SimplifiedNewton(lower=0.0), dfc.Staged(("total", dfc.SimplifiedNewton(lower=0.0)))],
+    ids=["joint", "staged"],
+)
+def test_a_saved_state_that_cannot_be_projected_is_within_the_bounds_and_told(projection):
+    # In such a long step the interpolant of Tsit5 has the right total, and amounts far below zero.
+    total = {"total": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))}
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), total, projection=projection)
+    saveat, y0 = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 0.12, 12)), jnp.array([1.0, 0.0])
+    field = lambda t, y, args: jnp.stack([-30 * y[0], 30 * y[0]])  # noqa: E731
+    solution = one_solve(field, solver, y0, t1=0.12, dt0=0.12, saveat=saveat)
+    assert jnp.min(solution.ys) >= 0
+    wrong = jnp.abs(jnp.sum(solution.ys, axis=1) - 1) > 1e-6
+    assert jnp.any(wrong)
+    assert jnp.array_equal(wrong, dfc.off_manifold(solution, total))
