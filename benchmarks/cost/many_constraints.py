@@ -285,7 +285,8 @@ def main(argv=None):
     cases += [
         (f"chain, lengths of {n} bonds", chain_vector_field, bonds, chain(n), 1e-3) for n in large
     ]
-    cases += [(f"{n} spins", spin_vector_field, SPINS, spins(n), 2e-2) for n in large]
+    most = large if options.smoke else [*large, 1_000_000]
+    cases += [(f"{n} spins", spin_vector_field, SPINS, spins(n), 2e-2) for n in most]
     cases += [
         (f"{n} molecules", molecule_vector_field, MOLECULES, molecules(n), 1e-2) for n in large
     ]
