@@ -240,8 +240,13 @@ def _onto_simplex(w: Float[Array, "*batch n"], least: float) -> tuple[Array, Arr
     If the `k` largest are above the bound, `Σ_k w - k μ + (n - k) least = 1` determines `μ`. We
     compute it for every `k`, and take the largest `k` for which the `k`-th one is above the bound
     (Smolin, Gambetta and Smith).
+
+    A shift of all eigenvalues shifts `μ` alike. So we measure them from the largest: those that
+    stay above the bound are then between -1 and 0, and their sum is one to roundoff, however large
+    the matrix was.
     """
     n = w.shape[-1]
+    w = w - w[..., -1:]
     descending = w[..., ::-1]
     counts = jnp.arange(1, n + 1, dtype=w.dtype)
     mu = (jnp.cumsum(descending, axis=-1) - 1 + (n - counts) * least) / counts

@@ -7,7 +7,7 @@ from typing import ClassVar, final
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .implicit import project_along
@@ -33,6 +33,12 @@ class AbstractAlongLine(AbstractProjection):
     def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The vector `w`."""
 
+    @abc.abstractmethod
+    def is_wanted(
+        self, problem: Problem, candidate: Float[Array, " n"], y: Float[Array, " n"]
+    ) -> Bool[Array, ""] | bool:
+        """Whether a state of the manifold on this line is the one that is sought."""
+
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
@@ -48,7 +54,8 @@ class AbstractAlongLine(AbstractProjection):
         equations = dataclasses.replace(problem.equations, units=jnp.abs(direction))
         signs = lax.stop_gradient(jnp.sign(direction))[None]
         y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
-        return y, problem.report(candidate, y, count, ok=ok)
+        wanted = self.is_wanted(problem, candidate, y)
+        return y, problem.report(candidate, y, count, ok=ok & wanted)
 
 
 @final
@@ -97,6 +104,12 @@ class Directional(AbstractAlongLine):
                 "`diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
         return error
+
+    def is_wanted(
+        self, problem: Problem, candidate: Float[Array, " n"], y: Float[Array, " n"]
+    ) -> bool:
+        del problem, candidate, y
+        return True
 
 
 Directional.__init__.__doc__ = """**Arguments:**

@@ -9,6 +9,7 @@ correction needs the direction in which they differ: a truncated singular value 
 would drop this direction, makes Newton's method stall.
 """
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any
 
@@ -38,8 +39,9 @@ _ADDED = 16
 # what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit, of
 # which five are independent, does not converge.
 _ADDED_POWER = 3 / 4
-# So many steps of iterative refinement remove from a solution the error that the addition causes.
-# Each multiplies it by what was added, divided by the smallest eigenvalue of the scaled matrix.
+# So many solves, all but the first for what is left of the right side, remove from a solution the
+# error that the addition causes. Each multiplies it by what was added, divided by the smallest
+# eigenvalue of the scaled matrix.
 _REFINEMENTS = 3
 
 
@@ -69,7 +71,7 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 def gram_solve(gram: Any, b: Array, noise: Array | None = None) -> Array:
     """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
     if isinstance(gram, BlockGram):
-        return gram.factored()(b)
+        return _refined(gram.factored(), gram.times, b)
     return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), noise))
 
 
@@ -90,7 +92,7 @@ def eliminated(
     second the rows themselves.
     """
     if isinstance(gram, BlockGram):
-        return gram.factored()(b), rows
+        return gram_solve(gram, b), rows
     m, dtype = len(gram), gram.dtype
     if m > WRITTEN_OUT_MAX:
         # The rows and columns are scaled such that the diagonal is one.
@@ -98,9 +100,8 @@ def eliminated(
         unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
         scaled = gram * unit[:, None] * unit
         right = (b * unit).astype(added.dtype)
-        lu, x = jsp.linalg.lu_factor(scaled + added), jnp.zeros_like(right)
-        for _ in range(_REFINEMENTS):
-            x = x + jsp.linalg.lu_solve(lu, right - combined(x, scaled.T))
+        lu = jsp.linalg.lu_factor(scaled + added)
+        x = _refined(ft.partial(jsp.linalg.lu_solve, lu), lambda x: combined(x, scaled.T), right)
         return x.astype(dtype) * unit, rows
     least = _LEAST_PIVOT * m * float(jnp.finfo(dtype).eps)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
@@ -139,6 +140,17 @@ def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
     one = jnp.eye(len(gram), dtype=added.dtype)
     inverse = jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
     return lambda g: combined(combined(g.astype(inverse.dtype), inverse.T), inverse).astype(g.dtype)
+
+
+def _refined(
+    solve: Callable[[Array], Array], product: Callable[[Array], Array], b: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """The solution of `product(x) = b` by iterative refinement, from a `solve` that is inaccurate,
+    because something was added to the matrix."""
+    x = solve(b)
+    for _ in range(_REFINEMENTS - 1):
+        x = x + solve(b - product(x))
+    return x
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:

@@ -2,7 +2,8 @@
 
 from typing import ClassVar, final
 
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from .base import Problem
 from .directional import AbstractAlongLine
@@ -24,8 +25,10 @@ class Relaxation(AbstractAlongLine):
     of diffrax.
 
     The projection fails where the integral does not change along the step, as at a candidate on a
-    chord of a level set that is straight. At saved times inside a step and in dense output
-    $\hat y$ is the dense output. Derivatives follow from the implicit function theorem.
+    chord of a level set that is straight, and where there is no solution but $\gamma = 0$, the
+    start of the step: so with Euler's method, which moves along a tangent of the level set, and
+    with a quantity that is not conserved, in short steps. At saved times inside a step and in dense
+    output $\hat y$ is the dense output. Derivatives follow from the implicit function theorem.
 
     !!! example
 
@@ -56,6 +59,18 @@ class Relaxation(AbstractAlongLine):
                 "`projection=Newton()`."
             )
         return candidate - problem.step.y0
+
+    def is_wanted(
+        self, problem: Problem, candidate: Float[Array, " n"], y: Float[Array, " n"]
+    ) -> Bool[Array, ""]:
+        """The start of the step is on the line and on the manifold. It is no solution: time would
+        stand still. So the end of a step must be at least as near to the candidate as to the start,
+        which is `γ ≥ 1/2`. Every component tells, so the largest differences will do, in any units.
+        A saved time just after the start is another matter: there the way is as short as its error.
+        """
+        assert problem.step is not None
+        far = lambda x: jnp.max(jnp.abs(y - x), initial=0)  # noqa: E731
+        return (far(candidate) <= far(problem.step.y0)) | (problem.t != problem.step.t1)
 
 
 Relaxation.__init__.__doc__ = """**Arguments:**

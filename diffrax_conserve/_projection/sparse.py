@@ -45,10 +45,12 @@ _DENSE_ROWS_MAX = 16
 # Larger blocks are replaced by an iteration: the work for a row grows with the square of the size
 # of its block, and compile time with the size, because a block is eliminated element by element.
 _BLOCK_MAX = 16
-# As in `elimination`: so many units of roundoff, times the root of the size of a block, are added
-# to the diagonal of the Gram matrix, as a share of it, so that a factor exists where constraints
-# depend on each other.
-_ADDED = 16
+# This power of roundoff, times the root of the size of a block, is added to the diagonal of the
+# Gram matrix, as a share of it, so that an inverse exists where constraints depend on each other.
+# As in `elimination` it is far above roundoff: the elements of the inverse are as large as one over
+# what is added, and their roundoff is an error of all multipliers. What the addition itself changes
+# is removed by the iterations, or by refinement.
+_ADDED_POWER = 3 / 4
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
 
@@ -402,12 +404,25 @@ class BlockGram(eqx.Module):
     def __len__(self) -> int:
         return self.pattern.size
 
+    def times(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+        """`U Vᵀ x`."""
+        if self.factors is not None:
+            left, right = self.factors
+            return left.times(right.combined(x))
+        blocks, dense = self.pattern.taken_apart(x)
+        products = _times(self.diagonal, blocks) + self.columns @ dense
+        if self.following is not None and self.preceding is not None:
+            products = products.at[:-1].add(_times(self.following[:-1], blocks[1:]))
+            products = products.at[1:].add(_times(self.preceding[:-1], blocks[:-1]))
+        below = jnp.einsum("dij,ij->d", self.rows, blocks) + self.corner @ dense
+        return self.pattern.joined(products, below)
+
     def factored(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
         """The solution of the system, as a function of its right side. Dense rows are eliminated
         last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
-        added = _ADDED * block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps)
+        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** _ADDED_POWER
         # A diagonal element is zero for padding, and for a constraint without a gradient. With a
         # one in its place the multiplier of such a row is its right side.
         unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)

@@ -74,6 +74,13 @@ def test_the_nearest_density_matrix_against_a_minimiser():
     np.testing.assert_allclose(jnp.sum(jnp.abs(project(x) - x) ** 2), least, rtol=1e-9)
 
 
+def test_large_matrices_have_positive_density_matrices_too():
+    project, _ = FORMULAS["density"]
+    y = project(1e4 * matrices(jr.key(6), 50, 8, 8, kind=complex))
+    assert np.min(np.linalg.eigvalsh(y)) > 0
+    np.testing.assert_allclose(project(y), y, atol=8 * EPS)
+
+
 def lindblad(hamiltonian, decays):
     def field(t, rho, args):
         h = hamiltonian(t)

@@ -135,6 +135,23 @@ def test_many_dependent_constraints():
     assert jnp.max(jnp.abs(end - once)) < 1e-13
 
 
+def test_constraints_given_twice_change_no_derivative_and_no_force():
+    y = jr.normal(jr.key(0), (40, 3))
+    y = y / jnp.linalg.norm(y, axis=1, keepdims=True)
+    lengths = dfc.Constraint(lambda t, y, args: jnp.sum(y**2, axis=1) - 1)
+    weights = jnp.cos(jnp.arange(120.0)).reshape(40, 3)
+
+    def found(manifold):
+        projection = dfc.SimplifiedNewton()
+        total = lambda y: jnp.sum(weights * dfc.project(manifold, y, projection=projection)[0])  # noqa: E731
+        field = dfc.tangent(lambda t, y, args: weights, manifold)
+        return jax.grad(total)(1.01 * y), field(0.0, y, None)
+
+    once, twice = eqx.filter_jit(found)(lengths), eqx.filter_jit(found)([lengths, lengths])
+    for a, b in zip(once, twice, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-11)
+
+
 def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
     """The text of both is the same."""
 

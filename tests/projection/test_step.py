@@ -71,6 +71,19 @@ def test_derivatives_of_relaxation_agree_with_differences():
     np.testing.assert_allclose(gradient, np.subtract(ends[:2], ends[2:]) / 2e-5, rtol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("inner", "friction"), [(dfx.Euler(), 0.0), (dfx.Heun(), 0.3)], ids=["tangent", "not conserved"]
+)
+def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
+    """There all is conserved, but time stands still."""
+    square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(inner, square, projection=dfc.Relaxation())
+    term = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -y[0] - friction * y[1]]))
+    y0 = jnp.array([0.3, 0.7])
+    sol = dfx.diffeqsolve(term, solver, 0.0, 2.0, 0.1, y0, throw=False)
+    assert "was not reached" in dfx.RESULTS[sol.result]
+
+
 def test_relaxation_is_refused_without_a_step_and_with_two_integrals():
     with pytest.raises(ValueError, match="there is none outside a solve"):
         dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=dfc.Relaxation())
