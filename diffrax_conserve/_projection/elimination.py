@@ -127,18 +127,28 @@ def eliminated(
 
 
 def factored(gram: Any, sizes: Float[Array, " m"]) -> Callable[[Array], Array]:
-    """`S⁻¹ gram⁻¹ S⁻¹ g` as a function of `g`, for the diagonal matrix `S` of `sizes`.
-
-    We invert the triangle of `gram = L Lᵀ` once, and store `L⁻¹ S⁻¹`. Each solve is then two
-    products with a matrix, which are faster than two substitutions, in a batch above all.
-    """
+    """`S⁻¹ gram⁻¹ S⁻¹ g` as a function of `g`, for the diagonal matrix `S` of `sizes`."""
     if isinstance(gram, BlockGram):
         solve = gram.factored()
         return lambda g: solve(g / sizes) / sizes
+    return by_triangle(inverse_triangle(gram, sizes))
+
+
+def inverse_triangle(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, "m m"]:
+    """`L⁻¹ S⁻¹` for `gram = L Lᵀ`, for `by_triangle`. Each solve is then two products with a
+    matrix, which are faster than two substitutions, in a batch above all.
+
+    We do not multiply the two: where constraints depend on each other, the elements of the inverse
+    are as large as one over what is added to the diagonal, and those of its triangle only as large
+    as the root of that. So the roundoff of the product would spoil what the constraints determine.
+    """
     added = _added(gram, _ADDED_POWER) * jnp.where(gram > 0, gram, 1)
     lower = lax.linalg.cholesky(gram + added, symmetrize_input=False)
     one = jnp.eye(len(gram), dtype=added.dtype)
-    inverse = jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
+    return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
+
+
+def by_triangle(inverse: Float[Array, "m m"]) -> Callable[[Array], Array]:
     return lambda g: combined(combined(g.astype(inverse.dtype), inverse.T), inverse).astype(g.dtype)
 
 

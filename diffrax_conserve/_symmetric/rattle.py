@@ -28,11 +28,12 @@ from .._projection.base import Target
 from .._projection.chord import after_test, counter
 from .._projection.elimination import (
     WRITTEN_OUT_MAX,
+    by_triangle,
     combined,
     eliminated,
-    factored,
     gram_matrix,
     gram_solve,
+    inverse_triangle,
     times,
 )
 from .._projection.equations import ON, Equations, Jacobian, any_lane, length, shown_terms
@@ -49,17 +50,20 @@ from .shorter_step import ShorterStep, StepOf, root
 # For up to this many coordinates, sums over them are written out, so that XLA fuses them. Compile
 # time grows with their number; the number is a choice.
 _WRITTEN_OUT_COLUMNS = 32
-# The linear system for the velocities is solved this many times: once, and once more for what is
-# left, which is the roundoff of the first solution.
-_SOLVES = 2
+# The linear system for the velocities is solved this many times: once, and then for what is left.
+# Where constraints depend on each other, a solve leaves up to the fourth root of roundoff, because
+# the inverse is as large as one over what was added to the matrix. Otherwise two would do, and the
+# time of a step is the same.
+_SOLVES = 4
 
 
 class _Linear(eqx.Module):
     """The constraints at one position.
 
     - `jacobian`: `G`.
-    - `inverse`: the inverse of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By
-      it both the velocities at this position and the positions of the next step are found.
+    - `inverse`: the inverse of `G M⁻¹ Gᵀ`, from five constraints on its triangle, or, with many
+      constraints, the blocks of that matrix. By it both the velocities at this position and the
+      positions of the next step are found.
     """
 
     jacobian: Jacobian
@@ -70,6 +74,8 @@ class _Linear(eqx.Module):
         inverse = lax.stop_gradient(self.inverse)
         if isinstance(inverse, BlockGram):
             return inverse.factored()
+        if len(inverse) > WRITTEN_OUT_MAX:
+            return by_triangle(inverse)
         return lambda x: _combined(x, inverse)
 
 
@@ -358,12 +364,12 @@ broadcast, the state is no pair of positions and velocities that are alike, or a
 
 
 def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse of a Gram matrix. If constraints depend on each other, it does not exist, and
-    what is returned solves consistent systems with small multipliers."""
+    """The inverse of a Gram matrix, or its triangle. If constraints depend on each other, it does
+    not exist, and what is returned solves consistent systems with small multipliers."""
     sizes = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1))
     unit = gram / sizes[:, None] / sizes
     if len(gram) > WRITTEN_OUT_MAX:
-        return jax.vmap(factored(unit, sizes))(jnp.eye(len(gram), dtype=gram.dtype))
+        return inverse_triangle(unit, sizes)
     one = jnp.eye(len(gram), dtype=gram.dtype)
     left, right = eliminated(unit, one, one)
     return jnp.sum(right[:, :, None] * left[:, None, :], axis=0) / sizes[:, None] / sizes

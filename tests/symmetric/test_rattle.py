@@ -209,6 +209,19 @@ def test_derivatives_in_both_modes_against_finite_differences():
     assert abs(reverse - forward(at)[1]) < 1e-11
 
 
+@pytest.mark.parametrize("beads", [3, 20])
+def test_constraints_given_twice_change_nothing(beads):
+    """In a dense matrix, and in blocks."""
+    angles = 0.3 * jnp.arange(1.0, beads + 1)
+    q = jnp.cumsum(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=0)
+    pair, y0, rod = terms(fall), (q, 0 * q), dfc.Constraint(rods)
+    found = [
+        final(solve(pair, dfc.RATTLE(constraint, 1.0), y0, 0.0, 0.2, 0.01))
+        for constraint in (rod, [rod, rod])
+    ]
+    assert difference(*found) < 1e-13
+
+
 def test_a_lane_is_that_lane_alone_and_float32_works():
     speeds = jnp.array([0.0, 0.5, -1.0])
 
