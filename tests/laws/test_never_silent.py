@@ -48,11 +48,11 @@ def projected(projection, y, value, args):
     return found, info.result == optx.RESULTS.successful, info.ok
 
 
-EACH = [(name, dtype) for dtype in (np.float64, np.float32) for name in PROJECTIONS]
 coordinates = st.floats(-3, 3, allow_nan=False).map(lambda x: round(x, 6))
 
 
-@some_of("name, dtype", EACH, ids=[f"{name}-{dtype.__name__}" for name, dtype in EACH], period=2)
+@pytest.mark.parametrize("name", PROJECTIONS)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @given(
     state=st.tuples(coordinates, coordinates, coordinates),
     direction=st.tuples(coordinates, coordinates, coordinates),

@@ -244,8 +244,8 @@ CASES = {
         BOTH,
     ),
     "slow bodies, 1e-3": (slow_bodies, {"tol": 1e-3}, 5, DOUBLE),
-    "slow bodies, 1e-5": (slow_bodies, {"tol": 1e-5}, 5, DOUBLE),
     "elastic walls": (elastic_walls, {}, 3, SINGLE),
+    "slow bodies, 1e-5": (slow_bodies, {"tol": 1e-5}, 5, DOUBLE),
     "steady rotations": (steady_rotations, {}, 7, BOTH),
     "weak waves": (weak_waves, {}, 1, DOUBLE),
 }
