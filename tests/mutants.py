@@ -222,7 +222,7 @@ def trust_every_derivative(package):
     package.function("certain", lambda _: lambda equations, candidate, y, *_: jnp.ones((), y.dtype))
 
 
-@noticed_by("tests/laws/test_never_silent.py", "-k", "no_nan")
+@noticed_by("tests/projection/test_bounds.py", "-k", "cannot_be_projected")
 def return_a_state_that_was_not_projected_as_nan(package):
     module = sys.modules[package.find("ManifoldInterpolation").__module__]
     first_of = module._first_of
