@@ -62,7 +62,10 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     Where they fail too, or lead further away than the step is long, the value is the moved
     interpolant itself, which is off the manifold by the error of the interpolation. Of a projection
     with bounds it is the nearest value within them, because an interpolant can meet a balance, and
-    so look like a success, with a concentration that is negative.
+    so look like a success, with a concentration that is negative. With bounds an interpolant that
+    swings out of them, further than the step is long, may be led back as far as the start of the
+    step is away. That is a state on the manifold and within the bounds, so where these are convex,
+    as for balances that are linear, the nearest such state is never further away.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
 
@@ -119,6 +122,10 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         step = target.step(self.t0, self.t1, start, self.error)
         problem = target.problem(t, candidate, step)
         units, limit = problem.equations.units, lax.stop_gradient(self.limit)
+        bounded = has_bounds(target.projection)
+        if bounded:
+            away = length(ravel(tree_sub(candidate, start())), units)
+            limit = jnp.maximum(limit, lax.stop_gradient(away))
 
         def near(candidate: Array, y: Array, ok: Array) -> tuple[Array, Array]:
             """`y`, and whether it succeeded without leading further away than the step is long."""
@@ -136,7 +143,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # A second attempt by damped steps makes sense only if the projection follows gradients too.
         # The rule of another projection, such as a line, leads elsewhere. And bounds would be lost.
         by_gradients = isinstance(target.projection, AbstractNewton)
-        damps = by_gradients and not has_bounds(target.projection)
+        damps = by_gradients and not bounded
         attempts = [project, damped] if damps else [project]
         # `_first_of` has a derivative rule too, so its functions are converted likewise.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]

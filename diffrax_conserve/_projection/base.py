@@ -199,7 +199,14 @@ def adapted(
 
 
 def has_bounds(projection: AbstractProjection) -> bool:
-    return any(getattr(projection, name, None) is not None for name in ("lower", "upper"))
+    """Whether the projection has bounds, or one of its stages."""
+
+    def is_stage(x: Any) -> bool:
+        return x is not projection and isinstance(x, AbstractProjection)
+
+    own = any(getattr(projection, name, None) is not None for name in ("lower", "upper"))
+    stages = filter(is_stage, jtu.tree_leaves(projection, is_leaf=is_stage))
+    return own or any(map(has_bounds, stages))
 
 
 def check_projection(projection: Any) -> None:

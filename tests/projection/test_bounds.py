@@ -163,19 +163,41 @@ def test_a_solve_stays_within_the_bounds_between_its_steps_too():
     assert jnp.max(jnp.abs(jnp.sum(kept, 1) - 1)) < 4e-15
 
 
-@pytest.mark.parametrize(
-    "projection",
-    [dfc.SimplifiedNewton(lower=0.0), dfc.Staged(("total", dfc.SimplifiedNewton(lower=0.0)))],
-    ids=["joint", "staged"],
-)
-def test_a_saved_state_that_cannot_be_projected_is_within_the_bounds_and_told(projection):
-    # In such a long step the interpolant of Tsit5 has the right total, and amounts far below zero.
-    total = {"total": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))}
-    solver = dfc.ManifoldProjection(dfx.Tsit5(), total, projection=projection)
+def saved_in_a_long_step(total, projection):
+    """In such a long step the interpolant of Tsit5 has the total 1, and amounts far below zero."""
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), {"total": total}, projection=projection)
     saveat, y0 = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 0.12, 12)), jnp.array([1.0, 0.0])
     field = lambda t, y, args: jnp.stack([-30 * y[0], 30 * y[0]])  # noqa: E731
     solution = one_solve(field, solver, y0, t1=0.12, dt0=0.12, saveat=saveat)
     assert jnp.min(solution.ys) >= 0
-    wrong = jnp.abs(jnp.sum(solution.ys, axis=1) - 1) > 1e-6
+    return solution, dfc.off_manifold(solution, {"total": total})
+
+
+BOUNDED = pytest.mark.parametrize(
+    "projection",
+    [
+        dfc.SimplifiedNewton(lower=0.0),
+        dfc.Newton(lower=0.0),
+        dfc.Staged(("total", dfc.SimplifiedNewton(lower=0.0))),
+    ],
+    ids=["simplified", "newton", "staged"],
+)
+
+
+@BOUNDED
+def test_saved_states_of_a_very_long_step_keep_the_total_within_the_bounds(projection):
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
+    solution, off = saved_in_a_long_step(total, projection)
+    assert jnp.max(jnp.abs(jnp.sum(solution.ys, axis=1) - 1)) < 4e-15
+    assert not jnp.any(off)
+
+
+@BOUNDED
+def test_a_saved_state_that_cannot_be_projected_is_within_the_bounds_and_told(projection):
+    # In the middle of the step the total shall be negative, which no state within the bounds has.
+    wanted = lambda t: jnp.cos(2 * jnp.pi * t / 0.12)  # noqa: E731
+    total = dfc.Constraint(lambda t, y, args: jnp.sum(y) - wanted(t))
+    solution, off = saved_in_a_long_step(total, projection)
+    wrong = jnp.abs(jnp.sum(solution.ys, axis=1) - wanted(solution.ts)) > 1e-6
     assert jnp.any(wrong)
-    assert jnp.array_equal(wrong, dfc.off_manifold(solution, total))
+    assert jnp.array_equal(wrong, off)
