@@ -25,10 +25,11 @@ class Relaxation(AbstractAlongLine):
     of diffrax.
 
     The projection fails where the integral does not change along the step, as at a candidate on a
-    chord of a level set that is straight, and where there is no solution but $\gamma = 0$, the
-    start of the step: so with Euler's method, which moves along a tangent of the level set, and
-    with a quantity that is not conserved, in short steps. At saved times inside a step and in dense
-    output $\hat y$ is the dense output. Derivatives follow from the implicit function theorem.
+    chord of a level set that is straight, and where it finds no solution with $\gamma \ge 1/2$:
+    $\gamma = 0$, the start of the step, is always one, and not what is sought. So it fails with
+    Euler's method, which moves along a tangent of the level set, and with a quantity that is not
+    conserved, in short steps. At saved times inside a step and in dense output $\hat y$ is the
+    dense output. Derivatives follow from the implicit function theorem.
 
     !!! example
 

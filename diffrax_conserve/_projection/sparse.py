@@ -437,12 +437,13 @@ class BlockGram(eqx.Module):
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
         least = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
-        inverse = _inverse((corner + added * jnp.diag(least))[None])[0]
+        left, right = _halves((corner + added * jnp.diag(least))[None])
 
         def solve(b: Float[Array, " m"]) -> Float[Array, " m"]:
             blocks, dense = self.pattern.taken_apart(b)
             blocks = sparse(blocks)
-            dense = inverse @ (dense - jnp.einsum("dij,ij->d", self.rows, blocks))
+            dense = dense - jnp.einsum("dij,ij->d", self.rows, blocks)
+            dense = right[0] @ (left[0] @ dense)
             return self.pattern.joined(blocks - eliminated @ dense, dense)
 
         return solve
@@ -487,16 +488,23 @@ def _times(a: Array, b: Array) -> Array:
     return jnp.sum(a[..., None] * b[:, None], axis=2)
 
 
-def _inverse(matrix: Float[Array, "blocks k k"]) -> Float[Array, "blocks k k"]:
-    """The inverses of small matrices in all blocks, by Gauss-Jordan elimination in place. There is
-    no search for pivots, which positive definite matrices such as Gram matrices do not need."""
-    for k in range(matrix.shape[1]):
-        pivot = 1 / matrix[:, k, k]
-        row, column = matrix[:, k, :] * pivot[:, None], matrix[:, :, k]
-        matrix = matrix - column[:, :, None] * row[:, None, :]
-        matrix = matrix.at[:, k, :].set(row).at[:, :, k].set(-column * pivot[:, None])
-        matrix = matrix.at[:, k, k].set(pivot)
-    return matrix
+def _halves(matrix: Float[Array, "blocks k k"]) -> tuple[Array, Array]:
+    """Two matrices for each block, of which `right left` is its inverse, by Gaussian elimination.
+    There is no search for pivots, which positive definite matrices such as Gram matrices do not
+    need.
+
+    We do not multiply the two: where constraints depend on each other, the elements of the inverse
+    are as large as one over what is added to the diagonal, and the roundoff of the product would
+    spoil what the constraints determine. In the halves only a row of `left` is large.
+    """
+    left = right = jnp.broadcast_to(jnp.eye(matrix.shape[1], dtype=matrix.dtype), matrix.shape)
+    for k in range(matrix.shape[1] - 1):
+        pivot, later = matrix[:, k, k, None], np.arange(matrix.shape[1]) > k
+        below, beside = (jnp.where(later, x, 0) / pivot for x in (matrix[:, :, k], matrix[:, k, :]))
+        right = right - right[:, :, k, None] * beside[:, None]
+        left = left - below[:, :, None] * left[:, k, None]
+        matrix = matrix - below[:, :, None] * matrix[:, k, None]
+    return left / jnp.diagonal(matrix, axis1=1, axis2=2)[:, :, None], right
 
 
 def _reduced(
@@ -517,8 +525,8 @@ def _reduced(
         return jnp.concatenate([x[1:], jnp.zeros_like(x[:1])])
 
     if following is None or preceding is None or len(diagonal) == 1:
-        inverse = _inverse(diagonal)
-        return lambda b: _times(inverse, b)
+        left, right = _halves(diagonal)
+        return lambda b: _times(right, _times(left, b))
     if diagonal.shape[1] == 1:
         lower, middle, upper = (
             before(preceding).reshape(-1),
@@ -535,11 +543,12 @@ def _reduced(
     # If the number of blocks is odd, a block of ones is added, which is coupled to none.
     middle, odd = even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
-    right, odd_right = even_and_odd(following)
+    to_right, odd_right = even_and_odd(following)
     # These couple the odd block to the one before, and the next even block to the odd one.
-    odd_left, left = even_and_odd(preceding)
-    inverse = _inverse(odd)
-    from_right, from_left = _times(right, inverse), before(_times(left, inverse))
+    odd_left, to_left = even_and_odd(preceding)
+    left, right = _halves(odd)
+    from_right, from_left = _times(to_right, right), before(_times(to_left, right))
+    odd_left, odd_right = _times(left, odd_left), _times(left, odd_right)
     middle = middle - _times(from_right, odd_left) - _times(from_left, before(odd_right))
     following = -_times(from_right, odd_right)
     preceding = -after(_times(from_left, before(odd_left)))
@@ -547,8 +556,9 @@ def _reduced(
 
     def solve(b: Array) -> Array:
         even, rest = even_and_odd(b)
+        rest = _times(left, rest)
         x = coarse(even - _times(from_right, rest) - _times(from_left, before(rest)))
-        rest = _times(inverse, rest - _times(odd_left, x) - _times(odd_right, after(x)))
+        rest = _times(right, rest - _times(odd_left, x) - _times(odd_right, after(x)))
         return jnp.stack([x, rest], axis=1).reshape(-1, b.shape[1])[: len(b)]
 
     return solve

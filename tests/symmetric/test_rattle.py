@@ -209,15 +209,15 @@ def test_derivatives_in_both_modes_against_finite_differences():
     assert abs(reverse - forward(at)[1]) < 1e-11
 
 
-@pytest.mark.parametrize("beads", [3, 20])
-def test_constraints_given_twice_change_nothing(beads):
+@pytest.mark.parametrize(("beads", "times"), [(3, 2), (20, 2), (12, 4)])
+def test_constraints_given_several_times_change_nothing(beads, times):
     """In a dense matrix, and in blocks."""
     angles = 0.3 * jnp.arange(1.0, beads + 1)
     q = jnp.cumsum(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=0)
     pair, y0, rod = terms(fall), (q, 0 * q), dfc.Constraint(rods)
     found = [
         final(solve(pair, dfc.RATTLE(constraint, 1.0), y0, 0.0, 0.2, 0.01))
-        for constraint in (rod, [rod, rod])
+        for constraint in (rod, times * [rod])
     ]
     assert difference(*found) < 1e-13
 
