@@ -33,11 +33,13 @@ class AbstractAlongLine(AbstractProjection):
     def direction(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The vector `w`."""
 
-    @abc.abstractmethod
     def is_wanted(
         self, problem: Problem, candidate: Float[Array, " n"], y: Float[Array, " n"]
-    ) -> Bool[Array, ""] | bool:
-        """Whether a state of the manifold on this line is the one that is sought."""
+    ) -> Bool[Array, ""]:
+        """Whether a state of the manifold on this line is the one that is sought. By default every
+        one is."""
+        del problem, candidate, y
+        return jnp.asarray(True)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
@@ -104,12 +106,6 @@ class Directional(AbstractAlongLine):
                 "`diffrax.Tsit5()`. Elsewhere pass `projection=Newton()`."
             )
         return error
-
-    def is_wanted(
-        self, problem: Problem, candidate: Float[Array, " n"], y: Float[Array, " n"]
-    ) -> bool:
-        del problem, candidate, y
-        return True
 
 
 Directional.__init__.__doc__ = """**Arguments:**
