@@ -148,8 +148,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # `_first_of` has a derivative rule too, so its functions are converted likewise.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
         y, failed = _first_of(attempts, vector)
-        within = nearest_within(target.projection, problem.like, y)
-        y = jnp.where(failed < len(attempts), y, within)
+        if bounded:
+            within = nearest_within(target.projection, problem.like, y)
+            y = jnp.where(failed < len(attempts), y, within)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 

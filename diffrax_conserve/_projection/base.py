@@ -201,12 +201,11 @@ def adapted(
 def has_bounds(projection: AbstractProjection) -> bool:
     """Whether the projection has bounds, or one of its stages."""
 
-    def is_stage(x: Any) -> bool:
-        return x is not projection and isinstance(x, AbstractProjection)
+    def takes_bounds(x: Any) -> bool:
+        return isinstance(x, AbstractProjection) and hasattr(x, "lower")
 
-    own = any(getattr(projection, name, None) is not None for name in ("lower", "upper"))
-    stages = filter(is_stage, jtu.tree_leaves(projection, is_leaf=is_stage))
-    return own or any(map(has_bounds, stages))
+    parts = filter(takes_bounds, jtu.tree_leaves(projection, is_leaf=takes_bounds))
+    return any(getattr(x, name, None) is not None for x in parts for name in ("lower", "upper"))
 
 
 def check_projection(projection: Any) -> None:

@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .sparse import BlockGram, SparseRows
+from .sparse import ADDED_POWER, BlockGram, SparseRows
 
 # Up to this many constraints the elimination is written out, element by element, so that XLA fuses
 # it with what is around it. A call of LAPACK would take most of the time of a small projection.
@@ -34,11 +34,10 @@ _LEAST_PIVOT = 4
 # perturbs the matrix by about `√m` units (N. J. Higham, *Accuracy and Stability of Numerical
 # Algorithms*, SIAM 2002, 2.8 and 10.1), so that a pivot which should be zero stays positive.
 _ADDED = 16
-# And where no iterative refinement follows, at least this power of roundoff: the noise in the
-# residuals of dependent constraints becomes an error of all others, in the ratio of roundoff to
-# what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit, of
-# which five are independent, does not converge.
-_ADDED_POWER = 3 / 4
+# And where no iterative refinement follows, at least the power `ADDED_POWER` of roundoff: the noise
+# in the residuals of dependent constraints becomes an error of all others, in the ratio of roundoff
+# to what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit,
+# of which five are independent, does not converge.
 # So many solves, all but the first for what is left of the right side, remove from a solution the
 # error that the addition causes. Each multiplies it by what was added, divided by the smallest
 # eigenvalue of the scaled matrix.
@@ -142,13 +141,14 @@ def inverse_triangle(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Fl
     are as large as one over what is added to the diagonal, and those of its triangle only as large
     as the root of that. So the roundoff of the product would spoil what the constraints determine.
     """
-    added = _added(gram, _ADDED_POWER) * jnp.where(gram > 0, gram, 1)
+    added = _added(gram, ADDED_POWER) * jnp.where(gram > 0, gram, 1)
     lower = lax.linalg.cholesky(gram + added, symmetrize_input=False)
     one = jnp.eye(len(gram), dtype=added.dtype)
     return jsp.linalg.solve_triangular(lower, one, lower=True) / sizes
 
 
 def by_triangle(inverse: Float[Array, "m m"]) -> Callable[[Array], Array]:
+    """What `factored` says, from the `inverse_triangle`."""
     return lambda g: combined(combined(g.astype(inverse.dtype), inverse.T), inverse).astype(g.dtype)
 
 

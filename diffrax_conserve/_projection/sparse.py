@@ -50,7 +50,7 @@ _BLOCK_MAX = 16
 # As in `elimination` it is far above roundoff: the elements of the inverse are as large as one over
 # what is added, and their roundoff is an error of all multipliers. What the addition itself changes
 # is removed by the iterations, or by refinement.
-_ADDED_POWER = 3 / 4
+ADDED_POWER = 3 / 4
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
 
@@ -422,7 +422,7 @@ class BlockGram(eqx.Module):
         last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
-        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** _ADDED_POWER
+        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** ADDED_POWER
         # A diagonal element is zero for padding, and for a constraint without a gradient. With a
         # one in its place the multiplier of such a row is its right side.
         unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)

@@ -272,7 +272,13 @@ def test_right_solves_succeed(name, dtype):
     assert len(found) <= case.allowed, jax.tree.map(lambda x: x[found[:5]], case.y0)
 
 
-@some_of("dtype", [np.float64, np.float32], ids=["float64", "float32"], period=2)
+@pytest.mark.parametrize(
+    "dtype",
+    [
+        np.float64,
+        *(pytest.param(x, marks=pytest.mark.slow) for x in (np.float64, np.float32)),
+    ],
+)
 def test_almost_circular_orbits_in_a_batch_are_solved(dtype):
     """By the flags of `make slow`, but not by those of the tests, XLA evaluates the residuals once
     for each multiplier."""

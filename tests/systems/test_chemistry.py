@@ -18,7 +18,6 @@ from ..problems import solve
 from ..thinned import some_of
 
 STIFF = {name: dfc.systems.get(name) for name in dfc.systems.names(stiff=True)}
-both = pytest.mark.parametrize("system", STIFF.values(), ids=STIFF)
 
 # F. Mazzia and C. Magherini, Test Set for Initial Value Problem Solvers.
 POLLU_60 = [
