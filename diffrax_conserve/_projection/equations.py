@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import Constraint, evaluate, is_entry, named_entries
+from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
 from .metric import MatrixUnits, Units
 from .sparse import Pattern, SparseRows, pattern_of
@@ -45,6 +45,9 @@ _NOISE = 1 / 8
 # gradient shows. There a correction by one tolerance would move the state by more than 1/64 of
 # itself. The number is a choice; `tests/laws/test_refused.py -k near` solves such problems.
 _NEAR_REST = 64
+# If we do not know how far a component moves, we count this share of the largest one, because its
+# own value may just cross zero. The number is a choice.
+_CROSSING = 0.1
 # One entry of a manifold, as a function from the state to the vector of its residuals.
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
@@ -62,10 +65,9 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `motion`: how far each component moves in a step, where that is known; see `Target`.
+    - `sizes`: how large each component is: its value at the candidate plus its motion in a step, or,
+      if that is not known, plus `_CROSSING` times the largest component.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
-    - `may_vanish`: whether all terms of a residual may be zero on the manifold, so that its
-      tolerance is zero too. Only those of a `Constraint` may, such as of `q[0] = 0`.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
     - `pattern`: the places of the elements of a sparse Jacobian; `None` if it is dense.
@@ -74,11 +76,10 @@ class Equations(eqx.Module):
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
+    sizes: Float[Array, " n"]
     units: Units = None
-    motion: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
-    may_vanish: bool = eqx.field(default=False, static=True)
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
     pattern: Pattern | None = eqx.field(default=None, static=True)
 
@@ -110,8 +111,15 @@ class Equations(eqx.Module):
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        y = y if self.clip is None else self.clip(y)
-        return self.magnitude + shown_terms(jacobian, y)
+        """The sizes of the terms of the residuals.
+
+        Where a conserved value is zero, all terms may be zero on the manifold, as for `q[0] = 0`. A
+        tolerance that is relative to the component itself could never be met there, so each
+        component counts as at least one unit of roundoff of its size, which a correction leaves.
+        """
+        y = jnp.abs(y if self.clip is None else self.clip(y))
+        least = float(jnp.finfo(y.dtype).eps) * shown_terms(jacobian, self.sizes)
+        return self.magnitude + shown_terms(jacobian, y) + jnp.where(self.magnitude > 0, 0, least)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -216,7 +224,8 @@ def measure(
     equations = equations_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-    return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
+    scale = equations.magnitude + shown_terms(jacobian, vector)
+    return unflatten(g, like), unflatten(scale, like)
 
 
 def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -> list[Part]:
@@ -232,29 +241,33 @@ def equations_of(
     manifold: Manifold,
     values: Float[Array, " m"],
     t: RealScalarLike,
-    like: Any,
+    y: Y,
     args: Args,
     hidden: Float[Array, " m"] | None = None,
+    motion: Float[Array, " n"] | None = None,
 ) -> Equations:
-    """The equations of a manifold with the conserved `values`, for states like `like`."""
+    """The equations of a manifold with the conserved `values`, for states near `y`. If the `motion`
+    of the components in a step is known, it is their units too."""
     hidden = jnp.zeros_like(values) if hidden is None else hidden
-    like = jax.eval_shape(lambda: like)
+    sizes = jnp.abs(ravel(y)).astype(values.dtype)
+    other = _CROSSING * jnp.max(sizes, initial=0) if motion is None else motion
+    sizes = lax.stop_gradient(sizes + other)
+    like = jax.eval_shape(lambda: y)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     functions = functions_of(manifold, t, like, args)
-    sizes = [jax.eval_shape(fn, vector).size for fn in functions]
-    for fn, size in zip(functions, sizes, strict=True):
+    counts = [jax.eval_shape(fn, vector).size for fn in functions]
+    for fn, count in zip(functions, counts, strict=True):
 
-        def part(y: Array, fn=fn, start=start, end=start + size) -> Array:
+        def part(y: Array, fn=fn, start=start, end=start + count) -> Array:
             return fn(y) - values[start:end]
 
         # The user's function may close over arrays, such as the parameters of a network. Conversion
         # makes them leaves of the equations: only so can the custom rules differentiate by them.
         parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
-        start += size
+        start += count
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
-    may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
-    pattern = pattern_of(functions, sizes, vector)
-    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish, pattern=pattern)
+    pattern = pattern_of(functions, counts, vector)
+    return Equations(tuple(parts), magnitude, hidden, sizes, units=motion, pattern=pattern)
 
 
 class _Known:

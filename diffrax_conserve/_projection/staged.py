@@ -109,9 +109,8 @@ def _restricted(
         parts,
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
+        problem.equations.sizes,
         units=problem.equations.units,
-        motion=problem.equations.motion,
-        may_vanish=problem.equations.may_vanish,
         pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
     )
     return dataclasses.replace(
