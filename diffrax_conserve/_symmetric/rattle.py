@@ -411,6 +411,18 @@ def _iterated(
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
     scale, solve = equations.scale(at.jacobian, sizes), at.factored()
+    _, moves = jax.linearize(position, guess)
+
+    def correction(g: Array) -> Array:
+        """Where constraints depend on each other, the residuals of a state off the manifold
+        contradict each other a little, and the solution of the linear system has a large part that
+        moves no position, but whose roundoff would. So we solve once more, for the change of the
+        constraints that the solution causes: that is left without its contradiction, and the large
+        part with it."""
+        x = solve(g)
+        if guess.size <= WRITTEN_OUT_MAX:  # dependent constraints have the multiplier zero there
+            return x
+        return solve(_times(at.jacobian, moves(x)))
 
     def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         x, left = carry
@@ -422,7 +434,7 @@ def _iterated(
         # after the start, a correction of roundoff of the positions would be a large velocity.
         level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
         left = after_test(level, left, extra=1, gives_up=left > 0)
-        return jnp.where(left > 0, x - solve(g), x), left
+        return jnp.where(left > 0, x - correction(g), x), left
 
     carry = guess, counter(max_steps)
     return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)

@@ -222,6 +222,27 @@ def test_constraints_given_several_times_change_nothing(beads, times):
     assert difference(*found) < 1e-13
 
 
+@pytest.mark.parametrize("squares", [1, 7])
+def test_one_brace_too_many_changes_nothing(squares):
+    """The second diagonal of a rigid square says nothing new on the constraint, but contradicts the
+    other rods a little off it. In a dense matrix, and in blocks."""
+    sides, diagonals = [(0, 1), (1, 2), (2, 3), (3, 0)], [(0, 2), (1, 3)]
+    corners = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    q = corners + 2 * jnp.arange(squares)[:, None, None]
+    v = 0.8 * jnp.stack([0.5 - corners[:, 1], corners[:, 0] - 0.1], axis=1)
+    force = lambda t, q, args: fall(t, q, args) - q * jnp.array([1.0, 2.0])  # noqa: E731
+
+    def end(pairs):
+        i, j = np.array(pairs).T
+        square = jnp.sum((corners[i] - corners[j]) ** 2, axis=1)
+        rod = lambda t, q, args: jnp.sum((q[:, i] - q[:, j]) ** 2, axis=2) - square  # noqa: E731
+        masses = jnp.array([[1.0], [2.0], [1.5], [0.7]])
+        y0, solver = (q, jnp.broadcast_to(v, q.shape)), dfc.RATTLE(dfc.Constraint(rod), masses)
+        return final(solve(terms(force, masses), solver, y0, 0.0, 1.0, 0.02))
+
+    assert difference(end(sides + diagonals), end(sides + diagonals[:1])) < 1e-12
+
+
 def test_a_lane_is_that_lane_alone_and_float32_works():
     speeds = jnp.array([0.0, 0.5, -1.0])
 
