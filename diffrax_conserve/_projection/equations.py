@@ -65,8 +65,8 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `sizes`: how large each component is: its value at the candidate plus its motion in a step, or,
-      if that is not known, plus `_CROSSING` times the largest component.
+    - `sizes`: how large each component is: its value at the candidate plus its motion in a step,
+      or, if that is not known, plus `_CROSSING` times the largest component.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
@@ -113,13 +113,13 @@ class Equations(eqx.Module):
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         """The sizes of the terms of the residuals.
 
-        Where a conserved value is zero, all terms may be zero on the manifold, as for `q[0] = 0`. A
-        tolerance that is relative to the component itself could never be met there, so each
-        component counts as at least one unit of roundoff of its size, which a correction leaves.
+        All terms may be zero on the manifold, as for `q[0] = 0`. A tolerance that is relative to
+        the component itself could never be met there. So a component counts as larger by one unit
+        of roundoff of its size, which is what the first correction leaves.
         """
         y = jnp.abs(y if self.clip is None else self.clip(y))
-        least = float(jnp.finfo(y.dtype).eps) * shown_terms(jacobian, self.sizes)
-        return self.magnitude + shown_terms(jacobian, y) + jnp.where(self.magnitude > 0, 0, least)
+        least = float(jnp.finfo(y.dtype).eps) * self.sizes
+        return self.magnitude + shown_terms(jacobian, y + least)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)

@@ -25,7 +25,7 @@ from .._interpolation import PackedTarget
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._options import check_counts, check_number
 from .._projection.base import Target
-from .._projection.chord import after_test, counter
+from .._projection.chord import FROZEN_STEPS, after_test, counter
 from .._projection.elimination import (
     WRITTEN_OUT_MAX,
     by_triangle,
@@ -411,33 +411,40 @@ def _iterated(
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
     scale, solve = equations.scale(at.jacobian, sizes), at.factored()
-    _, moves = jax.linearize(position, guess)
 
-    def correction(g: Array) -> Array:
-        """Where constraints depend on each other, the residuals of a state off the manifold
-        contradict each other a little, and the solution of the linear system has a large part that
-        moves no position, but whose roundoff would. So we solve once more, for the change of the
-        constraints that the solution causes: that is left without its contradiction, and the large
-        part with it."""
-        x = solve(g)
-        if guess.size <= WRITTEN_OUT_MAX:  # dependent constraints have the multiplier zero there
-            return x
-        return solve(_times(at.jacobian, moves(x)))
+    def attempt(solve: Callable[[Array], Array], max_steps: int) -> tuple[Array, Array]:
+        def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            x, left = carry
+            g = _once(equations.residual(_once(position(x))))
+            level, _ = equations.level(g, scale)
+            # The iteration ends with one more than needed, which is cheap and leaves only roundoff:
+            # so after the first test a state does not count as settled. At the first test it may.
+            # Then the guess is a solution, and in a step of hardly any length, such as to a saved
+            # time just after the start, a correction of roundoff of the positions would be a large
+            # velocity.
+            level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
+            left = after_test(level, left, extra=1, gives_up=left > 0)
+            return jnp.where(left > 0, x - solve(g), x), left
 
-    def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        x, left = carry
-        g = _once(equations.residual(_once(position(x))))
-        level, _ = equations.level(g, scale)
-        # The iteration ends with one more than needed, which is cheap and leaves only roundoff: so
-        # after the first test a state does not count as settled. At the first test it may. Then the
-        # guess is a solution, and in a step of hardly any length, such as to a saved time just
-        # after the start, a correction of roundoff of the positions would be a large velocity.
-        level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
-        left = after_test(level, left, extra=1, gives_up=left > 0)
-        return jnp.where(left > 0, x - correction(g), x), left
+        carry = guess, counter(max_steps)
+        return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)
 
-    carry = guess, counter(max_steps)
-    return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)
+    if guess.size <= WRITTEN_OUT_MAX:  # constraints that depend on others have the multiplier zero
+        return attempt(solve, max_steps)
+
+    def consistent() -> tuple[Array, Array]:
+        """Off the manifold the constraints may contradict each other a little, as do those of a
+        body with one rod too many. Then the solution of the linear system has a large part that
+        moves nothing, but whose roundoff does. So we solve once more, for the change of the
+        constraints that the solution causes: in that there is no contradiction."""
+        _, moves = jax.linearize(position, guess)
+        return attempt(lambda g: solve(_times(at.jacobian, moves(solve(g)))), max_steps)
+
+    first = attempt(solve, min(max_steps, FROZEN_STEPS))
+    failed = first[1] == -1
+    second = lax.cond(any_lane(failed), consistent, lambda: first)
+    x, left = (jnp.where(failed, b, a) for a, b in zip(first, second, strict=True))
+    return x, left
 
 
 def _on_tangent(
