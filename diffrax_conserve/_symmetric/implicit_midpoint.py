@@ -4,6 +4,7 @@ from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -11,6 +12,7 @@ import optimistix as optx
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import option
+from .._tree import ravel, tree_stop_gradient, unravel
 
 # The iteration stops after a change of at most this many units of roundoff. It converges fast, so
 # what is left is much smaller than the change, and less than the rounding of the state.
@@ -98,7 +100,14 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         k0 = terms.vf_prod(t0, y0, args, control)
         # The unknown is the increment `h f`, in units of what is rounded when it is added to the
         # state. So tolerances mean the same whatever the units of the state are.
-        units = jtu.tree_map(_size, y0, k0)
+        # The terms of a slope may cancel, and what is left has their roundoff. So the unit counts
+        # them too, by the change of the slope if each component changes by a share of itself. These
+        # shares, the sines of 1, 4, 9, ..., have no pattern that could cancel again.
+        numbers = ravel(y0)
+        shares = jnp.sin(jnp.arange(1, numbers.size + 1, dtype=numbers.dtype) ** 2)
+        slope = lambda y: terms.vf_prod(middle, y, args, control)  # noqa: E731
+        _, answer = jax.jvp(slope, (y0,), (unravel(shares * numbers, y0),))
+        units = tree_stop_gradient(jtu.tree_map(_size, y0, k0, answer))
 
         def increment(x: Y) -> Y:
             return jtu.tree_map(lambda x, unit: x * unit, x, units)
@@ -106,7 +115,7 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         def relation(x: Y, _: Any) -> Y:
             k = increment(x)
             y = jtu.tree_map(lambda y, k: y + k / 2, y0, k)
-            new = terms.vf_prod(middle, y, args, control)
+            new = slope(y)
             return jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units)
 
         finder = self.root_finder
@@ -129,8 +138,9 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 
 - `root_finder`: a root finder of optimistix or diffrax with tolerances of its own. Its unknown is
-    the increment $h f$, each component divided by $|y_n| + |h f(t_n, y_n)|$, so that both
-    tolerances are relative to the state. Default: `optimistix.Chord` with four units of roundoff.
+    the increment $h f$, each component divided by $|y_n|$ plus the size of the terms of $h f$, so
+    that both tolerances are relative to the state. Default: `optimistix.Chord` with four units of
+    roundoff.
 - `root_find_max_steps`: the largest number of its iterations. If they are not enough, the solve
     ends, and its `result` says so.
 
@@ -140,9 +150,9 @@ ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 """
 
 
-def _size(y: Any, k: Any) -> Any:
-    """The size of each component, `|y| + |k|`. One that is zero counts as large as the largest, and
-    if all are zero, as one."""
-    size = jnp.abs(y) + jnp.abs(k)
+def _size(*terms: Any) -> Any:
+    """The size of each component, the sum of those of the terms. One that is zero counts as large
+    as the largest, and if all are zero, as one."""
+    size = sum(map(jnp.abs, terms))
     size = jnp.where(size > 0, size, jnp.max(size, initial=0))
     return jnp.where(size > 0, size, jnp.ones_like(size))
