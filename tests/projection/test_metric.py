@@ -42,8 +42,13 @@ def test_a_matrix_is_the_euclidean_metric_in_other_coordinates(method: Any):
         (_, z), info = dfc.project(other, y, projection=method(metric=(2.0, 1.0)))
         return jnp.where(info.ok, back(z), jnp.nan)
 
-    for found in (lambda fn: jax.jit(fn)(START[1]), lambda fn: jax.jit(jax.jacrev(fn))(START[1])):
-        np.testing.assert_allclose(found(by_matrix), found(by_coordinates), atol=1e-11)
+    def with_jacobian(fn: Any) -> Any:
+        """The value and the Jacobian, by one program."""
+        twice = lambda v: (fn(v),) * 2  # noqa: E731
+        return jax.jit(jax.jacrev(twice, has_aux=True))(START[1])
+
+    for found, expected in zip(*map(with_jacobian, (by_matrix, by_coordinates)), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-11)
 
 
 def test_a_function_is_evaluated_at_the_candidate():

@@ -140,14 +140,13 @@ def test_transformations():
         return jax.lax.scan(lambda y, _: (batched(y), None), y0[None], None, length=1)[0][0]
 
     (plain, expected), (gradient, end) = map(
-        end_and_gradient, (end_of_a_solve, jax.jit(transformed))
+        end_and_gradient, (jax.jit(end_of_a_solve), jax.jit(transformed))
     )
     np.testing.assert_allclose(end, expected, rtol=0, atol=1e-14)
     np.testing.assert_allclose(gradient, plain, rtol=0, atol=1e-12)
 
 
 def end_of_a_solve(y0):
-    """Not compiled as a whole, as by `solve`."""
     solver = dfc.ManifoldProjection(dfx.Euler(), CIRCLE)
     return dfx.diffeqsolve(dfx.ODETerm(rotation), solver, 0.0, 0.3, 0.1, y0).ys[-1]
 
