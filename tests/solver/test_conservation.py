@@ -129,7 +129,7 @@ ORDERS = {
 }
 
 
-@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=3)
+@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=6)
 def test_the_order_survives(solver):
     """On the Toda lattice, kept on its energy."""
     system = dfc.systems.get("toda-lattice")
