@@ -121,7 +121,6 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 	$(BIN)/python docs/browser.py site
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
-examples: export XLA_FLAGS ?= $(filter-out --xla_backend_optimization_level=0,$(QUICKLY_COMPILED))
 examples: export EQX_ON_ERROR ?= raise
 examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
 	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py

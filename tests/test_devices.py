@@ -27,9 +27,9 @@ LANES = 16
 
 
 def solve(y0):
-    """Ten steps of RK4 for one rigid body."""
+    """Ten steps of Euler's method, the quickest to compile, for one rigid body."""
     system = dfc.systems.RigidBody()
-    solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
+    solver = dfc.ManifoldProjection(dfx.Euler(), system.manifold)
     term = dfx.ODETerm(system.vector_field)
     return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y0).ys[-1]
 

@@ -47,7 +47,7 @@ FUNCTIONS = {
 }
 
 
-@some_of("name", FUNCTIONS, ids=FUNCTIONS, period=8)
+@some_of("name", FUNCTIONS, ids=FUNCTIONS, period=16)
 def test_a_batch_keeps_the_function(name):
     """All outputs of it, in one integral with different weights."""
 
@@ -179,7 +179,7 @@ def test_a_form_is_written_out(name):
         assert not [v for e in equations_in(closed.jaxpr) for v in e.outvars if v.aval.ndim]
 
 
-@some_of("name", FORMS, ids=FORMS, period=9)
+@some_of("name", FORMS, ids=FORMS, period=19)
 def test_a_form_that_is_written_out_keeps_its_values_and_derivatives(name):
     """In both precisions, alone and in a batch."""
     fn, _ = FORMS[name]

@@ -35,6 +35,8 @@ class Settings(NamedTuple):
     batch_tolerances: tuple[float, ...]
     trajectories: int  # in the batch of rigid bodies
     lanes: int  # in the batch of unlike orbits
+    solvers: tuple[dfx.AbstractSolver, ...] = (dfx.Tsit5(), dfx.Dopri8())
+    of_a_batch: int | None = None  # contestants; all if it is `None`
 
 
 FULL = Settings(
@@ -52,6 +54,8 @@ SMOKE = Settings(
     batch_tolerances=(1e-8, 1e-10),
     trajectories=4,
     lanes=2,
+    solvers=(dfx.Tsit5(),),
+    of_a_batch=2,
 )
 
 
@@ -62,7 +66,7 @@ def one_trajectory(name: str, settings: Settings) -> dict[str, Any]:
     system, tolerances = SYSTEMS[name], settings.tolerances
     equations = peers.EQUATIONS[name]
     contestants = {}
-    for solver in (dfx.Tsit5(), dfx.Dopri8()):
+    for solver in settings.solvers:
         label = type(solver).__name__
         projected = dfc.ManifoldProjection(solver, system.manifold)
         contestants[f"plain {label}"] = ours(system, solver, 1, tolerances)
@@ -101,6 +105,7 @@ def batch(settings: Settings) -> dict[str, Any]:
         "projected Tsit5, fixed steps": projected(dfx.Tsit5(), (5_000, 10_000, 20_000), False),
         "projected RK4, fixed steps": projected(dfc.RK4(), (40_000, 80_000, 160_000), False),
     }
+    contestants = dict(list(contestants.items())[: settings.of_a_batch])
     for width in (8, 16):
         contestants |= heyoka("rigid-body", (*tolerances, 1e-12, 1e-13, 1e-14), width)
     return part("rigid-body", system, contestants, lanes, settings.rounds, error=1e-9)

@@ -223,7 +223,8 @@ def chain():
     q = jnp.cumsum(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=0)
     h, steps = 0.005, few(10**6, 2000)
     solver = dfc.RATTLE(dfc.Constraint(lambda t, q, args: rods(q)), 1.0)
-    for name, potential in {"gravity": weight, "pairs": repulsion}.items():
+    potentials = ("gravity", weight), ("pairs", repulsion)
+    for name, potential in few(potentials, potentials[1:]):
         terms = pair_of_terms(potential, 1.0)
         count = few(20_000, 200)
 

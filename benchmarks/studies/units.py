@@ -201,7 +201,8 @@ def circles():
     y0 = Orbits(1.0, 1.0, np.zeros(lanes), anomaly=anomaly).y0
     cases = ((dfc.RK4(), 20), (dfc.RK4(), 100), (dfx.Bosh3(), 60), (dfx.Heun(), 150))
     for solver, steps in few(cases, cases[:1]):
-        for name, projection in (("default", ITERATIONS[0]), ("metric=1.0", EUCLIDEAN)):
+        kinds = ("default", ITERATIONS[0]), ("metric=1.0", EUCLIDEAN)
+        for name, projection in few(kinds, kinds[:1]):
             kept = dfc.ManifoldProjection(solver, KEPLER, projection=projection)
 
             def okay(y, kept=kept, steps=steps):
@@ -406,10 +407,11 @@ def over_euclidean(name, y0, inner, t1, dt, **options):
 
 
 def cost():
-    for name, lanes, steps, target in (
-        ("rigid-body", 1000, few(500, 5), 1.2),
+    cases = (
         ("cartesian-pendulum", 1, few(100_000, 100), 1.05),
-    ):
+        ("rigid-body", 1000, 500, 1.2),
+    )
+    for name, lanes, steps, target in few(cases, cases[:1]):
         system = dfc.systems.get(name)
         y0, dt = jax.tree.map(lambda x, n=lanes: jnp.stack([x] * n), system.y0), system.dt / 10
         _, ratio = over_euclidean(name, y0, dfc.RK4(), steps * dt, dt)
@@ -462,6 +464,8 @@ def long_steps():
 
 NATURE = (powers_of_two, planets, circles, other_times, events, energy_alone, attitudes)
 PARTS = (*NATURE, catalogue, cost, long_steps)
+# `tests/laws/test_units.py` solves what these solve; the catalogue is compared as the energy alone.
+NOT_AT_TOY_SIZES = (powers_of_two, planets, events, catalogue)
 
 
 def main():
@@ -471,7 +475,7 @@ def main():
     parser.add_argument("--smoke", action="store_true", help="toy sizes")
     options = parser.parse_args()
     SMOKE, rows = options.smoke, []
-    for part in PARTS:
+    for part in few(PARTS, [part for part in PARTS if part not in NOT_AT_TOY_SIZES]):
         if options.only in part.__name__:
             start = time.process_time()
             rows += part()

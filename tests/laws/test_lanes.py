@@ -90,7 +90,9 @@ def test_bad_lanes_change_no_gradient():
 
     y0 = jnp.array([1.0, 0.8, 0.6]) + 0.1 * jnp.arange(4)[:, None]
     lanes = y0, jnp.array(KINDS), jnp.asarray(STEPS)
-    together = jax.jit(jax.vmap(gradient))(*lanes)
+    gradients = jax.jit(jax.vmap(gradient))
+    together = gradients(*lanes)
     for i in (0, 3):
-        alone = jax.jit(gradient)(*(x[i] for x in lanes))
-        np.testing.assert_allclose(together[i], alone, rtol=0, atol=1000 * EPS)
+        # Among its like, which takes no other program.
+        like = gradients(*(jnp.stack([x[i]] * 4) for x in lanes))
+        np.testing.assert_allclose(together[i], like[0], rtol=0, atol=1000 * EPS)

@@ -80,7 +80,7 @@ def natural(field, manifold, y0, solver, projection):
     )
 
 
-@some_of("name", SYSTEMS, period=2)
+@some_of("name", SYSTEMS, period=3)
 def test_powers_of_two_as_units_change_nothing(name):
     _, manifold, y0, *_ = SYSTEMS[name]
     run, shapes = natural(*SYSTEMS[name]), (len(y0), (), len(manifold))

@@ -44,20 +44,20 @@ def test_drift_is_at_roundoff_in_single_precision(name):
     assert all(y.dtype == jnp.float32 for y in jax.tree.leaves(sol.ys))
 
 
-def test_drift_does_not_grow_over_a_million_steps():
+def test_drift_does_not_grow_over_many_steps():
     system = dfc.systems.get("rigid-body")
-    saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 2e4, 20))
+    saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 4e3, 20))
     solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
     options = dict(saveat=saveat, max_steps=None, adjoint=dfx.ForwardMode())
-    sol = solve(system.vector_field, solver, system.y0, t1=2e4, dt0=0.02, **options)
-    assert sol.stats["num_steps"] >= 1_000_000
+    sol = solve(system.vector_field, solver, system.y0, t1=4e3, dt0=0.02, **options)
+    assert sol.stats["num_steps"] >= 200_000
     assert largest(drift_of(sol, system.manifold)) <= 4e-15
 
 
 ORBIT = dfc.systems.Kepler()
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(packing=dct.restructurings(ORBIT.y0))
 def test_any_pytree_is_a_state(packing):
     """Of integrals too: in other containers the solve is the same."""
@@ -129,7 +129,7 @@ ORDERS = {
 }
 
 
-@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=3)
+@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=6)
 def test_the_order_survives(solver):
     """On the Toda lattice, kept on its energy."""
     system = dfc.systems.get("toda-lattice")

@@ -195,7 +195,7 @@ def test_it_is_never_small_where_something_is_not_finite():
 def work_with_a_heavy_field():
     """The operations of a solve with fixed steps, with those projected, and with adaptive ones. An
     evaluation of this vector field takes millions of operations, all the rest thousands."""
-    heavy = jnp.ones((1000, 1000))
+    heavy = jnp.ones((200, 200))
 
     def field(t, y, args):
         return LORENZ.vector_field(t, y, args) + 0 * jnp.sum(jnp.tanh(heavy @ (heavy * y[0])))
@@ -216,7 +216,7 @@ def test_fixed_steps_do_not_compute_it():
     """XLA removes what a loop carries and nobody reads, but not by the flags of the tests."""
     plain, projected, adaptive = fresh.interpreter()["flops"]
     assert max(plain, projected) < 1e6
-    assert adaptive > 1e9
+    assert adaptive > 1e7
 
 
 @eqx.filter_jit

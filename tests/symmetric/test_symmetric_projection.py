@@ -24,8 +24,8 @@ W0 = jnp.array([1.0, 0.7, -0.4])
 
 
 @eqx.filter_jit
-def solve(field, solver, y0, t0, t1, h, args=None, ts=None):
-    save = dfx.SaveAt(t1=True, solver_state=True) if ts is None else dfx.SaveAt(ts=ts)
+def solve(field, solver, y0, t0, t1, h, args=None):
+    save = dfx.SaveAt(t1=True, solver_state=True)
     return dfx.diffeqsolve(
         dfx.ODETerm(field), solver, t0, t1, h, y0, args, saveat=save, max_steps=None, throw=False,
         adjoint=dfx.ForwardMode(),
@@ -95,49 +95,48 @@ def test_second_order_against_another_solver():
 
 
 def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
-    ts = jnp.linspace(0.0, 1.0, 38)
-    ys = solve(rigid_body, BODY, W0, 0.0, 1.0, 0.1, None, ts).ys
+    """Of one solve, backwards in time."""
+
+    @jax.jit
+    def found(y0):
+        subs = dfx.SubSaveAt(ts=jnp.linspace(1.0, 0.0, 38)), dfx.SubSaveAt(steps=True)
+        save = dfx.SaveAt(subs=subs, dense=True)
+        sol = dfx.diffeqsolve(dfx.ODETerm(rigid_body), BODY, 1.0, 0.0, -0.1, y0, saveat=save)
+        (_, ts), (saved, ys) = sol.ts, sol.ys
+        at_steps = jax.vmap(sol.evaluate)(ts[:10]), ys[:10]
+        return saved, at_steps, sol.evaluate(1.0), sol.evaluate(0.55), sol.derivative(0.55)
+
+    saved, at_steps, start, between, slope = found(W0)
     for entry in RIGID_BODY.values():
-        values = jax.vmap(lambda y, e=entry: e.fn(0.0, y, None))(ys)
+        values = jax.vmap(lambda y, e=entry: e.fn(0.0, y, None))(saved)
         assert largest(values / entry.fn(0.0, W0, None) - 1) < 4e-15
-    dense = dfx.diffeqsolve(
-        dfx.ODETerm(rigid_body), BODY, 1.0, 0.0, -0.1, W0, saveat=dfx.SaveAt(dense=True, steps=True)
-    )  # fmt: skip
-    assert difference(jax.vmap(dense.evaluate)(dense.ts[:10]), dense.ys[:10]) < 1e-14
-    assert difference(dense.evaluate(1.0), W0) < 1e-14
-    slope = dense.derivative(0.55)
-    assert difference(slope, rigid_body(0.0, dense.evaluate(0.55), None)) < 0.05
+    assert difference(*at_steps) < 1e-14
+    assert difference(start, W0) < 1e-14
+    assert difference(slope, rigid_body(0.0, between, None)) < 0.05
 
 
 def test_derivatives_in_both_modes_against_finite_differences():
-    def end(y0, scale):
+    def end(y0, scale, adjoint):
         def field(t, w, args):
             return args * rigid_body(t, w, None)
 
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, scale, max_steps=8,
-        )  # fmt: skip
+        options = dict(max_steps=8, adjoint=adjoint)
+        sol = dfx.diffeqsolve(dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, scale, **options)
         return jnp.sum(jnp.sin(sol.ys[-1]) * jnp.array([1.0, 2.0, 3.0]))
 
+    @jax.jit
     def forward(y0, scale):
-        def fn(s):
-            def field(t, w, args):
-                return args * rigid_body(t, w, None)
+        """The value, and the derivative by `scale`."""
+        return jax.jvp(lambda s: end(y0, s, dfx.ForwardMode()), (scale,), (jnp.ones(()),))
 
-            options = dict(max_steps=8, adjoint=dfx.ForwardMode())
-            y = dfx.diffeqsolve(dfx.ODETerm(field), BODY, 0.0, 0.5, 0.1, y0, s, **options).ys[-1]
-            return jnp.sum(jnp.sin(y) * jnp.array([1.0, 2.0, 3.0]))
-
-        return jax.jvp(fn, (scale,), (jnp.ones(()),))[1]
-
-    one = jnp.ones(())
-    end = jax.jit(end)
-    by_y0, by_scale = jax.jit(jax.grad(end, argnums=(0, 1)))(W0, one)
-    e = 1e-6
-    numeric = [(end(W0 + d, one) - end(W0 - d, one)) / (2 * e) for d in e * jnp.eye(3)]
+    one, e = jnp.ones(()), 1e-6
+    value = lambda y0, scale: forward(y0, scale)[0]  # noqa: E731
+    reverse = jax.grad(lambda *x: end(*x, dfx.RecursiveCheckpointAdjoint()), argnums=(0, 1))
+    by_y0, by_scale = jax.jit(reverse)(W0, one)
+    numeric = [(value(W0 + d, one) - value(W0 - d, one)) / (2 * e) for d in e * jnp.eye(3)]
     assert difference(by_y0, jnp.stack(numeric)) < 1e-8
-    assert difference(by_scale, (end(W0, one + e) - end(W0, one - e)) / (2 * e)) < 1e-8
-    assert difference(jax.jit(forward)(W0, one), by_scale) < 1e-12
+    assert difference(by_scale, (value(W0, one + e) - value(W0, one - e)) / (2 * e)) < 1e-8
+    assert difference(forward(W0, one)[1], by_scale) < 1e-12
 
 
 def test_a_lane_is_that_lane_alone_and_float32_works():
@@ -173,22 +172,22 @@ def test_time_dependent_constraint_and_a_repeated_one_backwards_in_time():
 
 
 def test_failures_are_results():
-    off = dfc.SymmetricProjection(
-        dfc.ImplicitMidpoint(), dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
-    )
+    def impossible(t, y, at_once):
+        """From the start, or because it changes along every solution."""
+        later = jnp.exp(-(y[0] ** 2) - 5 * t) - jnp.exp(-(W0[0] ** 2))
+        return jnp.where(at_once, jnp.sum(y**2) - 1, later)
 
     def broken(t, y, args):
         return jnp.where(t > 0.5, jnp.nan, 1.0) * rigid_body(t, y, args)
 
     few = dfc.SymmetricProjection(dfc.ImplicitMidpoint(root_find_max_steps=1), RIGID_BODY)
-    wrong = dfc.SymmetricProjection(
-        dfc.ImplicitMidpoint(), dfc.FirstIntegral(lambda t, y, args: jnp.exp(-(y[0] ** 2) - 5 * t))
-    )
-    for field, solver, message in (
-        (rigid_body, off, "cannot start"), (broken, BODY, ""), (rigid_body, few, "steps"),
-        (rigid_body, wrong, "not reached"),
+    wrong = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), dfc.Constraint(impossible))
+    for field, solver, args, message in (
+        (rigid_body, wrong, True, "cannot start"), (rigid_body, wrong, False, "not reached"),
+        (broken, BODY, None, ""), (rigid_body, few, None, "steps"),
     ):  # fmt: skip
-        sol = solve(field, solver, W0, 0.0, 1.0, 0.1)
+        args = None if args is None else jnp.asarray(args)
+        sol = solve(field, solver, W0, 0.0, 1.0, 0.1, args)
         assert not dfx.is_okay(sol.result), message
         assert message in dfx.RESULTS[sol.result]
         assert not np.isfinite(final(sol)).any()

@@ -27,13 +27,13 @@ def rotated(y0, t):
     return jnp.stack([c * y0[0] + s * y0[1], c * y0[1] - s * y0[0]])
 
 
-EXACT = jax.vmap(lambda y0, ts: jax.vmap(lambda t: rotated(y0, t))(ts))(Y0S, TS)
+EXACT = jax.jit(jax.vmap(lambda y0, ts: jax.vmap(lambda t: rotated(y0, t))(ts)))(Y0S, TS)
 
 
-def network(max_step=0.5, **options):
-    return dfc.DeepONet(
-        Y0S, max_step, width=16, depth=1, core=dfc.learned.Concatenated, key=jr.key(0), **options
-    )
+@eqx.filter_jit
+def network():
+    options = dict(width=16, depth=1, core=dfc.learned.Concatenated)
+    return dfc.DeepONet(Y0S, 0.5, key=jr.key(0), **options)
 
 
 def recipe(model, epochs=150, points=60):
