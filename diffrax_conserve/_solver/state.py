@@ -28,7 +28,8 @@ from .diffrax_private import register
 
 _SMALLER = (
     "Take smaller steps, or pass `projection=diffrax_conserve.Newton()` to a `ManifoldProjection`, "
-    "which copes with far candidates. Check by `check_invariance` that the quantity is conserved at all. "
+    "which copes with far candidates. Check by `check_invariance` that the quantity is conserved "
+    "at all. "
 )
 _ENTRY = (
     "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
