@@ -113,13 +113,13 @@ class Equations(eqx.Module):
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         """The sizes of the terms of the residuals.
 
-        All terms may be zero on the manifold, as for `q[0] = 0`. A tolerance that is relative to
-        the component itself could never be met there. So a component counts as larger by one unit
-        of roundoff of its size, which is what the first correction leaves.
+        Where a conserved value is zero, all terms may be zero on the manifold, as for `q[0] = 0`. A
+        tolerance that is relative to the component itself could never be met there, so a component
+        counts as larger by one unit of roundoff of its size, which the first correction leaves.
         """
         y = jnp.abs(y if self.clip is None else self.clip(y))
-        least = float(jnp.finfo(y.dtype).eps) * self.sizes
-        return self.magnitude + shown_terms(jacobian, y + least)
+        least = float(jnp.finfo(y.dtype).eps) * shown_terms(jacobian, self.sizes)
+        return self.magnitude + shown_terms(jacobian, y) + jnp.where(self.magnitude > 0, 0, least)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)

@@ -44,6 +44,8 @@ SOLVERS = FIXED | ADAPTIVE
 MODES = ["ts", "dense", "event", "steps", "t1"]
 TIMES = 25
 MAX_STEPS = 100
+# Of the solves that succeed, so many may have saved a state off the manifold inside a long step.
+SHARE_OFF = 0.01
 
 
 @functools.cache
@@ -133,5 +135,10 @@ def run(seed: int, number: int, lanes: int) -> Tally:
 
     okay = okay & np.isfinite(value).all(axis=0)
     tally.blame(f"{mode}: not finite", okay & (saved & ~finite).any(axis=1), show)
-    tally.blame(f"{mode}: off", okay & (saved & finite & ~(off <= 1)).any(axis=1), show)
+    away = okay & (saved & finite & ~(off <= 1)).any(axis=1)
+    if mode not in ("steps", "t1"):
+        # Inside a very long step a state may be that of the interpolation, off the manifold.
+        tally.notes[f"{mode}: off"] += int(away.sum())
+        away = away & (away.sum() > SHARE_OFF * okay.sum())
+    tally.blame(f"{mode}: off", away, show)
     return tally
