@@ -45,9 +45,6 @@ _NOISE = 1 / 8
 # gradient shows. There a correction by one tolerance would move the state by more than 1/64 of
 # itself. The number is a choice; `tests/laws/test_refused.py -k near` solves such problems.
 _NEAR_REST = 64
-# If we do not know how far a component moves, we count this share of the largest one, because its
-# own value may just cross zero. The number is a choice.
-_CROSSING = 0.1
 # One entry of a manifold, as a function from the state to the vector of its residuals.
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
@@ -65,8 +62,9 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `sizes`: how large each component is: its value at the candidate plus its motion in a step,
-      or, if that is not known, plus `_CROSSING` times the largest component.
+    - `sizes`: how large each component is: its value at the candidate, plus its motion in a step,
+      where that is known.
+    - `moves`: whether it is known.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
@@ -78,6 +76,7 @@ class Equations(eqx.Module):
     hidden: Float[Array, " m"]
     sizes: Float[Array, " n"]
     units: Units = None
+    moves: bool = eqx.field(default=False, static=True)
     rtol: float | Array | None = None
     atol: float | Array | None = None
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
@@ -250,8 +249,7 @@ def equations_of(
     of the components in a step is known, it is their units too."""
     hidden = jnp.zeros_like(values) if hidden is None else hidden
     sizes = jnp.abs(ravel(y)).astype(values.dtype)
-    other = _CROSSING * jnp.max(sizes, initial=0) if motion is None else motion
-    sizes = lax.stop_gradient(sizes + other)
+    sizes = lax.stop_gradient(sizes if motion is None else sizes + motion)
     like = jax.eval_shape(lambda: y)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     functions = functions_of(manifold, t, like, args)
@@ -267,7 +265,8 @@ def equations_of(
         start += count
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
     pattern = pattern_of(functions, counts, vector)
-    return Equations(tuple(parts), magnitude, hidden, sizes, units=motion, pattern=pattern)
+    moves = motion is not None
+    return Equations(tuple(parts), magnitude, hidden, sizes, motion, moves, pattern=pattern)
 
 
 class _Known:

@@ -41,6 +41,9 @@ _SMALL_ANGLE, _SHORT_CORRECTION = 1e-2, 1e-5
 # them we look at the sine at another state, at this relative distance, so far that gradients which
 # are parallel only here have visibly turned.
 _OFFSET = 1e-3
+# If we do not know how far a component moves, it counts as larger by this share of the largest one,
+# because its own value may just cross zero. The number is a choice.
+_CROSSING = 0.1
 # If the gradients are parallel there too, their sine is roundoff: at most this many units of it,
 # for a QR decomposition of gradients that are themselves rounded.
 _PARALLEL = 64
@@ -132,12 +135,15 @@ def certain(
         crosses = jnp.abs(jnp.sum(gradient * directions)) > eps ** (1 / 3) * lengths
         return jnp.where(crosses | (lengths == 0), one, jnp.nan)
     sines = _sines(equations, jacobian)
+    sizes = equations.sizes
+    if not equations.moves:
+        sizes = sizes + _CROSSING * jnp.max(sizes, initial=0)
     # The sines of 1, 4, 9, ... have no pattern, so that this direction is in general position, and
     # the same in every call.
     phases = jnp.sin(jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2)
-    beside = y + _OFFSET * equations.sizes * phases
+    beside = y + _OFFSET * sizes * phases
     dependent = _sines(equations, equations.linearise(beside)[1]) <= _PARALLEL * eps
-    relative_change = jnp.abs(relative(y - candidate, equations.sizes))
+    relative_change = jnp.abs(relative(y - candidate, sizes))
     amplified = jnp.max(relative_change, initial=0) > _SHORT_CORRECTION * sines
     doubtful = (sines <= eps ** (1 / 3)) | ((sines <= _SMALL_ANGLE) & amplified)
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, one)

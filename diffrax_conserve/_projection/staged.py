@@ -111,6 +111,7 @@ def _restricted(
         problem.equations.hidden[rows],
         problem.equations.sizes,
         units=problem.equations.units,
+        moves=problem.equations.moves,
         pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
     )
     return dataclasses.replace(

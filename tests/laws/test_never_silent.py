@@ -79,8 +79,8 @@ def test_success_means_on_the_manifold_at_the_state_that_is_returned(
     numbers = np.finfo(dtype)  # below `tiny` a number counts as zero
     # Where the value is zero, a component counts as larger by one unit of roundoff of what the
     # projection started from.
-    sizes = np.abs(candidate) + np.max(np.abs(candidate)) / 10
-    size += np.where(value == 0, numbers.eps * np.sum(np.abs(rows) * sizes, axis=1), 0)
+    least = numbers.eps * np.sum(np.abs(rows * candidate), axis=1)
+    size += np.where(value == 0, least, 0)
     assert np.all(np.abs(values - value) <= 64 * numbers.eps * size + numbers.tiny)
 
 
