@@ -65,6 +65,10 @@ class Equations(eqx.Module):
     - `sizes`: how large each component is: its value at the candidate, plus its motion in a step,
       where that is known.
     - `moves`: whether it is known.
+    - `least`: by how much each component counts as larger in the scale. Where a conserved value is
+      zero, all terms may be zero on the manifold, as for `q[0] = 0`, so that a tolerance which is
+      relative to the component itself could never be met. Then it is one unit of roundoff of the
+      size, which the first correction leaves; otherwise zero.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
@@ -75,6 +79,7 @@ class Equations(eqx.Module):
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
     sizes: Float[Array, " n"]
+    least: Float[Array, " n"]
     units: Units = None
     moves: bool = eqx.field(default=False, static=True)
     rtol: float | Array | None = None
@@ -110,15 +115,8 @@ class Equations(eqx.Module):
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The sizes of the terms of the residuals.
-
-        Where a conserved value is zero, all terms may be zero on the manifold, as for `q[0] = 0`. A
-        tolerance that is relative to the component itself could never be met there, so a component
-        counts as larger by one unit of roundoff of its size, which the first correction leaves.
-        """
         y = jnp.abs(y if self.clip is None else self.clip(y))
-        least = float(jnp.finfo(y.dtype).eps) * shown_terms(jacobian, self.sizes)
-        return self.magnitude + shown_terms(jacobian, y) + jnp.where(self.magnitude > 0, 0, least)
+        return self.magnitude + shown_terms(jacobian, y + self.least)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -265,8 +263,18 @@ def equations_of(
         start += count
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
     pattern = pattern_of(functions, counts, vector)
-    moves = motion is not None
-    return Equations(tuple(parts), magnitude, hidden, sizes, motion, moves, pattern=pattern)
+    eps = float(jnp.finfo(sizes.dtype).eps)
+    least = jnp.where(jnp.all(magnitude > 0), 0, eps * sizes)
+    return Equations(
+        tuple(parts),
+        magnitude,
+        hidden,
+        sizes,
+        least,
+        units=motion,
+        moves=motion is not None,
+        pattern=pattern,
+    )
 
 
 class _Known:

@@ -110,6 +110,7 @@ def _restricted(
         problem.equations.magnitude[rows],
         problem.equations.hidden[rows],
         problem.equations.sizes,
+        problem.equations.least,
         units=problem.equations.units,
         moves=problem.equations.moves,
         pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
