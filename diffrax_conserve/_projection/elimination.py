@@ -32,12 +32,12 @@ _LEAST_PIVOT = 4
 # For more constraints we add this many units of roundoff, times `√m`, to a diagonal of ones, so
 # that a factor exists where constraints depend on each other. The rounding of a factorisation
 # perturbs the matrix by about `√m` units (N. J. Higham, *Accuracy and Stability of Numerical
-# Algorithms*, SIAM 2002, 2.8 and 10.1), so that a pivot which should be zero stays positive.
+# Algorithms*, SIAM 2002, 2.8 and 10.1), so that a pivot which should be zero stays positive. Where
+# no iterative refinement follows, we add at least the power `ADDED_POWER` of roundoff: the noise in
+# the residuals of dependent constraints becomes an error of all others, in the ratio of roundoff to
+# what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit, of
+# which five are independent, does not converge.
 _ADDED = 16
-# And where no iterative refinement follows, at least the power `ADDED_POWER` of roundoff: the noise
-# in the residuals of dependent constraints becomes an error of all others, in the ratio of roundoff
-# to what is added. With `_ADDED` alone one in five projections on the seven integrals of an orbit,
-# of which five are independent, does not converge.
 # So many solves, all but the first for what is left of the right side, remove from a solution the
 # error that the addition causes. Each multiplies it by what was added, divided by the smallest
 # eigenvalue of the scaled matrix.
