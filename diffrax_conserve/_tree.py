@@ -81,6 +81,12 @@ def key_of(entry: Any) -> Any:
     return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
 
 
+def without_pattern(n: int, dtype: Any) -> Array:
+    """The sines of 1, 4, 9, ..., in which there is no pattern: as a direction they are in general
+    position, and the same in every call."""
+    return jnp.sin(jnp.arange(1, n + 1, dtype=dtype) ** 2)
+
+
 def ravel(y: Any) -> Any:
     """The components of `y` as one real vector, complex ones as real and imaginary parts."""
     leaves = [jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))]

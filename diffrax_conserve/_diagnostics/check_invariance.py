@@ -34,7 +34,7 @@ from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
 from .._projection.equations import Jacobian, equations_of, relative, shown_terms
 from .._projection.roundoff import hidden_terms
-from .._tree import key_of, ravel, unravel
+from .._tree import key_of, ravel, unravel, without_pattern
 
 Entry = FirstIntegral | Constraint
 
@@ -247,7 +247,7 @@ def _relative_sizes(
     # size of the others.
     sizes = jnp.abs(vector)
     sizes = _BESIDE * jnp.where(sizes == 0, jnp.max(sizes, initial=0), sizes)
-    beside = vector + sizes * jnp.sin(jnp.arange(1, vector.size + 1, dtype=dtype) ** 2)
+    beside = vector + sizes * without_pattern(vector.size, dtype)
     idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field, so that its value is less accurate than its size tells. If
     # that roundoff is much larger than the terms, the defect is relative to it.

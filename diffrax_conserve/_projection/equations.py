@@ -221,6 +221,7 @@ def measure(
     equations = equations_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
+    # Without `least`, which is for tolerances: where all terms are zero, so is the scale.
     scale = equations.magnitude + shown_terms(jacobian, vector)
     return unflatten(g, like), unflatten(scale, like)
 

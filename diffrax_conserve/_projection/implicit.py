@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._tree import tree_tangents
+from .._tree import tree_tangents, without_pattern
 from .chord import FROZEN_STEPS, Solved, chord
 from .elimination import (
     WRITTEN_OUT_MAX,
@@ -41,12 +41,12 @@ _SMALL_ANGLE, _SHORT_CORRECTION = 1e-2, 1e-5
 # them we look at the sine at another state, at this relative distance, so far that gradients which
 # are parallel only here have visibly turned.
 _OFFSET = 1e-3
-# If we do not know how far a component moves, it counts as larger by this share of the largest one,
-# because its own value may just cross zero. The number is a choice.
-_CROSSING = 0.1
 # If the gradients are parallel there too, their sine is roundoff: at most this many units of it,
 # for a QR decomposition of gradients that are themselves rounded.
 _PARALLEL = 64
+# If we do not know how far a component moves, it counts as larger by this share of the largest one,
+# because its own value may just cross zero. The number is a choice.
+_CROSSING = 0.1
 
 
 @eqx.filter_custom_jvp
@@ -138,10 +138,7 @@ def certain(
     sizes = equations.sizes
     if not equations.moves:
         sizes = sizes + _CROSSING * jnp.max(sizes, initial=0)
-    # The sines of 1, 4, 9, ... have no pattern, so that this direction is in general position, and
-    # the same in every call.
-    phases = jnp.sin(jnp.arange(1, y.size + 1, dtype=y.dtype) ** 2)
-    beside = y + _OFFSET * sizes * phases
+    beside = y + _OFFSET * sizes * without_pattern(y.size, y.dtype)
     dependent = _sines(equations, equations.linearise(beside)[1]) <= _PARALLEL * eps
     relative_change = jnp.abs(relative(y - candidate, sizes))
     amplified = jnp.max(relative_change, initial=0) > _SHORT_CORRECTION * sines

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo, adapted
-from .equations import Equations
 from .sparse import pattern_of
 
 
@@ -105,14 +104,11 @@ def _restricted(
     sizes = [eqx.filter_eval_shape(part, y).size for part in problem.equations.parts]
     rows = np.flatnonzero(np.repeat(wanted, sizes))
     parts = tuple(it.compress(problem.equations.parts, wanted))
-    equations = Equations(
-        parts,
-        problem.equations.magnitude[rows],
-        problem.equations.hidden[rows],
-        problem.equations.sizes,
-        problem.equations.least,
-        units=problem.equations.units,
-        moves=problem.equations.moves,
+    equations = dataclasses.replace(
+        problem.equations,
+        parts=parts,
+        magnitude=problem.equations.magnitude[rows],
+        hidden=problem.equations.hidden[rows],
         pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
     )
     return dataclasses.replace(

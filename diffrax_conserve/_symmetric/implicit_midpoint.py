@@ -12,7 +12,7 @@ import optimistix as optx
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import option
-from .._tree import ravel, tree_stop_gradient, unravel
+from .._tree import ravel, tree_stop_gradient, unravel, without_pattern
 
 # The iteration stops after a change of at most this many units of roundoff. It converges fast, so
 # what is left is much smaller than the change, and less than the rounding of the state.
@@ -101,10 +101,10 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         # The unknown is the increment `h f`, in units of what is rounded when it is added to the
         # state. So tolerances mean the same whatever the units of the state are.
         # The terms of a slope may cancel, and what is left has their roundoff. So the unit counts
-        # them too, by the change of the slope if each component changes by a share of itself. These
-        # shares, the sines of 1, 4, 9, ..., have no pattern that could cancel again.
+        # them too, by the change of the slope if each component changes by a share of itself. The
+        # shares have no pattern, with which the changes could cancel again.
         numbers = ravel(y0)
-        shares = jnp.sin(jnp.arange(1, numbers.size + 1, dtype=numbers.dtype) ** 2)
+        shares = without_pattern(numbers.size, numbers.dtype)
         slope = lambda y: terms.vf_prod(middle, y, args, control)  # noqa: E731
         _, answer = jax.jvp(slope, (y0,), (unravel(shares * numbers, y0),))
         units = tree_stop_gradient(jtu.tree_map(_size, y0, k0, answer))

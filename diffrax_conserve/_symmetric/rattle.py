@@ -443,8 +443,7 @@ def _iterated(
     first = attempt(solve, min(max_steps, FROZEN_STEPS))
     failed = first[1] == -1
     second = lax.cond(any_lane(failed), consistent, lambda: first)
-    x, left = (jnp.where(failed, b, a) for a, b in zip(first, second, strict=True))
-    return x, left
+    return jax.tree.map(lambda a, b: jnp.where(failed, b, a), first, second)
 
 
 def _on_tangent(
