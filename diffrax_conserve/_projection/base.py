@@ -280,15 +280,15 @@ class Target(eqx.Module):
         return self.values if self.gained is None else self.values + self.gained[0]
 
     def equations(self, t: RealScalarLike, y: Y) -> Equations:
-        """The equations at a time of the solver, for states near `y`."""
-        hidden = self.hidden
+        """The equations at a time of the solver, for states like `y`."""
+        hidden, like = self.hidden, jax.eval_shape(lambda: y)
         if self.gained is not None:
             # An energy that has been lost leaves a small value, which is a difference of large
             # numbers and has their roundoff. So its scale is at least that of the start.
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
-        manifold, motion = self.manifold, self.motion
-        equations = equations_of(manifold, self.value, t, y, self.args, hidden, motion)
+        equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
+        equations = dataclasses.replace(equations, units=self.motion, motion=self.motion)
         return adapted(equations, self.projection, t, y, self.args)
 
     def units(self, t: RealScalarLike, y: Y) -> Units:

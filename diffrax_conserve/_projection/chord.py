@@ -32,6 +32,7 @@ from .elimination import (
     eliminated,
     factored,
     gram_matrix,
+    gram_solve,
     scaled_rows,
 )
 from .equations import NOT_FINITE, ON, SETTLED, Equations, Jacobian, any_lane
@@ -45,6 +46,13 @@ from .sparse import SparseRows
 # directions are the gradients at the last state. The number is a choice; the law that needs a
 # second start is `tests/laws/test_never_silent.py -k almost_circular`.
 FROZEN_STEPS = 6
+# If a correction leaves at most this many units of roundoff of a component, the component is set to
+# zero. The subtraction `y - change` and the change itself are each rounded by one unit.
+_CANCELLED = 2
+# If a component is corrected by several constraints whose terms cancel, the rest is compared with
+# the sum of their sizes instead. Up to four terms are rounded, in the multiplier and in the
+# product.
+_CANCELLED_TERMS = 8
 
 
 class Solved(NamedTuple):
@@ -223,7 +231,10 @@ def _of_many(
 
     def body(carry: tuple[Iterate, Array]) -> tuple[Iterate, Array]:
         now, g = carry
-        moved = now.y - equations.moved(combine(solve(g)))
+        multiplier, terms = solve(g), None
+        if equations.may_vanish and not isinstance(scaled, SparseRows):
+            terms = combined(jnp.abs(multiplier), jnp.abs(scaled))
+        moved = _moved(equations, now.y, combine(multiplier), terms)
         y = jnp.where(now.left > 0, moved, now.y)
         g, left = test(equations.residual(y), now.left)
         return Iterate(y, left, now.num_steps + (left > 0).astype(int)), g
@@ -242,5 +253,23 @@ def corrected(
     The rows `U` are the gradients at `y`, the rows of `along` the directions `V`. The residuals `g`
     and their noise are divided by the same sizes as the rows of `U`.
     """
-    gram = gram_matrix(rows, along)
-    return y - equations.moved(combined(*eliminated(gram, g, along, noise)))
+    gram, terms = gram_matrix(rows, along), None
+    if equations.may_vanish:
+        sizes = jtu.tree_map(jnp.abs, along)
+        terms = combined(jnp.abs(gram_solve(gram, g, noise)), sizes)
+    return _moved(equations, y, combined(*eliminated(gram, g, along, noise)), terms)
+
+
+def _moved(equations: Equations, y: Array, change: Array, terms: Array | None) -> Array:
+    """`y - s change`. If the correction cancels a component down to roundoff, we set it to exactly
+    zero: a tolerance that is relative to the component could never be met by what is left.
+
+    The `terms` are the sizes of the constraints' contributions to `change`, given where all terms
+    of a residual may vanish. If they are much larger than their sum, their roundoff is what is
+    left.
+    """
+    rest = y - equations.moved(change)
+    size, units = jnp.abs(y), _CANCELLED
+    if terms is not None:
+        size, units = size + jnp.abs(equations.moved(terms)), _CANCELLED_TERMS
+    return jnp.where(jnp.abs(rest) <= units * float(jnp.finfo(y.dtype).eps) * size, 0, rest)

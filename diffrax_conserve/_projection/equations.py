@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import evaluate, is_entry
+from .._manifold import Constraint, evaluate, is_entry, named_entries
 from .._tree import ravel, unflatten, unravel
 from .metric import MatrixUnits, Units
 from .sparse import Pattern, SparseRows, pattern_of
@@ -62,14 +62,10 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `sizes`: how large each component is: its value at the candidate, plus its motion in a step,
-      where that is known.
-    - `moves`: whether it is known.
-    - `least`: by how much each component counts as larger in the scale. Where a conserved value is
-      zero, all terms may be zero on the manifold, as for `q[0] = 0`, so that a tolerance which is
-      relative to the component itself could never be met. Then it is one unit of roundoff of the
-      size, which the first correction leaves; otherwise zero.
+    - `motion`: how far each component moves in a step, where that is known; see `Target`.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
+    - `may_vanish`: whether all terms of a residual may be zero on the manifold, so that its
+      tolerance is zero too. Only those of a `Constraint` may, such as of `q[0] = 0`.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
     - `pattern`: the places of the elements of a sparse Jacobian; `None` if it is dense.
@@ -78,12 +74,11 @@ class Equations(eqx.Module):
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    sizes: Float[Array, " n"]
-    least: Float[Array, " n"]
     units: Units = None
-    moves: bool = eqx.field(default=False, static=True)
+    motion: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
+    may_vanish: bool = eqx.field(default=False, static=True)
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
     pattern: Pattern | None = eqx.field(default=None, static=True)
 
@@ -115,8 +110,8 @@ class Equations(eqx.Module):
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        y = jnp.abs(y if self.clip is None else self.clip(y))
-        return self.magnitude + shown_terms(jacobian, y + self.least)
+        y = y if self.clip is None else self.clip(y)
+        return self.magnitude + shown_terms(jacobian, y)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -221,9 +216,7 @@ def measure(
     equations = equations_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
     g, jacobian = equations.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-    # Without `least`, which is for tolerances: where all terms are zero, so is the scale.
-    scale = equations.magnitude + shown_terms(jacobian, vector)
-    return unflatten(g, like), unflatten(scale, like)
+    return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
 
 
 def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -> list[Part]:
@@ -239,43 +232,29 @@ def equations_of(
     manifold: Manifold,
     values: Float[Array, " m"],
     t: RealScalarLike,
-    y: Y,
+    like: Any,
     args: Args,
     hidden: Float[Array, " m"] | None = None,
-    motion: Float[Array, " n"] | None = None,
 ) -> Equations:
-    """The equations of a manifold with the conserved `values`, for states near `y`. If the `motion`
-    of the components in a step is known, it is their units too."""
+    """The equations of a manifold with the conserved `values`, for states like `like`."""
     hidden = jnp.zeros_like(values) if hidden is None else hidden
-    sizes = jnp.abs(ravel(y)).astype(values.dtype)
-    sizes = lax.stop_gradient(sizes if motion is None else sizes + motion)
-    like = jax.eval_shape(lambda: y)
+    like = jax.eval_shape(lambda: like)
     vector, parts, start = jax.eval_shape(ravel, like), [], 0
     functions = functions_of(manifold, t, like, args)
-    counts = [jax.eval_shape(fn, vector).size for fn in functions]
-    for fn, count in zip(functions, counts, strict=True):
+    sizes = [jax.eval_shape(fn, vector).size for fn in functions]
+    for fn, size in zip(functions, sizes, strict=True):
 
-        def part(y: Array, fn=fn, start=start, end=start + count) -> Array:
+        def part(y: Array, fn=fn, start=start, end=start + size) -> Array:
             return fn(y) - values[start:end]
 
         # The user's function may close over arrays, such as the parameters of a network. Conversion
         # makes them leaves of the equations: only so can the custom rules differentiate by them.
         parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
-        start += count
+        start += size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
-    pattern = pattern_of(functions, counts, vector)
-    eps = float(jnp.finfo(sizes.dtype).eps)
-    least = jnp.where(jnp.all(magnitude > 0), 0, eps * sizes)
-    return Equations(
-        tuple(parts),
-        magnitude,
-        hidden,
-        sizes,
-        least,
-        units=motion,
-        moves=motion is not None,
-        pattern=pattern,
-    )
+    may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
+    pattern = pattern_of(functions, sizes, vector)
+    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish, pattern=pattern)
 
 
 class _Known:

@@ -28,7 +28,7 @@ from .elimination import (
     scaled_rows,
     times,
 )
-from .equations import Equations, Jacobian, in_units, relative
+from .equations import Equations, Jacobian, in_units
 from .sparse import SparseRows
 
 # Gradients count as nearly parallel if the sine of their angle is below the cube root of roundoff.
@@ -44,8 +44,9 @@ _OFFSET = 1e-3
 # If the gradients are parallel there too, their sine is roundoff: at most this many units of it,
 # for a QR decomposition of gradients that are themselves rounded.
 _PARALLEL = 64
-# If we do not know how far a component moves, it counts as larger by this share of the largest one,
-# because its own value may just cross zero. The number is a choice.
+# The test above and the size of a correction need a size of each component. If we do not know how
+# far a component moves, we count at least this share of the largest one, because its own value may
+# just cross zero.
 _CROSSING = 0.1
 
 
@@ -135,12 +136,13 @@ def certain(
         crosses = jnp.abs(jnp.sum(gradient * directions)) > eps ** (1 / 3) * lengths
         return jnp.where(crosses | (lengths == 0), one, jnp.nan)
     sines = _sines(equations, jacobian)
-    sizes = equations.sizes
-    if not equations.moves:
-        sizes = sizes + _CROSSING * jnp.max(sizes, initial=0)
+    # The size of a component is its value plus how far it moves in a step, or, if that is not
+    # known, a share of the largest component: the value alone may just cross zero.
+    motion = equations.motion
+    sizes = jnp.abs(y) + (_CROSSING * jnp.max(jnp.abs(y), initial=0) if motion is None else motion)
     beside = y + _OFFSET * sizes * without_pattern(y.size, y.dtype)
     dependent = _sines(equations, equations.linearise(beside)[1]) <= _PARALLEL * eps
-    relative_change = jnp.abs(relative(y - candidate, sizes))
+    relative_change = jnp.abs(y - candidate) / jnp.where(sizes > 0, sizes, 1)
     amplified = jnp.max(relative_change, initial=0) > _SHORT_CORRECTION * sines
     doubtful = (sines <= eps ** (1 / 3)) | ((sines <= _SMALL_ANGLE) & amplified)
     return jnp.where(jnp.any(doubtful & ~dependent), jnp.nan, one)

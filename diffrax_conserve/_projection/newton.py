@@ -136,8 +136,6 @@ def _nearest(
         magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
         units=units,
-        sizes=jnp.concatenate([equations.sizes, nothing]),
-        least=jnp.concatenate([equations.least, nothing]),
     )
     end, found, more = descend(optimality, start, max_steps=max_steps, extra=1)
     if box is not None:

@@ -41,8 +41,8 @@ _HALVINGS = 30
 # A full step is kept if it ends just past the minimum, where the slope has the opposite sign, but
 # is at most this share of the slope at the start. Bisection would not make it better.
 _JUST_PAST = 1e-3
-# A component that an iteration reduces to this share of itself is set to zero, so that an amount
-# that is used up is exactly zero. A shortened step is known to 1e-9 of its length only.
+# A component that an iteration reduces to this share of itself is set to zero. The share is larger
+# than in `chord`, because a shortened step is known to 1e-9 of its length only.
 _VANISHES = 1e-8
 # Once the residuals are within the tolerance, up to this many more iterations are made, because at
 # a kink one iteration can leave the manifold again.
