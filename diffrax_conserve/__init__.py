@@ -34,6 +34,9 @@ from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
+from ._mechanics.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
+from ._mechanics.rattle import RATTLE as RATTLE
+from ._mechanics.symmetric_projection import SymmetricProjection as SymmetricProjection
 from ._projection import closed_forms as closed_forms
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
@@ -55,9 +58,6 @@ from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import Unrolled as Unrolled
-from ._symmetric.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
-from ._symmetric.rattle import RATTLE as RATTLE
-from ._symmetric.symmetric_projection import SymmetricProjection as SymmetricProjection
 from .learned._files import load as load
 from .learned._files import save as save
 from .learned._networks.deeponet import DeepONet as DeepONet

@@ -25,14 +25,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import has_bounds
-from ._projection.descent import descend
-from ._projection.equations import any_lane, length
 from ._projection.within_bounds import AbstractNewton, nearest_within
+from ._step.constants import MAX_STEPS
+from ._step.equations import length
+from ._step.iterate import any_lane, damped
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
-
-# The second attempt at a projection makes at most this many damped steps, as many as `Newton` by
-# default. It is made only in very long steps, where the undamped iteration has failed.
-_DAMPED_STEPS = 100
 
 
 @final
@@ -59,13 +56,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     The interpolant `u` of the wrapped solver ends at the candidate `ŷ₁`. It is moved so that it
     meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
     a step is. Where that fails, damped steps with fresh gradients are tried from the same state.
-    Where they fail too, or lead further away than the step is long, the value is the moved
-    interpolant itself, which is off the manifold by the error of the interpolation. Of a projection
-    with bounds it is the nearest value within them, because an interpolant can meet a balance, and
-    so look like a success, with a concentration that is negative. With bounds an interpolant that
-    swings out of them, further than the step is long, may be led back as far as the start of the
-    step is away. That is a state on the manifold and within the bounds, so where these are convex,
-    as for balances that are linear, the nearest such state is never further away.
+    Where they fail too, or lead further away than the step is long and than its start is away, the
+    value is the moved interpolant itself, which is off the manifold by the error of the
+    interpolation. With bounds it is the nearest value within them.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
 
@@ -121,36 +114,33 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         start = lambda: self.inner.evaluate(self.t0)  # noqa: E731
         step = target.step(self.t0, self.t1, start, self.error)
         problem = target.problem(t, candidate, step)
-        units, limit = problem.equations.units, lax.stop_gradient(self.limit)
-        bounded = has_bounds(target.projection)
-        if bounded:
-            away = length(ravel(tree_sub(candidate, start())), units)
-            limit = jnp.maximum(limit, lax.stop_gradient(away))
+        units = problem.equations.units
+        away = length(ravel(tree_sub(candidate, start())), units)
+        limit = lax.stop_gradient(jnp.maximum(self.limit, away))
 
         def near(candidate: Array, y: Array, ok: Array) -> tuple[Array, Array]:
-            """`y`, and whether it succeeded without leading further away than the step is long."""
+            """`y`, and whether it succeeded without leading too far away."""
             return y, ok & (length(y - candidate, units) <= limit)
 
         def project(candidate: Array) -> tuple[Array, Array]:
             y, info = target.projection.solve(problem, candidate)
             return near(candidate, y, info.ok)
 
-        def damped(candidate: Array) -> tuple[Array, Array]:
-            y, ok, _ = descend(problem.equations, candidate, max_steps=_DAMPED_STEPS)
+        def fresh(candidate: Array) -> tuple[Array, Array]:
+            y, ok, _, _ = damped(problem.equations, candidate, max_steps=MAX_STEPS)
             return near(candidate, y, ok)
 
         vector = ravel(candidate)
         # A second attempt by damped steps makes sense only if the projection follows gradients too.
         # The rule of another projection, such as a line, leads elsewhere. And bounds would be lost.
-        by_gradients = isinstance(target.projection, AbstractNewton)
-        damps = by_gradients and not bounded
-        attempts = [project, damped] if damps else [project]
+        bounded = has_bounds(target.projection)
+        by_gradients = isinstance(target.projection, AbstractNewton) and not bounded
+        attempts = [project, fresh] if by_gradients else [project]
         # `_first_of` has a derivative rule too, so its functions are converted likewise.
         attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
-        y, failed = _first_of(attempts, vector)
+        y, _ = _first_of(attempts, vector)
         if bounded:
-            within = nearest_within(target.projection, problem.like, y)
-            y = jnp.where(failed < len(attempts), y, within)
+            y = nearest_within(target.projection, problem.like, y)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._projection.jaxprs import jaxprs_inside
-from diffrax_conserve._projection.scalars import MAX_OPERATIONS, components, in_scalars, written_out
+from diffrax_conserve._fast.jaxprs import jaxprs_inside
+from diffrax_conserve._fast.scalars import components, in_scalars, written_out
+from diffrax_conserve._step.constants import OPERATIONS
 
 from .thinned import some_of
 
@@ -223,8 +224,8 @@ def test_what_is_too_large_has_an_effect_or_random_numbers_is_not_written_out():
         jax.debug.print("{}", y)
         return y
 
-    assert in_scalars(lambda y: y + 1, jnp.ones(MAX_OPERATIONS // 2)) is not None
-    assert in_scalars(lambda y: y + y + 1, jnp.ones(MAX_OPERATIONS)) is None
+    assert in_scalars(lambda y: y + 1, jnp.ones(OPERATIONS // 2)) is not None
+    assert in_scalars(lambda y: y + y + 1, jnp.ones(OPERATIONS)) is None
     assert in_scalars(prints, jnp.ones(3)) is None
     assert in_scalars(lambda y: y + jr.normal(jr.key(0)), jnp.ones(3)) is None
 

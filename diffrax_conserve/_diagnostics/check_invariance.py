@@ -32,8 +32,8 @@ from .._manifold import (
 )
 from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
-from .._projection.equations import Jacobian, equations_of, relative, shown_terms
-from .._projection.roundoff import hidden_terms
+from .._step.equations import Jacobian, equations_of, relative, shown_terms
+from .._step.roundoff import hidden_terms
 from .._tree import key_of, ravel, unravel, without_pattern
 
 Entry = FirstIntegral | Constraint
@@ -237,7 +237,7 @@ def _relative_sizes(
         """The sum of the sizes of its terms."""
         state = unravel(vector, y)
         slope = ravel(slope_of(vector_field, t, state, args))
-        return shown_terms(jacobian, slope) + jnp.abs(partial) + jnp.abs(rate)
+        return shown_terms(jacobian, jnp.abs(slope)) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)
     # If each term of the derivative is zero, its sum tells nothing, as at an equilibrium. Only if

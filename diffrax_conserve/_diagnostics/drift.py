@@ -21,8 +21,9 @@ from .._manifold import (
     named_entries,
 )
 from .._options import check_solution
-from .._projection.equations import ROUNDOFF_MULTIPLE, measure, relative, shown_terms
-from .._projection.roundoff import hidden_scale
+from .._step.constants import ROUNDOFF
+from .._step.equations import measure, relative, shown_terms
+from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_add, tree_shapes, tree_sub
 
 
@@ -129,8 +130,8 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         # here anew, and may be a bit smaller than where the solve measured it.
         g = ravel(residual(t, y))
         _, jacobian, hidden = hidden_scale(manifold, t, y, args)
-        scale = numbers + shown_terms(jacobian, ravel(y)) + hidden
-        limit = 2 * ROUNDOFF_MULTIPLE * float(jnp.finfo(g.dtype).eps) * scale
+        scale = numbers + shown_terms(jacobian, jnp.abs(ravel(y))) + hidden
+        limit = 2 * ROUNDOFF * float(jnp.finfo(g.dtype).eps) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 
     return jax.vmap(at)(ts, ys)

@@ -18,9 +18,9 @@ from .._balance import integrated_rates
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry
 from .._printing import is_traced, printed
+from .._step.equations import ON, Equations, equations_of, length, relative
+from .._step.metric import MatrixUnits, Units, units_of
 from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
-from .equations import ON, Equations, equations_of, length, relative
-from .metric import MatrixUnits, Units, units_of
 
 
 @final
@@ -222,8 +222,9 @@ class Target(eqx.Module):
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
-    - `motion`: how far each component moves in a step, its unit in the metric of motion; `None`
-      where that is not the metric, with noise and outside a solve.
+    - `motion`: how far each component may be moved; see `Equations`.
+    - `units`: those of the components where the projection has no metric of its own; `None` if they
+      are one, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
       backwards in time, otherwise 1.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
@@ -234,7 +235,8 @@ class Target(eqx.Module):
     manifold: Manifold
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    motion: Float[Array, " n"] | None
+    motion: Float[Array, " n"]
+    units: Float[Array, " n"] | None
     args: Args
     direction: Real[Array, ""]
     gained: Float[Array, "2 m"] | None = None
@@ -288,13 +290,13 @@ class Target(eqx.Module):
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
-        equations = dataclasses.replace(equations, units=self.motion, motion=self.motion)
+        equations = dataclasses.replace(equations, units=self.units, motion=self.motion)
         return adapted(equations, self.projection, t, y, self.args)
 
-    def units(self, t: RealScalarLike, y: Y) -> Units:
+    def metric(self, t: RealScalarLike, y: Y) -> Units:
         """The units of the components in the metric of the projection, at a time of the solver."""
         metric = self.projection.metric
-        return self.motion if metric is None else units_of(metric, t * self.direction, y, self.args)
+        return self.units if metric is None else units_of(metric, t * self.direction, y, self.args)
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Callable[[], Y], error: Y | None

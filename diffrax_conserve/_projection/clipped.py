@@ -11,8 +11,8 @@ from jaxtyping import ArrayLike, PyTree
 from .._custom_types import VF, Args, RealScalarLike, Y
 from .._manifold import check_vector_field
 from .._options import check_numbers
+from .._step.metric import spread
 from .._tree import ravel, unravel
-from .metric import spread
 from .options import check_state
 
 

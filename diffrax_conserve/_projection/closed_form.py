@@ -10,9 +10,9 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import RealScalarLike, Values
 from .._options import check_function
+from .._step.metric import positive_weights
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .metric import positive_weights
 from .options import check_options, option
 
 

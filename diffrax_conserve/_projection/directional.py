@@ -9,9 +9,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._step.constants import MAX_STEPS
+from .._step.implicit import Along, solution
 from .base import AbstractProjection, Problem, ProjectionInfo
-from .implicit import project_along
-from .options import MAX_STEPS, check_options, option
+from .options import check_options, option
 
 
 class AbstractAlongLine(AbstractProjection):
@@ -55,7 +56,7 @@ class AbstractAlongLine(AbstractProjection):
         direction = self.direction(problem, candidate)
         equations = dataclasses.replace(problem.equations, units=jnp.abs(direction))
         signs = lax.stop_gradient(jnp.sign(direction))[None]
-        y, ok, count = project_along(equations, candidate, signs, max_steps=self.max_steps)
+        y, ok, count, _ = solution(Along(equations, candidate, signs, max_steps=self.max_steps))
         wanted = self.is_wanted(problem, candidate, y)
         return y, problem.report(candidate, y, count, ok=ok & wanted)
 

@@ -2,38 +2,38 @@
 
 The nearest point is a stationary point of the distance under the constraints, where the Lagrange
 conditions `y - ŷ - M⁻¹ G(y)ᵀ λ = 0` and `g(y) = 0` hold. These are equations for the pair `(y, λ)`.
-So they are solved by the same damped iteration as `g(y) = 0` alone, `descent.descend`, and the
-derivative follows from the implicit function theorem for them.
+So they are solved by the same damped iteration as `g(y) = 0` alone, and the derivative follows from
+the implicit function theorem for them.
 """
 
 import dataclasses
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
+from .._step.constants import MAX_STEPS, NEAREST
+from .._step.equations import Equations, measured
+from .._step.implicit import AbstractSystem, solution
+from .._step.iterate import Solved, damped
+from .._step.linear import (
+    combined,
+    gram_matrix,
+    is_determined,
+    scaled_rows,
+    solve,
+    solve_large,
+    times,
+)
+from .._step.metric import MatrixUnits
+from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
-from .descent import descend
-from .elimination import combined, gram_matrix, gram_solve, scaled_rows, times
-from .equations import Equations, in_units
-from .implicit import certain
-from .metric import MatrixUnits
 from .options import NEWTON_OPTIONS, option
-from .within_bounds import AbstractNewton, Box, project_within
-
-# The nearest point is sought for at most this many unknowns and constraints together, because each
-# iteration solves a dense system of that size. The docstring of `Newton` gives the number.
-_NEAREST_MAX = 512
-# A singular value below this many units of roundoff of the largest belongs to constraints that
-# depend on each other: the roundoff of a singular value decomposition of a rounded matrix.
-_SINGULAR = 64
-# A projection from far away makes at most this many iterations in each phase, by default. Nearby it
-# needs about five; the rest is for steps that must be shortened.
-_MAX_STEPS = 100
+from .within_bounds import AbstractNewton, Bounds, project_within
 
 
 @final
@@ -69,7 +69,7 @@ class Newton(AbstractNewton):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.4, (4.3).
     """
 
-    max_steps: int = option(_MAX_STEPS, static=True)
+    max_steps: int = option(MAX_STEPS, static=True)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
@@ -80,11 +80,10 @@ class Newton(AbstractNewton):
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
-        equations = problem.equations
-        box = self.box(problem.like)
-        unknowns, _, _, count = _nearest(equations, candidate, box, max_steps=self.max_steps)
-        y = unknowns[: candidate.size]
-        return y, problem.report(candidate, y, count)
+        equations, bounds = problem.equations, self.bounds(problem.like)
+        system = _Nearest(equations, candidate, bounds, max_steps=self.max_steps)
+        (y, _), _, num_steps, _ = solution(system)
+        return y, problem.report(candidate, y, num_steps)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS
@@ -97,106 +96,113 @@ class _Optimality(eqx.Module):
 
     equations: Equations
     candidate: Float[Array, " n"]
-    box: Box | None
+    bounds: Bounds | None
     sizes: Float[Array, " m"]
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         y, multiplier = jnp.split(unknowns, [self.candidate.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(self.equations.residual, y)
-        gradient = self.equations.scaled(vjp(multiplier / self.sizes)[0])
-        z = self.candidate + self.equations.moved(gradient)
-        return jnp.concatenate([y - (z if self.box is None else self.box.clip(z)), g])
+        gradient = self.equations.in_units(vjp(multiplier / self.sizes)[0])
+        z = self.candidate + self.equations.change(gradient)
+        return jnp.concatenate([y - (z if self.bounds is None else self.bounds.clip(z)), g])
 
 
-@eqx.filter_custom_jvp
-def _nearest(
-    equations: Equations, candidate: Float[Array, " n"], box: Box | None, *, max_steps: int
-) -> tuple[Float[Array, " N"], Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]:
-    """State and scaled multipliers in one vector, the sizes by which the multipliers are scaled,
-    whether the state is the nearest point, and the number of iterations."""
-    # First phase: some point of the manifold.
-    if box is None:
-        y, _, count = descend(equations, candidate, max_steps=max_steps)
-    else:
-        y, _, count = project_within(box, equations, candidate, max_steps=max_steps)
-    n, nothing = y.size, jnp.zeros_like(equations.magnitude)
-    if n + nothing.size > _NEAREST_MAX:
-        return jnp.concatenate([y, nothing]), nothing + 1, jnp.asarray(False), count
-    # Second phase: the nearest point. It starts from the multipliers that fit `y - ŷ` best.
-    equations = equations.dense()
-    sizes, unit, gram, units = _scaled(equations, y)
-    along = times(unit, in_units(y - candidate, equations.units))
-    start = jnp.concatenate([y, gram_solve(gram, along)])
-    # The Lagrange conditions take the place of the constraints. There are as many as unknowns, so
-    # the Gauss-Newton steps of `descend` are steps of Newton's method.
-    optimality = dataclasses.replace(
-        equations,
-        parts=(_Optimality(equations, candidate, box, sizes),),
-        magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
-        hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-        units=units,
-    )
-    end, found, more = descend(optimality, start, max_steps=max_steps, extra=1)
-    if box is not None:
-        end = jnp.concatenate([box.clip(end[:n]), end[n:]])
-        found = found & equations.holds(end[:n])
-    return jnp.where(found, end, start), sizes, found, count + more
+class _Nearest(AbstractSystem):
+    """The nearest point to the candidate. The unknowns are the state and its multipliers, divided by
+    the sizes of the gradients; the multipliers are NaN if only a point of the manifold was
+    found."""
 
+    equations: Equations
+    candidate: Float[Array, " n"]
+    bounds: Bounds | None
+    max_steps: int = eqx.field(static=True, kw_only=True)
 
-def _scaled(equations: Equations, y: Float[Array, " n"]) -> tuple[Array, Array, Array, Array]:
-    """The sizes of the rows of `G diag(s)`, the rows divided by them, their Gram matrix, and units
-    for `y` and for the multipliers, with which no condition number depends on the units of the
-    user."""
-    sizes, unit = scaled_rows(equations.scaled(equations.linearise(y)[1]))
-    gram = gram_matrix(unit, unit)
-    lengths = jnp.diagonal(gram)
-    units = lax.rsqrt(jnp.where(lengths > 0, lengths, 1))
-    own = equations.units.sizes if isinstance(equations.units, MatrixUnits) else equations.units
-    units = jnp.concatenate([jnp.ones_like(y) if own is None else own, units])
-    return sizes, unit, gram, units
+    def found(self) -> Solved:
+        equations, candidate, bounds = self.equations, self.candidate, self.bounds
+        # First phase: some point of the manifold.
+        if bounds is None:
+            first = damped(equations, candidate, max_steps=self.max_steps)
+        else:
+            first = project_within(bounds, equations, candidate, max_steps=self.max_steps)
+        y, nothing = first.y, jnp.full_like(equations.magnitude, jnp.nan)
+        if not self._is_sought():
+            return first._replace(y=(y, nothing))
+        # Second phase: the nearest point. It starts from the multipliers that fit `y - ŷ` best. The
+        # Lagrange conditions take the place of the constraints. There are as many as unknowns, so
+        # the steps of the damped iteration are those of Newton's method.
+        equations, sizes, units, start = self._at(y)
+        conditions = dataclasses.replace(
+            equations,
+            parts=(_Optimality(equations, candidate, bounds, sizes),),
+            magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
+            hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
+            motion=None,
+            units=units,
+        )
+        end, nearest, more, _ = damped(conditions, start, max_steps=self.max_steps, polish=True)
+        end, multiplier = jnp.split(end, [y.size])
+        if bounds is not None:
+            end = bounds.clip(end)
+        nearest = nearest & equations.holds(end)
+        both = jnp.where(nearest, end, y), jnp.where(nearest, multiplier, nothing)
+        return Solved(both, nearest | first.ok, first.num_steps + more)
 
+    def _is_sought(self) -> bool:
+        return self.candidate.size + self.equations.magnitude.size <= NEAREST
 
-@_nearest.def_jvp
-def _nearest_jvp(primals: Any, tangents: Any, *, max_steps: int) -> Any:
-    """By the implicit function theorem: the Lagrange conditions stay zero. So their tangent at
-    constant `y` and `λ`, which is `right`, is cancelled by the tangents of `y` and `λ` times the
-    Jacobian, which is `matrix`. Rows and columns are scaled by the units."""
-    equations, candidate, _ = primals
-    solved = _nearest(*primals, max_steps=max_steps)
-    unknowns, sizes, found, _ = solved
-    if unknowns.size > _NEAREST_MAX:
-        return solved, (jnp.full_like(unknowns, jnp.nan), None, None, None)
-    y = unknowns[: candidate.size]
-    equations = equations.dense()
-    _, _, _, units = _scaled(equations, y)
-    _, right = eqx.filter_jvp(lambda *p: _Optimality(*p, sizes=sizes)(unknowns), primals, tangents)
-    right = jnp.zeros_like(unknowns) if right is None else right
-    matrix = jax.jacfwd(_Optimality(*primals, sizes=sizes))(unknowns)
-    # A component that is never moved has no unit, but its tangent is known: that of the candidate.
-    known = jnp.where(units == 0, right, 0)
-    right = right - combined(known, matrix.T)
-    rows = jnp.concatenate([jnp.where(units == 0, 1, units)[: y.size], sizes / units[y.size :]])
-    tangent = -known - units * _shortest(matrix / rows[:, None] * units, right / rows)
-    # Only the nearest point has a derivative, so it is NaN where only the first phase succeeded.
-    # The result of a failed projection is discarded, and its derivative must stay finite.
-    sure = certain(equations, candidate, y, equations.linearise(y)[1])
-    doubt = jnp.where(found, sure, jnp.nan)
-    doubt = lax.stop_gradient(jnp.where(equations.holds(y), doubt, 1))
-    return solved, (doubt * tangent, None, None, None)
+    def _at(self, y: Array) -> tuple[Equations, Array, Array, Array]:
+        """The equations, dense; the sizes of the rows of `G S` at a state; units for the state and
+        for the multipliers, with which no condition number depends on the units of the user; and
+        the state with the multipliers that fit best."""
+        equations = self.equations.dense()
+        sizes, rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))
+        gram = gram_matrix(rows, rows)
+        lengths = jnp.diagonal(gram)
+        own = equations.units
+        own = (
+            own.sizes if isinstance(own, MatrixUnits) else jnp.ones_like(y) if own is None else own
+        )
+        units = jnp.concatenate([own, lax.rsqrt(jnp.where(lengths > 0, lengths, 1))])
+        fits = solve(gram, times(rows, measured(y - self.candidate, equations.units)))
+        return equations, sizes, units, jnp.concatenate([y, fits])
 
+    def _conditions(self, y: Array) -> tuple[_Optimality, Array, Array]:
+        """The Lagrange conditions, with the `sizes` and `units` of a state. These are no parameters:
+        they only say in which units the unknowns are."""
+        _, sizes, units, _ = tree_stop_gradient(self._at(y))
+        equations = self.equations.dense()
+        return _Optimality(equations, self.candidate, self.bounds, sizes), sizes, units
 
-def _shortest(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
-    """The solution of least norm, by singular values, because constraints that depend on each other
-    make the system singular but consistent. It can be differentiated again, in both modes, as the
-    solution of a linear system. An infinite element is replaced by NaN first, because LAPACK does
-    not return from a matrix with infinite elements."""
-    fixed = lax.stop_gradient(jnp.where(jnp.isfinite(matrix), matrix, jnp.nan))
-    u, s, vt = jnp.linalg.svd(fixed)
-    inverse = jnp.where(s > _SINGULAR * float(jnp.finfo(b.dtype).eps) * s[0], 1 / s, 0)
-    return lax.custom_linear_solve(
-        lambda x: combined(x, matrix.T),
-        b,
-        lambda _, b: combined(inverse * combined(b, u), vt),
-        lambda _, b: combined(inverse * combined(b, vt.T), u.T),
-    )
+    def defect(self, solved: Solved) -> Array:
+        y, multiplier = solved.y
+        if not self._is_sought():
+            return jnp.concatenate([self.candidate, multiplier])
+        conditions, _, _ = self._conditions(y)
+        known = jnp.where(jnp.isfinite(multiplier), multiplier, 0)
+        return conditions(jnp.concatenate([y, known]))
+
+    def linear_solution(self, solved: Solved, right: Array) -> tuple[Array, Array]:
+        """Rows and columns of the Jacobian are scaled by the units. Only the nearest point has a
+        derivative, so it is NaN where only the first phase succeeded. The result of a failed
+        projection is discarded, and its derivative must stay finite."""
+        y, multiplier = solved.y
+        if not self._is_sought():
+            tangent = jnp.full_like(right, jnp.nan)
+            return tangent[: y.size], tangent[y.size :]
+        conditions, sizes, units = self._conditions(y)
+        known = jnp.where(jnp.isfinite(multiplier), multiplier, 0)
+        matrix = jax.jacfwd(conditions)(jnp.concatenate([y, known]))
+        # A component that is never moved has no unit, but its tangent is known: that of the
+        # candidate.
+        fixed = jnp.where(units == 0, right, 0)
+        right = right - combined(fixed, matrix.T)
+        rows = jnp.concatenate([jnp.where(units == 0, 1, units)[: y.size], sizes / units[y.size :]])
+        rows = lax.stop_gradient(rows)
+        tangent = fixed + units * solve_large(matrix / rows[:, None] * units, right / rows)
+        gradients = self.equations.dense()
+        gradients = scaled_rows(gradients.in_units(gradients.linearise(y)[1]))[1]
+        right = jnp.all(jnp.isfinite(multiplier)) & is_determined(gram_matrix(gradients, gradients))
+        right = right | ~self.equations.holds(y)
+        tangent = lax.stop_gradient(jnp.where(right, 1, jnp.nan)).astype(tangent.dtype) * tangent
+        return tangent[: y.size], tangent[y.size :]

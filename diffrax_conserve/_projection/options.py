@@ -10,10 +10,6 @@ import jax.tree_util as jtu
 from .._custom_types import Y
 from .._options import check_counts, check_number, check_numbers, dtype_of
 
-# By default a Newton iteration makes at most this many iterations. In a solve it needs about two.
-# The rest is for steps that are much too long, and a projection that fails costs all of them.
-MAX_STEPS = 50
-
 
 def option(default: Any, **kwargs: Any) -> Any:
     """An optional, keyword-only field."""

@@ -3,20 +3,18 @@
 import dataclasses
 
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
+from .._step.equations import shown_terms
+from .._step.roundoff import hidden_scale
 from .._tree import ravel
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
-from .equations import any_lane, shown_terms
 from .newton import Newton
 from .options import check_state
-from .roundoff import hidden_scale
 
 
 def project(
@@ -70,37 +68,31 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    hidden, direction = jnp.zeros_like(values), jnp.asarray(1)
-    return _projected(Target(projection, manifold, values, hidden, None, args, direction), t, y)
+    hidden, size, direction = jnp.zeros_like(values), jnp.abs(ravel(y)), jnp.asarray(1)
+    target = Target(projection, manifold, values, hidden, size, None, args, direction)
+    return _projected(target, t, y)
 
 
 @eqx.filter_jit
 def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
-    """The tolerance follows the roundoff of the functions. That is measured before the projection,
-    at the candidate. At a result far away it may be different, so it is measured there too. If the
-    projection failed, or the roundoff at its result is much smaller, we make it once more, with the
-    roundoff that was measured at the result."""
-
-    def by(hidden: Array) -> tuple[Y, ProjectionInfo, Array, Array]:
-        """The projection with a tolerance for the roundoff `hidden`; the roundoff at its result;
-        and whether that justifies the tolerance, which may be twice too large."""
-        y, info = dataclasses.replace(target, hidden=hidden).project(t, candidate)
-        # If the projection failed, its result may be NaN, where nothing can be measured.
-        usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
-        value, jacobian, found = hidden_scale(target.manifold, t, usable, target.args)
-        shown = jnp.abs(value) + shown_terms(jacobian, ravel(usable))
-        return y, info, found, jnp.all(hidden <= 2 * (shown + found))
-
-    hidden = hidden_scale(target.manifold, t, candidate, target.args)[2]
-    y, info, found, justified = first = by(hidden)
-    done = info.ok & justified
-    again = lax.cond(any_lane(~done), lambda: by(found), lambda: first)
-    y, info, _, justified = jtu.tree_map(lambda a, b: jnp.where(done, a, b), first, again)
-    # If the roundoff measured at the result is smaller than what we assumed, the tolerance was too
-    # loose, and we report a failure.
-    missed = optx.RESULTS.nonlinear_max_steps_reached
-    result = optx.RESULTS.where(info.ok & ~justified, missed, info.result)
-    return y, dataclasses.replace(info, ok=info.ok & justified, result=result)
+    """The tolerance follows the roundoff of the functions, which is measured at the candidate. At a
+    result far away it may be different, so the result is judged by what is measured there."""
+    _, _, hidden = hidden_scale(target.manifold, t, candidate, target.args)
+    target = dataclasses.replace(target, hidden=hidden)
+    y, info = target.project(t, candidate)
+    # If the projection failed, its result may be NaN, where nothing can be measured.
+    usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
+    value, jacobian, hidden = hidden_scale(target.manifold, t, usable, target.args)
+    there = dataclasses.replace(target, hidden=hidden).problem(t, candidate)
+    judged = there.report(ravel(candidate), ravel(y), info.num_steps)
+    # The projection may have its own tolerances, and then its own verdict counts, unless it assumed
+    # more roundoff than there is.
+    shown = jnp.abs(value) + shown_terms(jacobian, jnp.abs(ravel(usable)))
+    ok = judged.ok | info.ok & jnp.all(target.hidden <= 2 * (shown + hidden))
+    kinds = optx.RESULTS
+    missed = kinds.where(info.ok, kinds.nonlinear_max_steps_reached, info.result)
+    result = kinds.where(ok, kinds.successful, missed)
+    return y, dataclasses.replace(judged, ok=ok, result=result)
 
 
 def given_values(

@@ -1,15 +1,16 @@
 """The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as
 close to the manifold as the local error of a step. It moves along the gradients at the candidate.
-The iteration itself is in `chord`, that within bounds in `within_bounds`, the derivative in
-`implicit`."""
+The iteration itself is `iterate.nearby`, that within bounds is in `within_bounds`, the derivative
+in `implicit`."""
 
 from typing import final
 
 from jaxtyping import Array, Float
 
+from .._step.constants import MAX_STEPS
+from .._step.implicit import Along, solution
 from .base import Problem, ProjectionInfo
-from .implicit import project_along
-from .options import MAX_STEPS, NEWTON_OPTIONS, option
+from .options import NEWTON_OPTIONS, option
 from .within_bounds import AbstractNewton, project_within
 
 
@@ -23,15 +24,16 @@ class SimplifiedNewton(AbstractNewton):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    Two iterations are enough for nearly every step of an integrator. If two to four constraints are
+    Two iterations are enough for nearly every step of an integrator. If up to four constraints are
     not met after six, the plane of the corrections may miss the manifold, as on a circular orbit:
-    then the iteration starts again along fresh gradients, and the derivative is NaN. With more than
-    four the matrix is that at the candidate, factored once, so that after a long step it takes more
-    iterations, and fails sooner. For candidates far away use [`diffrax_conserve.Newton`][].
+    from then on the corrections are along the gradients at each state, and the derivative is NaN.
+    With more than four the matrix is that at the candidate, factored once, so that after a long
+    step it takes more iterations, and fails sooner. For candidates far away use
+    [`diffrax_conserve.Newton`][].
 
     The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state,
-    independent of the number of iterations. It is NaN where the gradients of the constraints are so
-    nearly parallel that roundoff would dominate it.
+    independent of the number of iterations. It is NaN where the gradients of up to four constraints
+    are so nearly parallel that half of its digits would be lost.
 
     !!! example
 
@@ -56,12 +58,11 @@ class SimplifiedNewton(AbstractNewton):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        equations = problem.equations
-        box = self.box(problem.like)
-        if box is None:
-            y, ok, count = project_along(equations, candidate, None, max_steps=self.max_steps)
+        equations, bounds = problem.equations, self.bounds(problem.like)
+        if bounds is None:
+            y, ok, count, _ = solution(Along(equations, candidate, max_steps=self.max_steps))
         else:
-            y, ok, count = project_within(box, equations, candidate, max_steps=self.max_steps)
+            y, ok, count, _ = project_within(bounds, equations, candidate, max_steps=self.max_steps)
         return y, problem.report(candidate, y, count, ok=ok)
 
 

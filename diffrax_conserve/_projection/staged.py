@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._large.sparse import pattern_of
 from .._tree import ravel
 from .base import AbstractProjection, Problem, ProjectionInfo, adapted
-from .sparse import pattern_of
 
 
 @final

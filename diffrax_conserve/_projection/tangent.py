@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._fast.scalars import written_out
 from .._manifold import (
     check_manifold,
     check_vector_field,
@@ -24,12 +25,11 @@ from .._manifold import (
     slope_of,
 )
 from .._options import check_number
+from .._step.equations import equations_of
+from .._step.linear import corrected, gram_matrix, scaled_rows, solve
+from .._step.metric import positive_weights, units_of
 from .._tree import ravel, tree_add, unflatten, unravel
-from .elimination import combined, eliminated, gram_matrix, gram_solve, scaled_rows
-from .equations import equations_of
-from .metric import positive_weights, units_of
 from .options import check_state
-from .scalars import written_out
 
 
 def tangent(
@@ -158,10 +158,10 @@ class TangentField(eqx.Module):
             sizes, and so is the right side."""
             vector, wrong = given
             _, jacobian = equations.linearise(vector)
-            sizes, rows = scaled_rows(equations.scaled(jacobian))
+            sizes, rows = scaled_rows(equations.in_units(jacobian))
             gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = equations.moved(combined(*eliminated(gram, right, rows)))
-            return change, gram_solve(gram, right) / sizes
+            change = equations.change(corrected(rows, rows, right))
+            return change, solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)

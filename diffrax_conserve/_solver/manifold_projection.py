@@ -16,9 +16,10 @@ from .._interpolation import MakeManifoldInterpolation, PackedTarget
 from .._manifold import Constraint, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
 from .._projection.base import AbstractProjection, Target, check_projection, has_bounds
-from .._projection.equations import any_lane, length, reach
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
+from .._step.equations import length, reach
+from .._step.iterate import any_lane
 from .._tree import ravel, tree_sub
 from .diffrax_private import member
 from .state import (
@@ -186,7 +187,7 @@ class ManifoldProjection(ForwardingSolver):
         # which dense output integrates them to any time in the step; `target` is that at the end.
         change = moved(y0, candidate)
         motion = state.moved_by(change, candidate)
-        start = self._target(terms, t1, state, motion, candidate, args).following(t0, y0)
+        start = self._target(terms, t1, state, motion, args).following(t0, y0)
         # The dense output of the step is needed only for balances, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
@@ -194,7 +195,7 @@ class ManifoldProjection(ForwardingSolver):
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         # Whether it succeeded, and if not, whether a shorter step could.
-        units = start.units(t0, y0)
+        units = start.metric(t0, y0)
         cannot_start = self._cannot_start(start, state, t0, y0, made_jump)
         states = y0, candidate, y1
         failed = cause_of_failure(info.ok, cannot_start, states, units, self.max_correction)
@@ -233,22 +234,16 @@ class ManifoldProjection(ForwardingSolver):
         t: RealScalarLike,
         state: State,
         motion: Float[Array, " n"],
-        candidate: Y,
         args: Args,
     ) -> Target:
         """The target of a step. Noise has no metric of motion: with noise the metric decides which
         equation is solved, and that must not depend on the path."""
-        if any(getattr(x, "value", None) is not None for _, x in named_entries(self.manifold)):
-            # The first projection to a given value corrects no error of the step. So it does not
-            # follow the motion, which at a turning point depends on the length of the step, but
-            # makes the smallest relative change of the components.
-            size = jnp.maximum(motion, jnp.abs(ravel(candidate)))
-            motion = jnp.where(state.statistics.num_projections == 0, size, motion)
         return Target(
             self.projection,
             self.manifold,
             state.values,
             state.hidden,
+            motion,
             motion if is_ode(terms) else None,
             args,
             time_direction(terms, t),

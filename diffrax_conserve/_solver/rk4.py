@@ -6,7 +6,7 @@ import diffrax as dfx
 import jax.tree_util as jtu
 
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._projection.scalars import written_out
+from .._fast.scalars import written_out
 
 # The method averages the slopes with the weights 1, 2, 2, 1, of which this is the sum.
 _WEIGHTS = 1 + 2 + 2 + 1

@@ -1,6 +1,7 @@
 """Differential-algebraic equations of index 1: the algebraic unknowns are solved for in each
 evaluation of the vector field, and only carried along as a guess."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, final
 
@@ -17,10 +18,13 @@ from .._custom_types import Args, RealScalarLike, State, Values, Y
 from .._manifold import Constraint, exactly, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
-from .._projection.equations import ROUNDOFF_MULTIPLE, any_lane, shown_terms
 from .._projection.options import check_state
-from .._projection.roundoff import hidden_terms
-from .._tree import ravel, tree_shapes, tree_tangents, unravel
+from .._step.constants import ROUNDOFF, SHORTER
+from .._step.equations import shown_terms
+from .._step.implicit import root
+from .._step.iterate import Solved, after_step, any_lane, iterate, keep_done
+from .._step.roundoff import hidden_terms
+from .._tree import ravel, tree_shapes, unravel
 from .manifold_projection import ManifoldProjection
 
 Algebraic = Callable[[RealScalarLike, Any, Any, Args], Values]
@@ -29,14 +33,9 @@ Algebraic = Callable[[RealScalarLike, Any, Any, Args], Values]
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
 # lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
 _MAX_STEPS = 500
-# A correction that does not help is shortened to this share of itself.
-_SHORTER = 1 / 4
 # At this share of a correction we give up. In float64 a correction that is as large as the unknown
 # then still changes half of its digits, so that the functions could show an effect.
 _LEAST_SHARE = 1e-9
-# A pivot counts as roundoff if it is at most this many units of roundoff for each unknown, in a
-# matrix with elements of size one; as in `_projection/elimination.py`.
-_LEAST_PIVOT = 4
 
 
 @final
@@ -235,10 +234,8 @@ def _solved(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Float[
         )
     t = jnp.asarray(t, jnp.result_type(float, t))
     like = jax.eval_shape(lambda: z)
-    fn = lambda t, x, z, args: _residual(g, t, x, z, like, args)  # noqa: E731
-    # Arrays over which `g` closes become leaves, and can be differentiated.
-    fn = eqx.filter_closure_convert(fn, t, x, ravel(z), args)
-    return _root(fn, t, x, ravel(z), args)
+    residual = lambda z: _residual(g, t, x, z, like, args)  # noqa: E731
+    return root(residual, ft.partial(_algebraic_newton, residual), ravel(z), _divided).y
 
 
 @eqx.filter_jit
@@ -251,24 +248,6 @@ def _consistent(g: Algebraic, t: RealScalarLike, x: Y, z: Any, args: Args) -> Fl
         "Give a better guess `z`. If `dg/dz` is singular at every state, the index is not 1: "
         "for index 2 or 3 use `Constraint` and `tangent`.",
     )
-
-
-@eqx.filter_custom_jvp
-def _root(fn: Any, t: Array, x: Y, z: Float[Array, " m"], args: Args) -> Float[Array, " m"]:
-    return _algebraic_newton(lambda z: fn(t, x, z, args), z)
-
-
-@_root.def_jvp
-def _root_jvp(primals: Any, tangents: Any) -> Any:
-    """By the implicit function theorem: `g` stays zero at the root, so `g_z ż = -ġ`, where `ġ` is
-    the tangent of `g` at constant `z`. The root does not depend on the guess."""
-    fn, t, x, _, args = primals
-    t_fn, t_t, t_x, _, t_args = tangents
-    root = _root(*primals)
-    at_root = lambda fn, t, x, args: fn(t, x, root, args)  # noqa: E731
-    value, along = eqx.filter_jvp(at_root, (fn, t, x, args), (t_fn, t_t, t_x, t_args))
-    jacobian = jax.jacfwd(lambda z: fn(t, x, z, args))(root)
-    return root, _divided(jacobian, -tree_tangents(value, along))
 
 
 def _divided(jacobian: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -309,21 +288,10 @@ class _Factored(NamedTuple):
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
-        least = _LEAST_PIVOT * pivots.size * float(jnp.finfo(pivots.dtype).eps)
-        return jnp.all(pivots > least)
+        return jnp.all(pivots > ROUNDOFF * float(jnp.finfo(pivots.dtype).eps))
 
 
-class _Iterate(NamedTuple):
-    z: Float[Array, " m"]
-    share: Float[Array, ""]  # of the correction to try next
-    tries: Int[Array, ""]
-    settled: Bool[Array, ""]
-    going: Bool[Array, ""]
-
-
-def _algebraic_newton(
-    residual: Callable[[Array], Array], z: Float[Array, " m"]
-) -> Float[Array, " m"]:
+def _algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
     Nonlinear Problems*, Springer 2004, 3.3).
 
@@ -333,13 +301,14 @@ def _algebraic_newton(
     """
     eps = float(jnp.finfo(z.dtype).eps)
 
-    def body(now: _Iterate) -> _Iterate:
-        jacobian = jax.jacfwd(residual)(now.z)
+    def advance(now: tuple[Array, Array], counter: Array) -> tuple[tuple[Array, Array], Array]:
+        z, share = now  # the unknowns, and the share of the correction to try next
+        jacobian = jax.jacfwd(residual)(z)
         factored = _Factored.of(jacobian)
-        step = factored.correction(residual(now.z))
-        trial = now.z + now.share * step
+        step = factored.correction(residual(z))
+        trial = z + share * step
         after = factored.correction(residual(trial))
-        size = jnp.maximum(jnp.abs(now.z), jnp.abs(trial))
+        size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.
         slopes = jnp.abs(jacobian)
@@ -350,27 +319,26 @@ def _algebraic_newton(
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
         # for half of that gain.
-        better = then <= (1 - now.share / 2) * before
+        better = then <= (1 - share / 2) * before
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
-        settled = better & (now.share == 1) & (then * then <= eps * before) & factored.regular()
+        settled = better & (share == 1) & (then * then <= eps * before) & factored.regular()
         # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
         # helping. Whether it is, we ask once, at the end.
         stuck = ~better & (before <= eps**0.5)
-        z = jnp.where(better, trial, now.z) + jnp.where(settled, after, 0)
-        share = jnp.where(better, jnp.minimum(now.share / _SHORTER, 1), now.share * _SHORTER)
-        going = ~settled & ~stuck & (before < jnp.inf)
-        going = going & (share > _LEAST_SHARE) & (now.tries < _MAX_STEPS)
-        return _Iterate(z, share, now.tries + 1, settled, going)
+        going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > _LEAST_SHARE))
+        z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
+        share = jnp.where(better, jnp.minimum(share / SHORTER, 1), share * SHORTER)
+        return keep_done(counter, (z, share), now), after_step(settled, going, counter)
 
-    start = jnp.ones((), z.dtype), jnp.asarray(0), jnp.asarray(False), jnp.asarray(True)
-    end = lax.while_loop(lambda now: now.going, body, _Iterate(z, *start))
+    start = z, jnp.ones((), z.dtype)
+    (z, _), settled, num_steps, _ = iterate(advance, start, max_steps=_MAX_STEPS)
 
     def at_roundoff() -> Bool[Array, ""]:
         """Whether the state where the iteration ended is a root as far as rounding lets us see."""
-        g, jacobian, hidden = hidden_terms(residual, end.z)
-        limit = ROUNDOFF_MULTIPLE * eps * (shown_terms(jacobian, end.z) + hidden)
+        g, jacobian, hidden = hidden_terms(residual, z)
+        limit = ROUNDOFF * eps * (shown_terms(jacobian, jnp.abs(z)) + hidden)
         return jnp.all(jnp.abs(g) <= limit) & _Factored.of(jacobian).regular()
 
-    found = lax.cond(any_lane(~end.settled), at_roundoff, lambda: jnp.asarray(True))
-    return jnp.where(end.settled | found, end.z, jnp.nan)
+    found = settled | lax.cond(any_lane(~settled), at_roundoff, lambda: jnp.asarray(True))
+    return Solved(jnp.where(found, z, jnp.nan), found, num_steps)

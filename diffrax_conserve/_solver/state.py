@@ -20,9 +20,9 @@ from .._manifold import Constraint, is_entry
 from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
-from .._projection.equations import Equations, length, reach, shown_terms
-from .._projection.metric import Units
-from .._projection.roundoff import hidden_scale
+from .._step.equations import Equations, length, reach, shown_terms
+from .._step.metric import Units
+from .._step.roundoff import hidden_scale
 from .._tree import ravel
 from .diffrax_private import register
 

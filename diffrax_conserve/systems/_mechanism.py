@@ -4,11 +4,9 @@ import functools as ft
 import re
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import equinox as eqx
-import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
@@ -16,7 +14,11 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._projection.closed_form import ClosedForm
-from .._projection.elimination import gram_solve
+from .._step.constants import MAX_STEPS, ROUNDOFF
+from .._step.equations import OFF, SETTLED
+from .._step.implicit import root
+from .._step.iterate import after_test, iterate, keep_done
+from .._step.linear import solve
 from ._base import real
 
 State = Float[Array, " species"]
@@ -173,53 +175,31 @@ class _Entropic(eqx.Module):
 Rows = tuple[tuple[int, ...], ...]
 
 
-@ft.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
     """The state `max(y, 0) exp(Wᵀ μ)` with the balances `target`, by Newton's method for `μ`."""
-    y = jnp.maximum(y, 0)
-    small = _ROUNDOFF * jnp.finfo(y.dtype).eps
+    y, weights = jnp.maximum(y, 0), jnp.asarray(rows, y.dtype)
+    small = ROUNDOFF * jnp.finfo(y.dtype).eps
 
-    def missing(y: State) -> Float[Array, " balances"]:
+    def state(multiplier: Array) -> State:
+        return y * jnp.exp(jnp.sum(multiplier[:, None] * weights, axis=0))
+
+    def missing(multiplier: Array) -> Float[Array, " balances"]:
         # A sum of products, because a matrix product rounds differently in a batch.
-        return target - jnp.sum(jnp.asarray(rows, y.dtype) * y, axis=1)
+        return target - jnp.sum(weights * state(multiplier), axis=1)
 
-    def off(carry: tuple[Array, Array, Array]) -> Array:
-        _, left, count = carry
-        return (count < _UPDATES) & jnp.any(jnp.abs(left) > small * jnp.abs(target))
+    def advance(multiplier: Array, counter: Array) -> tuple[Array, Array]:
+        left = missing(multiplier)
+        met = jnp.all(jnp.abs(left) <= small * jnp.abs(target))
+        counter = after_test(jnp.where(met, SETTLED, OFF), counter)
+        gram = jnp.sum(weights[:, None, :] * weights * state(multiplier), axis=2)
+        change = solve(gram, left)
+        # An exponent changes by at most one in a step.
+        longest = jnp.max(jnp.abs(jnp.sum(change[:, None] * weights, axis=0)), initial=1)
+        return keep_done(counter, multiplier + change / longest, multiplier), counter
 
-    def update(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        y, left, count = carry
-        exponents = _exponents(rows, y, left)
-        y = y * jnp.exp(jnp.clip(exponents, -_LONGEST, _LONGEST))
-        return y, missing(y), count + 1
-
-    return lax.while_loop(off, update, (y, missing(y), jnp.asarray(0)))[0]
-
-
-@_balanced.defjvp
-def _(rows: Rows, primals: Any, tangents: Any) -> Any:
-    """The implicit function theorem, because a `while_loop` has no reverse mode."""
-    (y, target), (t_y, t_target) = primals, tangents
-    out = _balanced(rows, y, target)
-    # Where `y` is zero its factor cannot be computed from `out / y` and is set to zero.
-    t_out = jnp.where(y > 0, out / jnp.where(y > 0, y, 1), 0) * t_y
-    left = t_target - jnp.sum(jnp.asarray(rows, y.dtype) * t_out, axis=1)
-    return out, t_out + out * _exponents(rows, out, left)
-
-
-def _exponents(rows: Rows, y: State, left: Float[Array, " balances"]) -> State:
-    """The `Wᵀ μ` that changes the balances of `y` by `left`, to first order."""
-    weights = jnp.asarray(rows, y.dtype)
-    gram = jnp.sum(weights[:, None, :] * weights * y, axis=2)
-    return jnp.sum(gram_solve(gram, left)[:, None] * weights, axis=0)
-
-
-# The largest number of updates, and the largest exponent in one. Errors of ten per cent decrease as
-# 1e-1, 5e-3, 1e-5, 1e-10, roundoff; larger ones need more updates.
-_UPDATES, _LONGEST = 8, 1.0
-# The accepted error in units of roundoff. It is above 1 because a balance is a sum of several
-# numbers.
-_ROUNDOFF = 4
+    # Errors of ten per cent decrease as 1e-1, 5e-3, 1e-5, 1e-10, roundoff.
+    newton = lambda guess: iterate(advance, guess, max_steps=MAX_STEPS)  # noqa: E731
+    return state(root(missing, newton, jnp.zeros_like(target), solve).y)
 
 
 class _Tables(NamedTuple):

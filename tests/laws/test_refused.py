@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._projection.jaxprs import jaxprs_inside
+from diffrax_conserve._fast.jaxprs import jaxprs_inside
 
 from ..problems import kepler, kepler_energy, kepler_momentum, solve
 from ..thinned import some_of

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._projection.jaxprs import jaxprs_inside
+from diffrax_conserve._fast.jaxprs import jaxprs_inside
 
 from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, in_single, oscillator, solution, states
 from ..problems import solve

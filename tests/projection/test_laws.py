@@ -96,22 +96,6 @@ def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weig
         np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
 
 
-def test_a_component_that_vanished_stays_zero():
-    """Otherwise the last correction moves it by roundoff, which is all that its constraint has."""
-    entries = jax.random.uniform(jax.random.key(0), (500, 3), minval=0.1)
-    matrices = jax.vmap(lambda x: jnp.array([[0, 0, 0, x[0]], [0, x[1], 1, x[2]]]))(entries)
-
-    def result(matrix):
-        plane = dfc.Constraint(lambda t, y, args: matrix @ y)
-        y = jnp.array([0.0, 0.0, 0.28125, 1.0])
-        y, info = dfc.project(plane, y, projection=dfc.SimplifiedNewton())
-        return y[3], info.ok
-
-    last, ok = jax.jit(jax.vmap(result))(matrices)
-    assert np.all(ok)
-    assert np.all(last == 0)
-
-
 def test_what_was_projected_to_zero_can_be_projected_again():
     """Three constraints determine three numbers, all zero, so that no term is left. Where the
     matrix is nearly singular the first projection may fail; nothing is lost by a second."""

@@ -13,9 +13,10 @@ import pytest
 from jaxtyping import Array
 
 import diffrax_conserve as dfc
-from diffrax_conserve._projection import sparse
-from diffrax_conserve._projection.elimination import combined, gram_matrix, gram_solve, times
-from diffrax_conserve._projection.equations import Equations, equations_of
+from diffrax_conserve._large import sparse
+from diffrax_conserve._step.equations import Equations, equations_of
+from diffrax_conserve._step.linear import combined, gram_matrix, times
+from diffrax_conserve._step.linear import solve as gram_solve
 
 from ..problems import largest, solve
 from ..thinned import some_of
@@ -70,7 +71,7 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
 
     def rows(equations: Equations, y: Array) -> Any:
-        return equations.scaled(equations.linearise(y.reshape(-1))[1])
+        return equations.in_units(equations.linearise(y.reshape(-1))[1])
 
     @jax.jit
     def found() -> Any:

@@ -7,8 +7,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._projection.elimination import combined, gram_matrix, gram_solve
-from ..._projection.equations import Equations, relative
+from ..._step.equations import Equations, relative
+from ..._step.linear import combined, gram_matrix, solve
 from .trainable import LayerSchedule
 
 
@@ -34,11 +34,11 @@ def iterated(
         y = candidate + combined(multipliers, rows)
         g, jacobian = equations.linearise(y)
         if radius is None:
-            return multipliers - gram_solve(gram_matrix(rows, rows), g)
+            return multipliers - solve(gram_matrix(rows, rows), g)
         ratio = relative(g, equations.scale(jacobian, y))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         gram = gram_matrix(jacobian, rows)
-        change = gram_solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)
+        change = solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)
         step = combined(change, rows)
         return multipliers - lax.rsqrt(1 + jnp.sum(step * step) / radius**2) * change
 

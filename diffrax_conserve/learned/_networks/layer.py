@@ -3,25 +3,20 @@
 from typing import final
 
 import equinox as eqx
-import jax
-import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..._balance import refuse_rates
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._options import check_counts
-from ..._projection.descent import descend
-from ..._projection.elimination import gram_matrix, gram_solve, times
-from ..._projection.equations import Equations, equations_of
-from ..._tree import ravel, tree_stop_gradient, tree_tangents, unravel
+from ..._step.constants import MAX_STEPS
+from ..._step.equations import Equations, equations_of
+from ..._step.implicit import Along, solution
+from ..._step.iterate import damped_along
+from ..._tree import ravel, unravel
 from .iterations import iterated
 from .trainable import LayerSchedule
-
-# The largest number of iterations. From far away a shortened step can need many; close to the
-# manifold two or three are made, because the loop ends at the tolerance.
-_MAX_STEPS = 30
 
 
 @final
@@ -82,7 +77,9 @@ class ConservativeLayer(eqx.Module):
         `steps` the move of an iteration is at most the norm of `scale`."""
         equations, vector = self.equations(candidate, t, start)
         if self.steps is None:
-            y, _, _ = _projected(equations, vector, ravel(start[1]).astype(vector.dtype))
+            along = Along(equations, vector, iteration=damped_along, max_steps=MAX_STEPS)
+            projected = solution(along)
+            y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)
             y = iterated(equations, vector, radius, self.steps, schedule)
@@ -118,52 +115,3 @@ ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
 
 An invalid `manifold` or number raises a `TypeError` or `ValueError`.
 """
-
-
-@eqx.filter_custom_jvp
-def _projected(
-    equations: Equations, candidate: Float[Array, " n"], start: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, " m"], Bool[Array, ""]]:
-    """`y = ŷ + G(ŷ)ᵀ λ` on the manifold, `λ`, and whether it was found."""
-    del start
-    _, rows = equations.linearise(candidate)
-    y, ok, _ = descend(equations, candidate, rows, max_steps=_MAX_STEPS)
-    multipliers = gram_solve(gram_matrix(rows, rows), times(rows, y - candidate))
-    ok = ok & jnp.all(jnp.isfinite(multipliers))
-    return jnp.where(ok, y, candidate), jnp.where(ok, multipliers, 0), ok
-
-
-@_projected.def_jvp
-def _projected_jvp(primals, tangents):
-    """`λ̇ = -(G(y) G(ŷ)ᵀ)⁻¹ ġ`, where `ġ` is the tangent of the residual at constant `λ`.
-
-    The linear solve is differentiated implicitly too. Second derivatives, which every loss with a
-    time derivative needs, then cost products with `G` instead of derivatives of its rows. Where
-    nothing was found all is evaluated at `start`, which is on the manifold, because a NaN would
-    reach the gradient also from a branch that is not taken.
-    """
-    equations, candidate, start = primals
-    t_equations, t_candidate, _ = tangents
-    y, multipliers, ok = _projected(*primals)
-    t_candidate = jnp.zeros_like(candidate) if t_candidate is None else t_candidate
-    point, end = jnp.where(ok, candidate, start), jnp.where(ok, y, start)
-
-    def displaced(equations: Equations, candidate: Array) -> tuple[Array, Array]:
-        # `Gᵀ λ` by one reverse pass for all constraints.
-        _, vjp = jax.vjp(equations.residual, candidate)
-        state = candidate + vjp(multipliers)[0]
-        return state, equations.residual(state)
-
-    moved = eqx.filter_jvp(displaced, (equations, point), (t_equations, t_candidate))[1]
-    t_y, t_g = tree_tangents((y, multipliers), moved)
-    fixed, fixed_point, fixed_end = tree_stop_gradient((equations, point, end))
-    gram = gram_matrix(fixed.linearise(fixed_end)[1], fixed.linearise(fixed_point)[1])
-    _, vjp = jax.vjp(equations.residual, point)
-    change = lax.custom_linear_solve(
-        lambda multipliers: jax.jvp(equations.residual, (end,), vjp(multipliers))[1],
-        t_g,
-        solve=lambda _, b: gram_solve(gram, b),
-        transpose_solve=lambda _, b: gram_solve(gram.T, b),
-    )
-    t_y = jnp.where(ok, t_y - vjp(change)[0], t_candidate)
-    return (y, multipliers, ok), (t_y, jnp.where(ok, -change, 0), None)

@@ -6,13 +6,13 @@ points. Newton's method is written here because its matrix is put together from 
 at the points, where a library would differentiate the residual once for each coefficient.
 """
 
+import functools as ft
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple, final
 
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
@@ -21,6 +21,8 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import is_ode
+from ..._step.implicit import root
+from ..._step.iterate import Solved, after_step, iterate, keep_done
 from .chebyshev import ChebyshevInterpolation, multiply
 from .feature_basis import FeatureBasis, feature_basis
 from .sweeps import increment
@@ -201,41 +203,28 @@ def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
     rest = jnp.zeros((equations.basis.size - 1, slope.size), slope.dtype)
     start = jnp.concatenate([slope[None], rest])
 
-    def tangent_solve(linear: Callable, right: Coefficients) -> Coefficients:
-        units = jnp.eye(right.size, dtype=right.dtype).reshape(right.size, *right.shape)
-        rows = jax.vmap(linear)(units).reshape(right.size, right.size)
-        return jnp.linalg.solve(rows.T, right.ravel()).reshape(right.shape)
-
-    # The flag is a floating-point number, because `custom_root` forms its tangent.
-    coefficients, found = lax.custom_root(
+    found = root(
         equations.residual,
+        ft.partial(_newton, equations),
         start,
-        lambda residual, start: _newton(equations, residual, start),
-        tangent_solve,
-        has_aux=True,
+        lambda a, b: jnp.linalg.solve(a, b),
     )
-    return coefficients, found > 0
+    return found.y, found.ok
 
 
-def _newton(
-    equations: StepEquations, residual: Callable, start: Coefficients
-) -> tuple[Coefficients, Float[Array, ""]]:
+def _newton(equations: StepEquations, start: Coefficients) -> Solved:
     tolerance = jnp.finfo(start.dtype).eps ** (2 / 3)
 
-    def iterate(carry: tuple[Array, Coefficients, Array, Array]) -> tuple:
-        _, coefficients, _, count = carry
-        states = equations.states(coefficients)
-        change = equations.solve_linear(equations.jacobians(states), residual(coefficients))
+    def advance(coefficients: Array, counter: Array) -> tuple[Array, Array]:
+        states, residual = equations.states(coefficients), equations.residual(coefficients)
+        change = equations.solve_linear(equations.jacobians(states), residual)
         size = jnp.max(jnp.abs(equations.states(change) - equations.y0))
-        found = size <= tolerance * jnp.max(jnp.abs(states))
-        unfinished = ~found & jnp.isfinite(size) & (count < _MAX_STEPS)
-        return unfinished, coefficients - change, found, count + 1
+        settled = size <= tolerance * jnp.max(jnp.abs(states))
+        then = after_step(settled, jnp.isfinite(size), counter)
+        return keep_done(counter, coefficients - change, coefficients), then
 
-    # The condition is carried, because a batched loop evaluates it in two places, which may round
-    # differently.
-    carry = (jnp.asarray(True), start, jnp.asarray(False), jnp.asarray(1))
-    _, coefficients, found, _ = lax.while_loop(lambda carry: carry[0], iterate, carry)
-    return jnp.where(found, coefficients, 0), found.astype(start.dtype)
+    found = iterate(advance, start, max_steps=_MAX_STEPS)
+    return found._replace(y=jnp.where(found.ok, found.y, 0))
 
 
 def _error(equations: StepEquations, coefficients: Coefficients) -> Float[Array, "wide n"]:

@@ -31,26 +31,9 @@ import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
 
-from .jaxprs import jaxprs_inside
+from .._fast.jaxprs import jaxprs_inside
+from .._step.constants import ADDED_POWER, FEW, LEAST_SPARSE
 
-# The pattern is sought from this number of constraints on. With fewer a dense factor is as fast
-# (`benchmarks/cost/many_constraints.py`).
-LEAST_CONSTRAINTS = 33
-# A row counts as dense if it has more than this many times the elements of the median row. The
-# number is a choice: a bond has 6 elements, an energy all of them.
-_DENSE_ROW = 16
-# A Jacobian with more dense rows than these is treated as dense. Each dense row costs one reverse
-# pass, and a solve of the sparse system.
-_DENSE_ROWS_MAX = 16
-# Larger blocks are replaced by an iteration: the work for a row grows with the square of the size
-# of its block, and compile time with the size, because a block is eliminated element by element.
-_BLOCK_MAX = 16
-# This power of roundoff, times the root of the size of a block, is added to the diagonal of the
-# Gram matrix, as a share of it, so that an inverse exists where constraints depend on each other.
-# As in `elimination` it is far above roundoff: the elements of the inverse are as large as one over
-# what is added, and their roundoff is an error of all multipliers. What the addition itself changes
-# is removed by the iterations, or by refinement.
-ADDED_POWER = 3 / 4
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
 
@@ -113,7 +96,7 @@ class Pattern:
         _, labels = sp.csgraph.connected_components(graph, directed=False)
         sizes = np.bincount(labels)
         block = int(sizes.max())
-        if block <= _BLOCK_MAX:
+        if block <= FEW:
             by_label = np.argsort(labels, kind="stable")
             starts = np.cumsum(sizes) - sizes
             order = np.full(len(sizes) * block, self.size)
@@ -127,7 +110,7 @@ class Pattern:
         a, b = graph.nonzero()
         widths = [int(np.max(np.abs(np.argsort(x)[a] - np.argsort(x)[b]))) for x in orders]
         best = int(np.argmin(widths))
-        if widths[best] > _BLOCK_MAX:
+        if widths[best] > FEW:
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
@@ -201,7 +184,7 @@ def pattern_of(
     """The pattern of the Jacobian of these functions; `None` if they are few, or if it is not
     sparse or cannot be found."""
     m, n = sum(sizes), y.size
-    if m < LEAST_CONSTRAINTS:
+    if m < LEAST_SPARSE:
         return None
     if _asdex() is None:
         warnings.warn(
@@ -286,8 +269,8 @@ def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
     """The pattern, if few rows are dense and at most a quarter of the elements of the others can
     differ from zero."""
     counts = np.concatenate([np.bincount(r, minlength=size) for size, (r, _) in found])
-    dense = counts > _DENSE_ROW * max(1, np.median(counts))
-    if np.sum(dense) > _DENSE_ROWS_MAX or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
+    dense = counts > FEW * max(1, np.median(counts))
+    if np.sum(dense) > FEW or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
         return None
     return Pattern(shape, found, dense)
 

@@ -10,7 +10,6 @@ good enough, because that is where the step starts. So the matrix is factored on
 """
 
 import functools as ft
-from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
@@ -22,61 +21,40 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._interpolation import PackedTarget
+from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._options import check_counts, check_number
 from .._projection.base import Target
-from .._projection.chord import FROZEN_STEPS, after_test, counter
-from .._projection.elimination import (
-    WRITTEN_OUT_MAX,
-    by_triangle,
-    combined,
-    eliminated,
-    gram_matrix,
-    gram_solve,
-    inverse_triangle,
-    times,
-)
-from .._projection.equations import ON, Equations, Jacobian, any_lane, length, shown_terms
-from .._projection.metric import spread
-from .._projection.options import MAX_STEPS, check_state, option
+from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._projection.sparse import BlockGram, SparseRows
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._tree import ravel, tree_shapes, tree_stop_gradient, unflatten, unravel
-from .shorter_step import ShorterStep, StepOf, root
-
-# For up to this many coordinates, sums over them are written out, so that XLA fuses them. Compile
-# time grows with their number; the number is a choice.
-_WRITTEN_OUT_COLUMNS = 32
-# The linear system for the velocities is solved this many times: once, and then for what is left.
-# Where constraints depend on each other, a solve leaves up to the fourth root of roundoff, because
-# the inverse is as large as one over what was added to the matrix. Otherwise two would do, and the
-# time of a step is the same.
-_SOLVES = 4
+from .._step.constants import MAX_STEPS
+from .._step.equations import Equations, Jacobian, length, shown_terms
+from .._step.implicit import root
+from .._step.iterate import Solved, after_test, iterate, keep_done
+from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
+from .._step.metric import spread
+from .._tree import ravel, tree_shapes, unflatten, unravel
+from .shorter_step import ShorterStep, StepOf
 
 
 class _Linear(eqx.Module):
     """The constraints at one position.
 
     - `jacobian`: `G`.
-    - `inverse`: the inverse of `G M⁻¹ Gᵀ`, from five constraints on its triangle, or, with many
-      constraints, the blocks of that matrix. By it both the velocities at this position and the
-      positions of the next step are found.
+    - `factors`: those of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By it both
+      the velocities at this position and the positions of the next step are found.
     """
 
     jacobian: Jacobian
-    inverse: Float[Array, "m m"] | BlockGram
+    factors: Factors | BlockGram
 
-    def factored(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
-        """The product with the inverse."""
-        inverse = lax.stop_gradient(self.inverse)
-        if isinstance(inverse, BlockGram):
-            return inverse.factored()
-        if len(inverse) > WRITTEN_OUT_MAX:
-            return by_triangle(inverse)
-        return lambda x: _combined(x, inverse)
+    def solve(self) -> Solve:
+        """The solution of the system, as a function of its right side."""
+        fixed = lax.stop_gradient(self.factors)
+        return fixed.factored() if isinstance(fixed, BlockGram) else fixed
 
 
 class _State(eqx.Module):
@@ -202,7 +180,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         wrong = jax.jvp(slope, start, along)[1]
         _, jacobian = equations.linearise(ravel(q))
         gram = self._gram(equations, jacobian, self._drift(terms, t, v, args), ravel(v))
-        return unflatten(gram_solve(gram, -wrong), values)
+        return unflatten(solve(gram, -wrong), values)
 
     def init(
         self,
@@ -236,10 +214,10 @@ class RATTLE(dfx.AbstractSolver[Any]):
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
-        squares = jax.tree.map(jnp.square, equations.scaled(at.jacobian))
-        lengths = jnp.sqrt(_times(squares, jnp.ones_like(ravel(v))))
+        squares = jax.tree.map(jnp.square, equations.in_units(at.jacobian))
+        lengths = jnp.sqrt(times(squares, jnp.ones_like(ravel(v))))
         limit = lengths * length(drift(ravel(v)), equations.units) + jnp.abs(rate)
-        moves = rate + _times(at.jacobian, drift(ravel(v)))
+        moves = rate + times(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | violated(equations, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
@@ -273,17 +251,16 @@ class RATTLE(dfx.AbstractSolver[Any]):
         # The unknown is `h² λ / 2`, which a multiplier `λ` contributes to the positions. Unlike `λ`
         # itself it is well determined when the step is short.
         def halfway(displacement: Array) -> Array:
-            force = _combined(displacement, at.jacobian)
-            return kicked + per_step * equations.scaled(equations.scaled(force))
+            return kicked + per_step * _impulse(equations, displacement, at.jacobian)
 
         def position(displacement: Array) -> Array:
             return q + h * drift(halfway(displacement))
 
-        displacement, left = root(
+        displacement, found, _, _ = root(
             lambda x: equations.residual(position(x)),
+            ft.partial(_shaken, equations, position, at, q, self.max_steps),
             state.multiplier * (h * h / 2),
-            ft.partial(_iterated, equations, position, tree_stop_gradient(at), q, self.max_steps),
-            gram_solve,
+            solve,
         )
         half, q1 = _once((halfway(displacement), position(displacement)))
         y1 = unravel(q1, q0)
@@ -291,9 +268,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
         kicked = _once(half + h / 2 * ravel(slope))
         drift = self._drift(terms, t1, v0, args)
         at, rate = self._linear(equations, t1, y1, args, direction, drift, kicked)
-        v1, settled = _on_tangent(equations, at, rate, drift, kicked)
+        v1, keeps = _on_tangent(equations, at, rate, drift, kicked)
 
-        ok = (left != -1) & settled
+        ok = found & keeps
         failed = cause_of_failure(ok, state.off, (q, q1, v1), None, None)
         y1 = y1, unravel(v1, v0)
         y1 = jax.tree.map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
@@ -307,7 +284,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
     ) -> Equations:
         projection = SimplifiedNewton(metric=jax.tree.map(jnp.asarray, self.masses))
         values = jnp.zeros_like(hidden)
-        target = Target(projection, self.constraint, values, hidden, None, args, direction)
+        nothing = jnp.zeros_like(ravel(q))
+        target = Target(projection, self.constraint, values, hidden, nothing, None, args, direction)
         return target.equations(t, q)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
@@ -319,12 +297,12 @@ class RATTLE(dfx.AbstractSolver[Any]):
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
-        forces = equations.scaled(equations.scaled(jacobian))
+        forces = equations.in_units(equations.in_units(jacobian))
         if isinstance(jacobian, SparseRows):
             speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
             return jacobian.gram(forces.times_columns(speeds))
         along = jax.vmap(lambda x: jax.jvp(drift, (p,), (x,))[1])(forces)
-        return _gram_matrix(jacobian, along)
+        return gram_matrix(jacobian, along)
 
     def _linear(
         self,
@@ -342,9 +320,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
         t = t * direction
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
         gram = _once(lax.stop_gradient(self._gram(equations, jacobian, drift, p)))
-        return _Linear(
-            jacobian, gram if isinstance(gram, BlockGram) else _once(_inverse(gram))
-        ), rate
+        factors: Any = gram if isinstance(gram, BlockGram) else _once(factored(gram))
+        return _Linear(jacobian, factors), rate
 
 
 RATTLE.__init__.__doc__ = r"""**Arguments:**
@@ -363,113 +340,55 @@ broadcast, the state is no pair of positions and velocities that are alike, or a
 """
 
 
-def _inverse(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The inverse of a Gram matrix, or its triangle. If constraints depend on each other, it does
-    not exist, and what is returned solves consistent systems with small multipliers."""
-    sizes = jnp.sqrt(jnp.where(jnp.diagonal(gram) > 0, jnp.diagonal(gram), 1))
-    unit = gram / sizes[:, None] / sizes
-    if len(gram) > WRITTEN_OUT_MAX:
-        return inverse_triangle(unit, sizes)
-    one = jnp.eye(len(gram), dtype=gram.dtype)
-    left, right = eliminated(unit, one, one)
-    return jnp.sum(right[:, :, None] * left[:, None, :], axis=0) / sizes[:, None] / sizes
-
-
 # Without a barrier XLA would evaluate an expression once for each use of it.
 _once = lax.optimization_barrier
 
 
-def _combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
-    """`rowsᵀ multiplier`. XLA is fastest in a batch of small systems if short sums are written
-    out."""
-    if len(rows) > WRITTEN_OUT_MAX:
-        return combined(multiplier, rows)
-    return sum(x * row for x, row in zip(multiplier, rows, strict=True))  # pyright: ignore
+def _impulse(equations: Equations, multiplier: Array, rows: Any) -> Float[Array, " n"]:
+    """`M⁻¹ Gᵀ λ`."""
+    return equations.in_units(equations.in_units(combined(multiplier, rows)))
 
 
-def _times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`rows x`."""
-    if len(rows) > WRITTEN_OUT_MAX:
-        return times(rows, x)
-    return jnp.sum(rows * x, axis=1)
-
-
-def _gram_matrix(rows: Float[Array, "m n"], others: Float[Array, "m n"]) -> Float[Array, "m m"]:
-    """`rows othersᵀ`, written out if it is small."""
-    if len(rows) > WRITTEN_OUT_MAX or rows.shape[1] > _WRITTEN_OUT_COLUMNS:
-        return gram_matrix(rows, others)
-    return sum(a[:, None] * b[None] for a, b in zip(rows.T, others.T, strict=True))  # pyright: ignore
-
-
-def _iterated(
+def _shaken(
     equations: Equations, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
-) -> tuple[Float[Array, " m"], Array]:
+) -> Solved:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
-    step: an iteration evaluates the constraint and nothing else. Returns the multipliers and what
-    `counter` has left, from a `guess`."""
+    step: a step of the iteration evaluates the constraint and nothing else."""
     # The residuals are compared with their scales at the start of the step, for coordinates as
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
-    scale, solve = equations.scale(at.jacobian, sizes), at.factored()
+    scale, solve = equations.scale(at.jacobian, sizes), at.solve()
 
-    def attempt(solve: Callable[[Array], Array], max_steps: int) -> tuple[Array, Array]:
-        def body(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            x, left = carry
-            g = _once(equations.residual(_once(position(x))))
-            level, _ = equations.level(g, scale)
-            # The iteration ends with one more than needed, which is cheap and leaves only roundoff:
-            # so after the first test a state does not count as settled. At the first test it may.
-            # Then the guess is a solution, and in a step of hardly any length, such as to a saved
-            # time just after the start, a correction of roundoff of the positions would be a large
-            # velocity.
-            level = jnp.where(left > max_steps, level, jnp.minimum(level, ON))
-            left = after_test(level, left, extra=1, gives_up=left > 0)
-            return jnp.where(left > 0, x - solve(g), x), left
+    def advance(x: Array, counter: Array) -> tuple[Array, Array]:
+        g = _once(equations.residual(_once(position(x))))
+        level, _ = equations.level(g, scale)
+        counter = after_test(level, counter)
+        return keep_done(counter, x - solve(g), x), counter
 
-        carry = guess, counter(max_steps)
-        return lax.while_loop(lambda carry: any_lane(carry[1] > 0), body, carry)
-
-    if guess.size <= WRITTEN_OUT_MAX:  # constraints that depend on others have the multiplier zero
-        return attempt(solve, max_steps)
-
-    def consistent() -> tuple[Array, Array]:
-        """Off the manifold the constraints may contradict each other a little, as do those of a
-        body with one rod too many. Then the solution of the linear system has a large part that
-        moves nothing, but whose roundoff does. So we solve once more, for the change of the
-        constraints that the solution causes: in that there is no contradiction."""
-        _, moves = jax.linearize(position, guess)
-        return attempt(lambda g: solve(_times(at.jacobian, moves(solve(g)))), max_steps)
-
-    first = attempt(solve, min(max_steps, FROZEN_STEPS))
-    failed = first[1] == -1
-    second = lax.cond(any_lane(failed), consistent, lambda: first)
-    return jax.tree.map(lambda a, b: jnp.where(failed, b, a), first, second)
+    return iterate(advance, guess, max_steps=max_steps)
 
 
 def _on_tangent(
     equations: Equations, at: _Linear, rate: Array, drift: Any, p: Array
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """The velocities nearest to `p` that keep the constraint, `∂_t g + G v = 0`, and whether they
-    do so to roundoff."""
-    solve = at.factored()
+    do so to roundoff. The multipliers solve a linear system, and have its derivative."""
+    solve = at.solve()
 
-    def moved(x: Array) -> Array:
-        return p + equations.scaled(equations.scaled(_combined(x, at.jacobian)))
+    def product(x: Array) -> Array:
+        """`G M⁻¹ Gᵀ x`, for momenta with the masses in `drift`, which is linear."""
+        change = _impulse(equations, x, at.jacobian)
+        return times(at.jacobian, jax.jvp(drift, (p,), (change,))[1])
 
-    def residual(x: Array) -> Array:
-        return rate + _times(at.jacobian, drift(moved(x)))
+    def iterated(product: Any, b: Array) -> Array:
+        return refined(solve, product, b)
 
-    def iterate(x: Array) -> tuple[Array, None]:
-        for _ in range(_SOLVES):
-            x = _once(x - solve(residual(x)))
-        return x, None
-
-    x, _ = root(residual, jnp.zeros_like(rate), iterate, gram_solve)
+    wrong = rate + times(at.jacobian, drift(p))
+    x = lax.custom_linear_solve(product, -wrong, iterated, iterated, symmetric=True)
+    v = p + _impulse(equations, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
     # velocities is that of the terms, and not of their sum.
-    terms = equations.scaled(
-        equations.scaled(_combined(jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian)))
-    )
+    terms = _impulse(equations, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
     sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
     limit = equations.tolerance(jnp.abs(rate) + shown_terms(at.jacobian, sizes))
-    return moved(x), jnp.all(jnp.abs(residual(x)) <= limit)
+    return v, jnp.all(jnp.abs(rate + times(at.jacobian, drift(v))) <= limit)

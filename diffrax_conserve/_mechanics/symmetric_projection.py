@@ -8,19 +8,13 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import PackedTarget
 from .._manifold import check_manifold, conserved_values, named_entries, rate_of
 from .._projection.base import Target
-from .._projection.chord import after_test, counter
-from .._projection.elimination import combined, gram_matrix, gram_solve, scaled_rows, times
-from .._projection.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, any_lane, length
-from .._projection.implicit import certain
-from .._projection.options import MAX_STEPS, check_state
+from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.rk4 import RK4
@@ -28,18 +22,13 @@ from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, start
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.unrolled import Unrolled
 from .._solver.wrapper import ForwardingSolver
+from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF
+from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
+from .._step.implicit import root
+from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
+from .._step.linear import combined, gram_matrix, is_determined, scaled_rows, solve, times
 from .._tree import ravel, unravel
-from .shorter_step import ShorterStep, StepOf, root
-
-# The equation for the end of the step counts as nearly solved if its defect is at most this many
-# units of roundoff of the state. From there one more iteration is enough, because each reduces the
-# defect by much more than this factor.
-_NEARLY_SOLVED = 64
-# At this many units of roundoff the defect is only the rounding of the state and of the sum.
-_SOLVED = 2
-# Where a coefficient of a tableau should be zero, the sum of two others may be this, because they
-# are given with 16 digits. Elsewhere the relative tolerance of numpy applies.
-_ZERO_COEFFICIENT = 1e-14
+from .shorter_step import ShorterStep, StepOf
 
 
 class _State(eqx.Module):
@@ -53,27 +42,13 @@ class _State(eqx.Module):
     statistics: ProjectionStatistics
 
 
-class _Iterate(NamedTuple):
-    """One iterate of the two equations of a step.
-
-    - `y`, `multiplier`: the unknowns, the state `y_{n+1}` and `μ`.
-    - `candidate`: the end of the inner step with this multiplier, `ỹ_{n+1}`.
-    - `wrong`: what the next change of the multiplier must correct, the residual of the constraints
-      and what the defect of the equation for the state will change in it.
-    - `noise`: that of the residuals.
-    - `rows`: the gradients at `y`, in the units.
-    - `left`, `num_steps`: the tests that are left, see `chord.counter`, and the inner steps made.
-    - `result`: that of the inner step.
-    """
+class _Unknowns(NamedTuple):
+    """The unknowns of a step, the state `y_{n+1}` and the multiplier `μ`; and what the inner step
+    with this multiplier gives, the candidate `ỹ_{n+1}` and a result."""
 
     y: Float[Array, " n"]
     multiplier: Float[Array, " m"]
     candidate: Float[Array, " n"]
-    wrong: Float[Array, " m"]
-    noise: Float[Array, " m"]
-    rows: Float[Array, "m n"]
-    left: Int[Array, ""]
-    num_steps: Int[Array, ""]
     result: dfx.RESULTS
 
 
@@ -186,7 +161,14 @@ class SymmetricProjection(ForwardingSolver):
         state, vector = solver_state, ravel(y0)
         direction = time_direction(terms, t0)
         target = Target(
-            self.projection, self.manifold, state.values, state.hidden, None, args, direction
+            self.projection,
+            self.manifold,
+            state.values,
+            state.hidden,
+            jnp.zeros_like(vector),
+            None,
+            args,
+            direction,
         )
         start, end = (target.equations(t, y0).dense() for t in (t0, t1))
 
@@ -202,22 +184,19 @@ class SymmetricProjection(ForwardingSolver):
             candidate, _ = inner(vector + _along(start, vector, multiplier))
             return y - candidate - _along(end, y, multiplier), end.residual(y)
 
-        def iterate(guess: tuple[Array, Array]) -> tuple[tuple[Array, Array], _Iterate]:
-            found = _iterated(start, end, inner, vector, guess[1], self.projection.max_steps)
-            return (found.y, found.multiplier), found
-
-        (y1, multiplier), found = root(
-            residual, (vector, state.multiplier), iterate, ft.partial(_tangent, vector.size)
+        (y1, multiplier), ok, num_steps, (candidate, result) = root(
+            residual,
+            ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
+            (vector, state.multiplier),
+            ft.partial(_tangent, vector.size),
         )
-        y1 = _differentiable(y1, certain(end, found.candidate, y1, end.linearise(y1)[1]))
-        problem = target.problem(t1, y0)
-        info = problem.report(found.candidate, y1, found.num_steps, ok=found.left != -1)
+        info = target.problem(t1, y0).report(candidate, y1, num_steps, ok=ok)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
-        failed = cause_of_failure(info.ok, off, (vector, found.candidate, y1), None, None)
-        inner_failed = found.result != dfx.RESULTS.successful
+        failed = cause_of_failure(info.ok, off, (vector, candidate, y1), None, None)
+        inner_failed = result != dfx.RESULTS.successful
         y1 = unravel(jnp.where((failed > 0) | inner_failed, jnp.nan, y1), y0)
         result = dfx.RESULTS.where(
-            (failed == 0) | (inner_failed & ~off), found.result, member(FIRST - 1 + failed)
+            (failed == 0) | (inner_failed & ~off), result, member(FIRST - 1 + failed)
         )
         dense_info = dict(y0=y0, step=PackedTarget(StepOf(self, terms, args, state)))
         statistics = state.statistics.add(info, None, None)
@@ -249,12 +228,12 @@ and backwards. `TypeError` or `ValueError` if another argument does not fit.
 def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(equations.residual, y)
-    return equations.moved(equations.scaled(vjp(multiplier)[0]))
+    return equations.change(equations.in_units(vjp(multiplier)[0]))
 
 
-def _iterated(
-    start: Equations, end: Equations, inner: Any, y0: Array, multiplier: Array, max_steps: int
-) -> _Iterate:
+def _solved(
+    start: Equations, end: Equations, inner: Any, y0: Array, max_steps: int, guess: Any
+) -> Solved:
     """Simplified Newton's method for `μ`, with the matrix `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`, where `G₀` and
     `G₁` are the gradients at both ends of the step.
 
@@ -262,43 +241,43 @@ def _iterated(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = scaled_rows(start.scaled(start.linearise(y0)[1]))
+    sizes, first = scaled_rows(start.in_units(start.linearise(y0)[1]))
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 
-    def tested(multiplier: Array, near: Array | None, left: Array, count: Array) -> _Iterate:
-        """The iterate with this multiplier. The gradients at its end are needed to compute the end
-        itself, so they are first taken from `near`, those of the last iterate, or at the candidate.
-        By those at the end we measure the defect that this leaves."""
-        candidate, result = inner(y0 + start.moved(combined(multiplier * sizes, first)))
-        rows = end.scaled(end.linearise(candidate)[1]) if near is None else near
-        y = candidate + end.moved(combined(multiplier, rows))
-        g, jacobian = end.linearise(y)
-        rows = end.scaled(jacobian)
-        defect = candidate + end.moved(combined(multiplier, rows)) - y
-        level, noise = end.level(g, end.scale(jacobian, y))
-        off = length(defect, end.units) / length(jnp.abs(y0) + jnp.abs(y), end.units)
-        solved = jnp.where(
-            off <= _SOLVED * eps, SETTLED, jnp.where(off <= _NEARLY_SOLVED * eps, ON, OFF)
-        )
-        solved = jnp.where(
-            off < jnp.inf, solved, jnp.where(jnp.all(defect == 0), SETTLED, NOT_FINITE)
-        )
-        failed = result != dfx.RESULTS.successful
-        level = jnp.where(failed, NOT_FINITE, jnp.minimum(level, solved))
-        left = jnp.where(failed, -1, after_test(level, left, extra=1, gives_up=left > 0))
-        wrong = g + times(jacobian, defect)
-        return _Iterate(y, multiplier, candidate, wrong, noise, rows, left, count, result)
+    def stepped(multiplier: Array, rows: Array | None = None) -> _Unknowns:
+        """The unknowns with this multiplier. The gradients at the end of the step are needed to
+        compute that end, so they are those of the last unknowns, or at the candidate."""
+        candidate, result = inner(y0 + start.change(combined(multiplier * sizes, first)))
+        rows = end.in_units(end.linearise(candidate)[1]) if rows is None else rows
+        y = candidate + end.change(combined(multiplier, rows))
+        return _Unknowns(y, multiplier, candidate, result)
 
-    def body(last: _Iterate) -> _Iterate:
-        rows = last.rows / sizes[:, None]
-        gram = gram0 + gram_matrix(rows, rows)
-        change = gram_solve(gram, last.wrong / sizes, last.noise / sizes) / sizes
-        found = tested(last.multiplier - change, last.rows, last.left, last.num_steps + 1)
-        # In a batch a lane that is done stays as it is while others go on.
-        return jtu.tree_map(lambda a, b: jnp.where(last.left > 0, a, b), found, last)
+    def advance(now: _Unknowns, counter: Array) -> tuple[_Unknowns, Array]:
+        g, jacobian = end.linearise(now.y)
+        rows = end.in_units(jacobian)
+        level, wrong = end.level(g, end.scale(jacobian, now.y))
+        # What the gradients at the end itself change in the equation for the state.
+        defect = now.candidate + end.change(combined(now.multiplier, rows)) - now.y
+        off = length(defect, end.units) / (eps * length(jnp.abs(y0) + jnp.abs(now.y), end.units))
+        off = jnp.where(jnp.all(defect == 0), 0, off)
+        solved = jnp.where(off <= NOISE, SETTLED, jnp.where(off <= ROUNDOFF, ON, OFF))
+        solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)
+        counter = after_test(jnp.minimum(level, solved), counter)
+        # Where the inner step has failed, there is nothing to go on with.
+        counter = jnp.where(now.result == dfx.RESULTS.successful, counter, -1)
 
-    first_iterate = tested(multiplier, None, counter(max_steps), jnp.asarray(1))
-    return lax.while_loop(lambda x: any_lane(x.left > 0), body, first_iterate)
+        def move() -> _Unknowns:
+            scaled = rows / sizes[:, None]
+            gram = gram0 + gram_matrix(scaled, scaled)
+            change = solve(gram, (wrong + times(jacobian, defect)) / sizes) / sizes
+            return stepped(now.multiplier - change, rows)
+
+        moved = lax.cond(any_lane(counter > 0), move, lambda: now)
+        return keep_done(counter, moved, now), counter
+
+    found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
+    y, multiplier, candidate, result = found.y
+    return Solved((y, multiplier), found.ok, found.num_steps + 1, (candidate, result))
 
 
 def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) -> Array:
@@ -308,21 +287,10 @@ def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) 
     (a, b), (c, d) = (jnp.split(rows, [size], axis=1) for rows in jnp.split(matrix, [size]))
     above, below = jnp.split(right, [size])
     along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
-    multiplier = gram_solve(d - c @ along, below - c @ at)
-    return jnp.concatenate([at - along @ multiplier, multiplier])
-
-
-@jax.custom_jvp
-def _differentiable(y: Float[Array, " n"], factor: Float[Array, ""]) -> Float[Array, " n"]:
-    """`y`, whose tangent is multiplied by a factor: one, or NaN if the tangent is not
-    determined."""
-    del factor
-    return y
-
-
-@_differentiable.defjvp
-def _differentiable_jvp(primals: Any, tangents: Any) -> Any:
-    return primals[0], lax.stop_gradient(primals[1]) * tangents[0]
+    gram = d - c @ along
+    multiplier = solve(gram, below - c @ at)
+    tangent = jnp.concatenate([at - along @ multiplier, multiplier])
+    return lax.stop_gradient(jnp.where(is_determined(gram), 1, jnp.nan)) * tangent
 
 
 def _check_symmetric(solver: Any) -> None:
@@ -332,27 +300,10 @@ def _check_symmetric(solver: Any) -> None:
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"`solver` is `{name}`, which is not a diffrax solver. {remedy}.")
     inner = innermost(solver)
-    tableau = getattr(inner, "tableau", None)
-    if isinstance(tableau, dfx.ButcherTableau):
-        symmetric = _is_symmetric(tableau)
-    else:
-        ours = isinstance(inner, RK4 | Unrolled)
-        symmetric = not (ours or type(inner).__module__.startswith("diffrax."))
+    ours = isinstance(inner, RK4 | Unrolled)
     projects = issubclass(type(solver), ForwardingSolver)  # which `isinstance` would not tell
-    if projects or not symmetric:
+    if projects or ours or type(inner).__module__.startswith("diffrax."):
         raise ValueError(
             f"`solver` is {name}, which is not symmetric: a step backwards does not undo a step, "
             f"and no projection changes that. {remedy}, or use `ManifoldProjection`."
         )
-
-
-def _is_symmetric(tableau: dfx.ButcherTableau) -> bool:
-    """Whether a Runge-Kutta method is symmetric, `a[s+1-i, s+1-j] + a[i, j] = b[j]` (Hairer, Lubich
-    and Wanner, V.2)."""
-    b = np.asarray(tableau.b_sol)
-    a = np.zeros((b.size, b.size))
-    for i, row in enumerate(tableau.a_lower):
-        a[i + 1, : i + 1] = row
-    if tableau.a_diagonal is not None:
-        a += np.diag(tableau.a_diagonal)
-    return bool(np.allclose(a + a[::-1, ::-1], b, atol=_ZERO_COEFFICIENT))

@@ -41,12 +41,12 @@ class MatrixUnits(eqx.Module):
     lower: tuple[Float[Array, "k k"], ...]
     starts: tuple[int, ...] = eqx.field(static=True)
 
-    def scaled(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         """`rows S`."""
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
         return self._in_parts(solve, rows * self.diagonal)
 
-    def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S change`."""
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
         return self._in_parts(solve, change * self.diagonal)

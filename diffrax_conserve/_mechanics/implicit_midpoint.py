@@ -4,7 +4,6 @@ from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -12,14 +11,8 @@ import optimistix as optx
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import option
-from .._tree import ravel, tree_stop_gradient, unravel, without_pattern
-
-# The iteration stops after a change of at most this many units of roundoff. It converges fast, so
-# what is left is much smaller than the change, and less than the rounding of the state.
-_ACCEPTED = 4
-# The chord iteration may take this many iterations, by default. Each gains a constant factor, so
-# for steps that are not too long 16 digits need fewer.
-_MAX_STEPS = 30
+from .._step.constants import MAX_STEPS, ROUNDOFF
+from .._tree import tree_stop_gradient
 
 
 @final
@@ -55,7 +48,7 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
     """
 
     root_finder: optx.AbstractRootFinder | None = option(None)
-    root_find_max_steps: int = option(_MAX_STEPS, static=True)
+    root_find_max_steps: int = option(MAX_STEPS, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = dfx.ThirdOrderHermitePolynomialInterpolation
@@ -100,14 +93,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         k0 = terms.vf_prod(t0, y0, args, control)
         # The unknown is the increment `h f`, in units of what is rounded when it is added to the
         # state. So tolerances mean the same whatever the units of the state are.
-        # The terms of a slope may cancel, and what is left has their roundoff. So the unit counts
-        # them too, by the change of the slope if each component changes by a share of itself. The
-        # shares have no pattern, with which the changes could cancel again.
-        numbers = ravel(y0)
-        shares = without_pattern(numbers.size, numbers.dtype)
         slope = lambda y: terms.vf_prod(middle, y, args, control)  # noqa: E731
-        _, answer = jax.jvp(slope, (y0,), (unravel(shares * numbers, y0),))
-        units = tree_stop_gradient(jtu.tree_map(_size, y0, k0, answer))
+        units = tree_stop_gradient(jtu.tree_map(_size, y0, k0))
 
         def increment(x: Y) -> Y:
             return jtu.tree_map(lambda x, unit: x * unit, x, units)
@@ -121,7 +108,7 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         finder = self.root_finder
         if finder is None:
             eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(units))).eps)
-            finder = optx.Chord(rtol=0.0, atol=_ACCEPTED * eps, norm=optx.max_norm)
+            finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
         guess = jtu.tree_map(lambda k, unit: k / unit, k0, units)
         solved = optx.root_find(
             relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
@@ -138,9 +125,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 
 - `root_finder`: a root finder of optimistix or diffrax with tolerances of its own. Its unknown is
-    the increment $h f$, each component divided by $|y_n|$ plus the size of the terms of $h f$, so
-    that both tolerances are relative to the state. Default: `optimistix.Chord` with four units of
-    roundoff.
+    the increment $h f$, each component divided by $|y_n| + |h f|$, so that both tolerances are
+    relative to the state. Default: `optimistix.Chord` with 16 units of roundoff.
 - `root_find_max_steps`: the largest number of its iterations. If they are not enough, the solve
     ends, and its `result` says so.
 

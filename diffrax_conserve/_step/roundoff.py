@@ -27,11 +27,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, Y
+from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
+from .._large.sparse import SparseRows, pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
+from .constants import LEAST_SPARSE
 from .equations import Jacobian, functions_of, shown_terms
-from .jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
-from .sparse import LEAST_CONSTRAINTS, SparseRows, pattern_of
 
 # The primitives of JAX that are sums, and sums of products.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
@@ -76,13 +77,13 @@ def hidden_scale(
         # The roundoff of an entry with many elements is not measured, because that would cost a
         # reverse pass for each.
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
-        few = [size < LEAST_CONSTRAINTS for size in sizes]
+        few = [size < LEAST_SPARSE for size in sizes]
         measured = [
             hidden_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
             for fn, size, one in zip(functions, sizes, few, strict=True)
         ]
         hidden = jnp.concatenate(measured)
-    shown = jnp.abs(value) + shown_terms(jacobian, vector)
+    shown = jnp.abs(value) + shown_terms(jacobian, jnp.abs(vector))
     return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
 
 

@@ -7,7 +7,9 @@ as zero. The roundoff of a residual is proportional to the size of the terms tha
 *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
 in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
 no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
-measures them, and they are added as the *hidden* part of the scale.
+measures them, and they are added as the *hidden* part of the scale. And a component that a
+correction has moved by `s_k` is known to roundoff of `s_k` only, which matters where the component
+itself vanishes, as on `q[0] = 0`. So its size counts as `|y_k| + s_k`.
 """
 
 import dataclasses
@@ -17,7 +19,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.core
-import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -25,26 +26,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import Constraint, evaluate, is_entry, named_entries
+from .._large.sparse import Pattern, SparseRows, pattern_of
+from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
+from .constants import NOISE, ROUNDOFF
 from .metric import MatrixUnits, Units
-from .sparse import Pattern, SparseRows, pattern_of
 
-# A residual of at most this many units of roundoff of its scale counts as zero. Rounding the state
-# and evaluating the residual contribute about one unit each, in long sums a few. The promise "16
-# units of roundoff" is part of the documentation, and `tests/soak` checks it in long double.
-ROUNDOFF_MULTIPLE = 16
-# The four levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all
-# are within; all are so small that only chance could make them smaller. They are ordered such that
-# the level of a state is the minimum over its residuals.
+# The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
+# within; all are so small that only chance could make them smaller. They are ordered such that the
+# level of a state is the minimum over its residuals.
 NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
-# The noise of a residual is this share of its tolerance: two of the 16 units of roundoff, the two
-# that rounding the state and evaluating the residual contribute.
-_NOISE = 1 / 8
-# A state is near rest where the tolerance exceeds one part in this many of the terms that the
-# gradient shows. There a correction by one tolerance would move the state by more than 1/64 of
-# itself. The number is a choice; `tests/laws/test_refused.py -k near` solves such problems.
-_NEAR_REST = 64
 # One entry of a manifold, as a function from the state to the vector of its residuals.
 Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
@@ -62,10 +53,9 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `motion`: how far each component moves in a step, where that is known; see `Target`.
+    - `motion`: how far each component may be moved: in a solve, how far it moves in a step;
+      elsewhere, how large it is at first.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
-    - `may_vanish`: whether all terms of a residual may be zero on the manifold, so that its
-      tolerance is zero too. Only those of a `Constraint` may, such as of `q[0] = 0`.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
     - `pattern`: the places of the elements of a sparse Jacobian; `None` if it is dense.
@@ -78,7 +68,6 @@ class Equations(eqx.Module):
     motion: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
-    may_vanish: bool = eqx.field(default=False, static=True)
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
     pattern: Pattern | None = eqx.field(default=None, static=True)
 
@@ -110,77 +99,71 @@ class Equations(eqx.Module):
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        y = y if self.clip is None else self.clip(y)
-        return self.magnitude + shown_terms(jacobian, y)
+        size = jnp.abs(y if self.clip is None else self.clip(y))
+        size = size if self.motion is None else size + self.motion
+        return self.magnitude + shown_terms(jacobian, size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
-        rtol = ROUNDOFF_MULTIPLE * eps if self.rtol is None else self.rtol
+        rtol = ROUNDOFF * eps if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
 
     def level(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """The level of a state, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and the noise of the
-        residuals, given the residuals and their scales.
-
-        The noise is the part of a residual that an iteration cannot reduce except by chance.
-        Usually that is an eighth of the tolerance. Near rest it is half of it: there the gradient
-        is so small that a correction by one tolerance would move the state by much, which would be
-        worse than the residual. A state is settled if each residual is within twice its noise.
-        """
+        """The level of a state, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and what is to be
+        corrected: the residuals, but for those that are noise. The residuals and their scales are
+        given."""
         limit = self.tolerance(scale)
+        noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
         # A tolerance that has underflowed would be met by a residual that has underflowed too,
         # whatever the state is, and an infinite one is met by everything. So neither is ever met.
         # If the scale is exactly zero, all terms are zero, and so is the residual.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
-        valid = valid & (limit < jnp.inf)
-        # The scale minus its constant part is what the gradient shows at this state.
-        near_rest = _NEAR_REST * limit >= scale - self.magnitude
-        noise = jnp.where(near_rest, 1 / 2, _NOISE) * limit
-        on = jnp.where(jnp.abs(g) <= 2 * noise, jnp.int8(SETTLED), jnp.int8(ON))
-        off = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(OFF), jnp.int8(NOT_FINITE))
+        on = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be
         # shorter, but on a CPU a maximum can lose a NaN.
-        return jnp.min(jnp.where(valid & (jnp.abs(g) <= limit), on, off)), noise
+        within = jnp.where(noise, jnp.int8(SETTLED), jnp.int8(ON))
+        beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(OFF), jnp.int8(NOT_FINITE))
+        return jnp.min(jnp.where(on, within, beyond)), jnp.where(noise, 0, g)
 
     def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= ON
 
-    def scaled(self, rows: Any) -> Any:
+    def in_units(self, rows: Any) -> Any:
         """`G S` for the rows of a Jacobian, or for one gradient."""
         if self.units is None:
             return rows
         if isinstance(self.units, MatrixUnits):
-            return self.units.scaled(rows)
+            return self.units.of_rows(rows)
         if isinstance(rows, SparseRows):
             return rows.times_columns(self.units)
         return rows * jnp.broadcast_to(self.units, rows.shape)
 
-    def moved(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def change(self, u: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S u`, the change of the state that is `u` when it is measured in the units."""
         if isinstance(self.units, MatrixUnits):
-            return self.units.moved(change)
-        return change if self.units is None else change * self.units
+            return self.units.of_change(u)
+        return u if self.units is None else u * self.units
 
 
-def in_units(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
+def measured(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
     """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
     such a component is never moved."""
     if units is None:
         return change
     if isinstance(units, MatrixUnits):
-        return units.measured(in_units(change, units.diagonal))
+        return units.measured(measured(change, units.diagonal))
     moves = units != 0
     return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
 
 
 def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
     """The length of a change of the state in the metric."""
-    return jnp.linalg.norm(in_units(change, units))
+    return jnp.linalg.norm(measured(change, units))
 
 
 def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:
@@ -194,12 +177,12 @@ def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> F
     return length(jnp.maximum(jnp.abs(end - start), least), units)
 
 
-def shown_terms(jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`Σ_k |y_k ∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
-    shows."""
+def shown_terms(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`Σ_k size_k |∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
+    shows, for components of this size."""
     if isinstance(jacobian, SparseRows):
-        return jtu.tree_map(jnp.abs, jacobian).times(jnp.abs(y))
-    return jnp.sum(jnp.abs(jacobian * y[None]), axis=1)
+        return jtu.tree_map(jnp.abs, jacobian).times(size)
+    return jnp.sum(jnp.abs(jacobian) * size[None], axis=1)
 
 
 def relative(residual: Any, scale: Any) -> Any:
@@ -252,9 +235,8 @@ def equations_of(
         parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
         start += size
     magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
-    may_vanish = any(isinstance(x, Constraint) for _, x in named_entries(manifold))
     pattern = pattern_of(functions, sizes, vector)
-    return Equations(tuple(parts), magnitude, hidden, may_vanish=may_vanish, pattern=pattern)
+    return Equations(tuple(parts), magnitude, hidden, pattern=pattern)
 
 
 class _Known:
@@ -281,21 +263,3 @@ class _Converted(eqx.Module):
 
     def __call__(self, y: Array) -> Array:
         return jtu.tree_map(lambda x: x.value if isinstance(x, _Known) else x, self.fn)(y)
-
-
-@jax.custom_batching.custom_vmap
-def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether the flag of any lane of a batch is set, for the conditions of loops.
-
-    If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
-    array in the carry, which keeps the lanes that are done. With this condition, which is the same
-    for all lanes, it adds none. So the body of such a loop itself must leave a finished lane as it
-    is.
-    """
-    return flag
-
-
-@any_lane.def_vmap
-def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
-    del size, axes
-    return any_lane(jnp.any(flags)), False

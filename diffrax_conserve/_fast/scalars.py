@@ -19,8 +19,10 @@ from collections.abc import Callable, Iterable, Sequence
 from math import prod
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.core
+import jax.custom_batching
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
@@ -28,15 +30,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from .._step.constants import OPERATIONS
 from .jaxprs import closed_jaxpr, outputs, walk
 
 # An array as a tuple of its elements.
 Scalars = tuple[Any, ...]
-
-# Compile time grows with the number of scalar operations. With 512 the Cartesian pendulum, the
-# vortices and the Toda lattice of the catalogue stayed in arrays: they compiled up to two seconds
-# faster, and took two to five times as long (`benchmarks/cost/forms.py --only systems`).
-MAX_OPERATIONS = 2048
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
@@ -47,7 +45,7 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     """
     out = jax.eval_shape(fn, y)
     size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
-    written = in_scalars(fn, y, limit=MAX_OPERATIONS // size, differentiated=True)
+    written = in_scalars(fn, y, limit=OPERATIONS // size, differentiated=True)
     if written is None:
         return fn(y)
     return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
@@ -56,7 +54,7 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
 def in_scalars(
     fn: Callable[..., Any],
     *like: Any,
-    limit: int = MAX_OPERATIONS,
+    limit: int = OPERATIONS,
     differentiated: bool = False,
 ) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements.
@@ -92,6 +90,42 @@ def in_scalars(
         return out_treedef.unflatten(results)
 
     return written
+
+
+def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
+    """`run(given, lanes)` as a function of `given`, where `lanes` tells whether it is batched.
+
+    Both forms are jitted, so that JAX traces each once, although it batches the loop over the steps
+    of a solve several times. The results of `run` are arrays.
+    """
+
+    def call(given: Any) -> Any:
+        arrays, static = eqx.partition(given, eqx.is_array)
+        form = lambda lanes: jax.jit(lambda arrays: run(eqx.combine(arrays, static), lanes))  # noqa: E731
+        alone, lane = jax.custom_batching.custom_vmap(form(False)), form(True)
+
+        @alone.def_vmap
+        def batched(size: int, axes: Any, arrays: Any) -> Any:
+            del size
+            (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
+            out = jax.vmap(lane, (axes,))(arrays)
+            return out, jtu.tree_map(lambda x: True, out)
+
+        return alone(arrays)
+
+    return call
+
+
+def written_out_loop(
+    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, counter: Array
+) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
+    """The functions of a loop, `first = start(y)` and `y, counter = advance(first, y, counter)`, in
+    scalars, with `y` as a tuple of them. They are given back as they are if one is too large."""
+    first = jax.eval_shape(start, y)
+    written = in_scalars(start, y), in_scalars(advance, first, y, counter)
+    if written[0] is None or written[1] is None:
+        return start, advance, y
+    return *written, components(y)
 
 
 def components(x: Array) -> Any:

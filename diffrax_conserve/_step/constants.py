@@ -1,0 +1,59 @@
+"""The numbers of the core, each with its reason. What follows from one of them is computed."""
+
+# A residual of at most this many units of roundoff of its scale counts as zero. Rounding the state
+# and evaluating the residual contribute about one unit each, in long sums a few. The promise "16
+# units of roundoff" is part of the documentation, and `tests/soak` checks it in long double. What
+# else is compared with roundoff, such as the pivot of a constraint that depends on others, is
+# compared with this many units of it.
+ROUNDOFF = 16
+# A residual of this many units is noise: rounding the state and evaluating the function contribute
+# about one unit each, to the conserved value and now. An iteration can reduce it by chance only, so
+# it is not corrected. With other tolerances the share of the tolerance is the same. With 2 in the
+# place of 4 one of a thousand lanes usually needs one more step, and all wait for it.
+NOISE = 4
+# An iteration has at most this many steps, unless the user says otherwise. In a solve two are
+# usual. The rest is for steps of the solver that are much too long.
+MAX_STEPS = 50
+# The directions of a correction are the gradients at the candidate for this many steps. Newton's
+# method converges quadratically, so a nearby candidate needs fewer. If these are not enough, the
+# plane of the corrections may miss the manifold, as on a circular orbit, where the states with the
+# given energy and angular momentum are a curve and not a surface. From then on the directions are
+# the gradients at each state.
+FROZEN_STEPS = 6
+# A correction that does not help is shortened to this share of itself. A half needs twice as many
+# evaluations where it is far too long, and a much smaller share gives away corrections that would
+# do.
+SHORTER = 1 / 4
+# Up to this many constraints the elimination is written out, element by element, so that XLA fuses
+# it with what is around it. A call of LAPACK would take most of the time of a small projection.
+WRITTEN_OUT = 4
+# This power of roundoff, times the root of the number of constraints, is added to the diagonal of
+# larger matrices, as a share of it, so that they can be factored where constraints depend on each
+# other. The residuals of such constraints contradict each other by roundoff, which becomes an error
+# of all multipliers, in the ratio of roundoff to what is added. With 16 units of roundoff one in
+# five projections on the seven integrals of an orbit, of which five are independent, does not
+# converge.
+ADDED_POWER = 3 / 4
+# So many solves, all but the first for what is left of the right side, remove from a solution what
+# the addition has changed in it.
+REFINEMENTS = 3
+# Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
+# constraint whose components are all at bounds would have no gradient, and would never be met.
+AT_BOUND = 1e-10
+# The nearest point from far away is sought for at most this many unknowns and constraints together,
+# because each step solves a dense system of that size.
+NEAREST = 512
+# A function is written out in scalars up to this many operations, with which compile time grows.
+# With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
+# arrays: they compiled up to two seconds faster, and took two to five times as long
+# (`benchmarks/cost/forms.py --only systems`). With 0 nothing is.
+OPERATIONS = 2048
+# The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
+# is as fast (`benchmarks/cost/many_constraints.py`).
+LEAST_SPARSE = 33
+# A row is dense if it has more than this many times the elements of the median row (a bond has 6
+# elements, an energy all of them). A Jacobian with more dense rows than this is treated as dense,
+# because each costs one reverse pass and a solve of the sparse system. A block with more rows than
+# this is replaced by an iteration, because it is eliminated element by element, so that compile
+# time grows with its size.
+FEW = 16

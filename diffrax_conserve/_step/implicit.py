@@ -1,0 +1,165 @@
+"""The derivative of what an iteration finds, by the implicit function theorem.
+
+Whatever solves the equations `F(x, p) = 0` for the unknowns `x`, its derivative by the parameters
+`p` is `ẋ = -(∂F/∂x)⁻¹ ∂F/∂p ṗ`. It holds for the unknowns that were computed, whatever the number of
+steps, and no step is unrolled. That is one rule, `solution`. Equations say how they are solved,
+what `F` is, and how a linear system with its derivative is solved. The parameters are the arrays of
+which they consist: the candidate, the values that are conserved, the units, parameters of the
+user's functions.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._large.sparse import SparseRows
+from .._tree import tree_stop_gradient, tree_tangents, unflatten
+from .equations import Equations, Jacobian, measured
+from .iterate import Solved, nearby
+from .linear import combined, corrected, gram_matrix, is_determined, scaled_rows, solve, times
+
+
+class AbstractSystem(eqx.Module):
+    """Equations for unknowns. What is not an array, such as an option, must be static."""
+
+    @abc.abstractmethod
+    def found(self) -> Solved:
+        """The unknowns that solve the equations, as far as the iteration gets."""
+
+    @abc.abstractmethod
+    def defect(self, solved: Solved) -> Any:
+        """`F`, at the unknowns of `solved`, which are constant here. It is only differentiated."""
+
+    @abc.abstractmethod
+    def linear_solution(self, solved: Solved, right: Any) -> Any:
+        """`(∂F/∂x)⁻¹ right`."""
+
+
+@eqx.filter_custom_jvp
+def solution(system: AbstractSystem) -> Solved:
+    """What `system.found()` returns, with the derivative of the unknowns."""
+    return system.found()
+
+
+@solution.def_jvp
+def _solution_jvp(primals: Any, tangents: Any) -> Any:
+    (system,), (t_system,) = primals, tangents
+    solved = solution(system)
+    fixed = tree_stop_gradient(solved)
+    defect, t_defect = eqx.filter_jvp(lambda system: system.defect(fixed), (system,), (t_system,))
+    right = tree_tangents(defect, t_defect)
+    tangent = system.linear_solution(solved, jtu.tree_map(jnp.negative, right))
+    return solved, Solved(tangent, None, None, None)  # pyright: ignore
+
+
+@final
+class Along(AbstractSystem):
+    """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows of
+    `U` are the `directions`, or the gradients at the candidate `ŷ`.
+
+    The unknowns are `y` and `λ`. The iteration returns only `y`, from which `λ` follows. The
+    equations are `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
+    """
+
+    equations: Equations
+    candidate: Float[Array, " n"]
+    directions: Jacobian | None = None
+    iteration: Callable[..., Solved] = eqx.field(default=nearby, static=True, kw_only=True)
+    max_steps: int = eqx.field(static=True, kw_only=True)
+
+    def found(self) -> Solved:
+        given = self.equations, self.candidate, self.directions
+        return self.iteration(*given, max_steps=self.max_steps)
+
+    def _along(self) -> Jacobian:
+        """The rows of `U`."""
+        if self.directions is not None:
+            return self.directions
+        return self.equations.in_units(self.equations.linearise(self.candidate)[1])
+
+    def _state(self, solved: Solved) -> Float[Array, " n"]:
+        """The result of a failed projection is discarded. In reverse mode its cotangent is zero, but
+        zero times a tangent that is not finite would be NaN. So we differentiate at the candidate
+        there."""
+        return jnp.where(solved.ok, solved.y, self.candidate)
+
+    def defect(self, solved: Solved) -> tuple[Array, Array]:
+        y = self._state(solved)
+        fixed = tree_stop_gradient(self)
+        sizes, rows = scaled_rows(fixed._along())
+        along = times(rows, measured(lax.stop_gradient(y) - fixed.candidate, fixed.equations.units))
+        multiplier = solve(gram_matrix(rows, rows), along) / sizes
+        if self.directions is not None:
+            change = combined(multiplier, self.directions)
+        else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
+            _, vjp = jax.vjp(self.equations.residual, self.candidate)
+            change = self.equations.in_units(vjp(multiplier)[0])
+        end = self.candidate + self.equations.change(change)
+        # The second equation at the end of the correction, so that its tangent contains the first.
+        return end, self.equations.residual(end)
+
+    def linear_solution(self, solved: Solved, right: tuple[Array, Array]) -> Array:
+        """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
+        and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
+        t_y, t_g = (-x for x in right)
+        equations, y = self.equations, self._state(solved)
+        heights, rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))
+        along = scaled_rows(self._along())[1]
+        t_y = t_y - equations.change(corrected(rows, along, t_g / heights))
+        # `more` tells whether the state is of the form above.
+        sizes = [jnp.linalg.norm(x, axis=1) for x in (rows, along) if not isinstance(x, SparseRows)]
+        sizes = sizes[0] * sizes[1] if sizes else None
+        right = solved.more & is_determined(gram_matrix(rows, along), sizes) | ~solved.ok
+        return lax.stop_gradient(jnp.where(right, 1, jnp.nan)).astype(t_y.dtype) * t_y
+
+
+@final
+class General(AbstractSystem):
+    """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that solves
+    them from a guess. The linear systems have their dense Jacobian."""
+
+    residual: Callable[[Any], Any]
+    iterate: Callable[[Any], Solved]
+    guess: Any
+    solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = eqx.field(
+        static=True
+    )
+
+    def found(self) -> Solved:
+        return self.iterate(self.guess)
+
+    def defect(self, solved: Solved) -> Any:
+        return self.residual(solved.y)
+
+    def linear_solution(self, solved: Solved, right: Any) -> Any:
+        flat = _flat(right)
+
+        def linear(x: Array) -> Array:
+            return jax.jvp(self.residual, (solved.y,), (unflatten(x, solved.y),))[1]
+
+        matrix = jax.jacfwd(lambda x: _flat(linear(x)))(jnp.zeros_like(flat))
+        return unflatten(self.solve(matrix, flat), solved.y)
+
+
+def root(
+    residual: Callable[[Any], Any],
+    iterate: Callable[[Any], Solved],
+    guess: Any,
+    solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]],
+) -> Solved:
+    """The root of `residual` that `iterate(guess)` finds, for unknowns that are a vector or a PyTree
+    of vectors. Its derivative is by the theorem, with `solve(matrix, vector)` for linear systems.
+    The arrays over which the functions close, such as parameters, have their derivatives too."""
+    residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
+    return solution(General(residual, iterate, guess, solve))
+
+
+def _flat(tree: Any) -> Float[Array, " n"]:
+    return jnp.concatenate([jnp.ravel(x) for x in jtu.tree_leaves(tree)])

@@ -1,0 +1,330 @@
+"""The iterations that lead to the manifold: one loop, and what a step of it may do.
+
+All are Newton's method for equations with more unknowns than constraints. They differ in what a
+step does, so a step is a function of the unknowns and of a counter, and the loop around it is
+written once, in `iterate`.
+
+- `nearby` is for candidates as near as the local error of a solver's step (Hairer, Lubich and
+  Wanner, IV.4, equations (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
+  is on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
+  gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function of
+  the candidate and of the multipliers, and has a derivative by the implicit function theorem; see
+  `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration is
+  Newton's method. With many constraints it is that at the candidate.
+- `damped` is for starts far away. Each step is the shortest, in the metric, that solves the
+  equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
+  Springer 2004, Section 4.4). A step that increases the largest residual, or leaves the domain of a
+  function, is shortened until it does not.
+"""
+
+import functools as ft
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.custom_batching
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int
+
+from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
+from .._large.sparse import SparseRows
+from .constants import AT_BOUND, FROZEN_STEPS, SHORTER, WRITTEN_OUT
+from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
+from .linear import combined, corrected, factored, gram_matrix, scaled_rows, solve, solve
+
+# A step of an iteration: the unknowns and the counter after it.
+Advance = Callable[[Any, Array], tuple[Any, Array]]
+
+
+class Solved(NamedTuple):
+    """The unknowns, of a projection the state; whether they solve the equations; the number of
+    steps; and what else was found, which has no derivative."""
+
+    y: Any
+    ok: Bool[Array, ""]
+    num_steps: Int[Array, ""]
+    more: Any = None
+
+
+# ---- The loop ----
+
+
+class _Now(NamedTuple):
+    """What the loop carries. It carries little, because for small systems moving the carry costs
+    more than the arithmetic."""
+
+    y: Any
+    counter: Array
+    num_steps: Array
+
+
+def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
+    """Advances the unknowns until the counter says that they are done.
+
+    The counter is the number of tests that are left. A test of the unknowns comes before each step
+    and after the last, so there is one more test than steps. In the end the counter is zero if the
+    last test was passed, otherwise -1. `after_test` computes it.
+
+    The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
+    are done, for which the counter is not positive, as they are.
+    """
+
+    def body(now: _Now) -> _Now:
+        y, counter = advance(now.y, now.counter)
+        return _Now(y, counter, now.num_steps + (counter > 0).astype(int))
+
+    start = _Now(y, tests(max_steps), jnp.asarray(0))
+    end = lax.while_loop(lambda now: any_lane(now.counter > 0), body, start)
+    return Solved(end.y, end.counter == 0, end.num_steps)
+
+
+def tests(max_steps: int) -> Int[Array, ""]:
+    """The counter at the start of an iteration, in a byte if it fits."""
+    fits = max_steps + 1 < jnp.iinfo(jnp.int8).max
+    return jnp.asarray(max_steps + 1, jnp.int8 if fits else jnp.int32)
+
+
+def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
+    """The counter after unknowns of this `level` were tested.
+
+    Unknowns that are settled are done. Of those that are merely within the tolerance, one more step
+    brings the residual to roundoff, where `polish` asks for it. A residual that is not finite
+    cannot recover, but one more step takes the NaN to the unknowns, where everybody sees it. If no
+    test is left and the unknowns do not solve the equations, the iteration has failed.
+    """
+    one_more = jnp.minimum(counter - 1, 1)
+    then = jnp.where(level == NOT_FINITE, one_more, counter - 1)
+    then = jnp.where((level < ON) & (then == 0), -1, then)
+    then = jnp.where(level == ON, one_more if polish else 0, then)
+    then = jnp.where(level == SETTLED, 0, then)
+    return jnp.where(counter > 0, then, counter).astype(counter.dtype)
+
+
+def after_step(settled: Array, hopeful: Array, counter: Array) -> Array:
+    """As `after_test`, for an iteration that judges a step by its length and takes it in any case:
+    whether it was so short that this is the last, and whether another would make sense."""
+    then = jnp.where(settled, 0, jnp.where(hopeful & (counter > 1), counter - 1, -1))
+    return jnp.where(counter > 0, then, counter).astype(counter.dtype)
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether the flag of any lane of a batch is set, for the conditions of loops and branches.
+
+    If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
+    array in the carry, which keeps the lanes that are done. With this condition, which is the same
+    for all lanes, it adds none. A branch with such a condition remains a branch.
+    """
+    return flag
+
+
+@any_lane.def_vmap
+def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
+    del size, axes
+    return any_lane(jnp.any(flags)), False
+
+
+def keep_done(counter: Array, moved: Any, y: Any) -> Any:
+    """The moved unknowns where the iteration goes on, and the others where it is done."""
+    return jtu.tree_map(lambda a, b: jnp.where(counter > 0, a, b), moved, y)
+
+
+# ---- For candidates nearby ----
+
+
+def nearby(
+    equations: Equations,
+    candidate: Float[Array, " n"],
+    directions: Float[Array, "m n"] | None = None,
+    *,
+    max_steps: int,
+) -> Solved:
+    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions`, or the gradients
+    at the candidate; instead of the latter, those at each state after `FROZEN_STEPS` steps. Then the
+    state is not of this form: `more` tells whether it is."""
+    if equations.magnitude.size > WRITTEN_OUT:
+        return _of_many(equations, candidate, max_steps)
+    return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
+        (equations, candidate, directions)
+    )
+
+
+def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
+    """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
+    out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
+    equations, candidate, directions = given
+    last_frozen = max_steps + 1 - FROZEN_STEPS
+
+    def start(y: Any) -> Any:
+        """The gradients at the candidate, which the steps share."""
+        if directions is not None:
+            return directions
+        return scaled_rows(equations.in_units(equations.linearise(y)[1]))[1]
+
+    def advance(first: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+        seen = equations.linearise(y)
+        # Without a barrier XLA would evaluate the residuals once for each use of them.
+        g, jacobian = seen if lanes else lax.optimization_barrier(seen)
+        level, wrong = equations.level(g, equations.scale(jacobian, y))
+        counter = after_test(level, counter)
+        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        fresh = directions is None and last_frozen > 1
+        along = jnp.where(counter >= last_frozen, first, rows) if fresh else first
+        moved = y - equations.change(corrected(rows, along, wrong / sizes))
+        return keep_done(counter, moved, y), counter
+
+    # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for
+    # each use of the candidate.
+    y: Any = candidate if lanes else lax.optimization_barrier(candidate)
+    if lanes:
+        start, advance, y = written_out_loop(start, advance, y, tests(max_steps))
+    found = iterate(ft.partial(advance, start(y)), y, max_steps=max_steps)
+    frozen = (directions is not None) | (found.num_steps <= FROZEN_STEPS)
+    return found._replace(y=joined(candidate, found.y), more=frozen)
+
+
+@eqx.filter_jit
+def _of_many(equations: Equations, candidate: Float[Array, " n"], max_steps: int) -> Solved:
+    """The matrix is that at the candidate, factored once, so that a step evaluates only residuals.
+
+    They are compared with the scales at the candidate, because those at each state would need a
+    Jacobian. So at the end we test the result once more, by its own scales.
+    """
+    candidate = lax.optimization_barrier(candidate)
+    jacobian = equations.linearise(candidate)[1]
+    scale = equations.scale(jacobian, candidate)
+    along = equations.in_units(jacobian)
+    sizes, rows = scaled_rows(along)
+    solve = factored(gram_matrix(rows, rows))
+    _, vjp = jax.vjp(equations.residual, candidate)
+
+    def along_gradients(multiplier: Array) -> Array:
+        """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
+        if isinstance(along, SparseRows):
+            return equations.change(equations.in_units(vjp(multiplier)[0]))
+        return equations.change(combined(multiplier, along))
+
+    def advance(y: Array, counter: Array) -> tuple[Array, Array]:
+        level, wrong = equations.level(equations.residual(y), scale)
+        counter = after_test(level, counter)
+        move = lambda: y - along_gradients(solve(wrong / sizes) / sizes)  # noqa: E731
+        moved = lax.cond(any_lane(counter > 0), move, lambda: y)
+        return keep_done(counter, moved, y), counter
+
+    y, ok, num_steps, _ = iterate(advance, candidate, max_steps=max_steps)
+    return Solved(y, ok & equations.holds(y), num_steps, jnp.asarray(True))
+
+
+# ---- For starts far away ----
+
+
+class _Descent(NamedTuple):
+    """The state to be tested, and the best one so far with its largest residual, relative to the
+    scales at the first state. A scale grows with the state, so that by their own scales residuals
+    far away would look smaller than they are."""
+
+    y: Float[Array, " n"]
+    best: Float[Array, " n"]
+    largest: Float[Array, ""]
+    scale: Float[Array, " m"]
+
+
+def damped(
+    equations: Equations,
+    start: Float[Array, " n"],
+    directions: Jacobian | None = None,
+    *,
+    max_steps: int,
+    polish: bool = False,
+) -> Solved:
+    """A state on the manifold, which is near the start if that is near the manifold.
+
+    The steps are along the given `directions`, or along the gradients at each state. In the second
+    case the result depends on the path, so that its derivative is unknown.
+    """
+
+    def advance(now: _Descent, counter: Array) -> tuple[_Descent, Array]:
+        y, first = now.y, now.largest == jnp.inf
+        g, jacobian = lax.optimization_barrier(equations.linearise(y))
+        here = equations.scale(jacobian, y)
+        level, wrong = equations.level(g, here)
+        # A start that is not finite is hopeless. Later states are not: their step was too long.
+        level = jnp.where(first, level, jnp.maximum(level, OFF))
+        counter = after_test(level, counter, polish=polish)
+        scale = jnp.where(first, here, now.scale)
+        residuals = jnp.abs(relative(g, scale))
+        better = jnp.all(residuals <= now.largest)  # false if one is NaN
+        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        along = rows if directions is None else directions
+        further = y - equations.change(corrected(rows, along, wrong / sizes))
+        shorter = now.best + SHORTER * (y - now.best)
+        best = jnp.where(better, y, now.best)
+        largest = jnp.where(better, jnp.max(residuals), now.largest)
+        moved = keep_done(counter, jnp.where(better, further, shorter), y)
+        return _Descent(moved, best, largest, scale), counter
+
+    begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), equations.magnitude)
+    found = iterate(advance, begin, max_steps=max_steps)
+    return found._replace(y=found.y.y)
+
+
+def damped_along(
+    equations: Equations, candidate: Float[Array, " n"], directions: None, *, max_steps: int
+) -> Solved:
+    """As `nearby`, by the damped iteration."""
+    del directions
+    rows = equations.in_units(equations.linearise(candidate)[1])
+    found = damped(equations, candidate, rows, max_steps=max_steps)
+    return found._replace(more=jnp.asarray(True))
+
+
+# ---- Within bounds ----
+
+
+def bounded(
+    equations: Equations, start: Float[Array, " n"], directions: Jacobian, *, max_steps: int
+) -> Solved:
+    """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
+
+    If the constraints are linear, their residuals are the gradient of a function of the multipliers
+    that is convex and has kinks, where components reach their bounds. Newton's method for its
+    minimum may go round in a circle if it makes full steps across kinks. So each step goes to the
+    minimum along its direction, where the slope changes its sign.
+    """
+
+    def advance(z: Array, counter: Array) -> tuple[Array, Array]:
+        g, jacobian = lax.optimization_barrier(equations.linearise(z))
+        level, _ = equations.level(g, equations.scale(jacobian, z))
+        counter = after_test(level, counter, polish=False)
+        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        # Residuals that are noise are corrected too. Components at their bounds couple the
+        # constraints, so that what is noise for one constraint may be what another needs.
+        gram, right = gram_matrix(rows, directions), g / sizes
+        change = equations.change(combined(solve(gram, right), directions))
+        share = _share(equations, z, solve(gram, right), change)
+        return keep_done(counter, z - share * change, z), counter
+
+    return iterate(advance, start, max_steps=max_steps)._replace(more=jnp.asarray(True))
+
+
+def _share(equations: Equations, z: Array, multiplier: Array, change: Array) -> Array:
+    """The share of a step at which the convex function is least, by bisection of its slope along
+    the step, which is the product of the residuals with the step of the multipliers."""
+
+    def slope(share: Array | float) -> Array:
+        return jnp.sum(multiplier * equations.residual(z - share * change))
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = (ends[0] + ends[1]) / 2
+        further = slope(middle) >= 0
+        return jnp.where(further, middle, ends[0]), jnp.where(further, ends[1], middle)
+
+    # If a component at its bound is what a step would move, the step is too long by one over
+    # `AT_BOUND`. A step in full is kept if it goes hardly past the minimum.
+    one = jnp.ones((), z.dtype)
+    _, end = lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, (0 * one, one))
+    return jnp.where(slope(1.0) >= -(AT_BOUND**0.5) * slope(0.0), one, end)

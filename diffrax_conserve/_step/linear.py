@@ -1,0 +1,201 @@
+"""The small linear systems of projections: Gram matrices `U Vᵀ` of rows, one for each constraint.
+
+The matrices are singular where constraints depend on each other, as when an integral is given
+twice. Their multipliers are then not determined, but what they move is, if the constraints do not
+contradict each other. There are three ways to solve such a system, by its size.
+
+- Up to four constraints are eliminated one after the other, written out in scalars. If the gradient
+  of a constraint is a combination of those before it, its pivot is roundoff. We give it the
+  multiplier zero: if the others hold, it holds too. Gradients that are only nearly parallel are all
+  kept, because a correction needs the direction in which they differ.
+- More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes.
+- A sparse matrix is factored in blocks, in the same way; see `sparse`.
+"""
+
+import functools as ft
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy as jsp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._large.sparse import BlockGram, SparseRows
+from .constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
+
+Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
+
+
+def gram_matrix(rows: Any, others: Any) -> Any:
+    """`rows othersᵀ`."""
+    if isinstance(rows, SparseRows):
+        return rows.gram(others)
+    if len(rows) > WRITTEN_OUT:
+        return jnp.matmul(rows, others.T, precision=lax.Precision.HIGHEST)
+    return jnp.sum(rows[:, None, :] * others[None], axis=2)
+
+
+def combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
+    """`rowsᵀ multiplier`."""
+    if isinstance(rows, SparseRows):
+        return rows.combined(multiplier)
+    if len(rows) > WRITTEN_OUT:
+        return jnp.matmul(multiplier, rows, precision=lax.Precision.HIGHEST)
+    return jnp.sum(multiplier[:, None] * rows, axis=0)
+
+
+def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`rows x`."""
+    return rows.times(x) if isinstance(rows, SparseRows) else combined(x, rows.T)
+
+
+def corrected(rows: Any, along: Any, b: Float[Array, " m"]) -> Float[Array, " n"]:
+    """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
+
+    Up to four constraints we do not multiply by the multipliers. If gradients are nearly parallel,
+    these are large and cancel in the sum. XLA may evaluate `b` once for each of them, with another
+    rounding each time, and then they do not cancel. So the elimination is applied to the rows too,
+    `(R⁻ᵀ along)ᵀ (L⁻¹ b)` for `rows alongᵀ = L R`: differences are taken before anything is large.
+    """
+    gram = gram_matrix(rows, along)
+    if _is_large(gram):
+        return combined(solve(gram, b), along)
+    return combined(*eliminated(gram, b, along))
+
+
+def solve(gram: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
+    if isinstance(gram, BlockGram):
+        return refined(gram.factored(), gram.times, b)
+    if _is_large(gram):
+        return refined(factored(gram), lambda x: combined(x, gram.T), b)
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype)))
+
+
+def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`matrix⁻¹ b` for a dense matrix of any size, by LAPACK with exchanges of rows."""
+    factors = _large_factors(matrix, jnp.ones_like(b))
+    return refined(factors, lambda x: combined(x, matrix.T), b)
+
+
+class Factors(eqx.Module):
+    """The inverses of the two factors of a matrix, so that a solve is two products with a matrix.
+    These are faster than two substitutions, in a batch above all. Their product is not formed: where
+    constraints depend on each other, the elements of an inverse are as large as one over what is
+    added, and their roundoff would spoil what the constraints determine.
+
+    - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
+    """
+
+    below: Float[Array, "m m"]
+    above: Float[Array, "m m"]
+    unit: Float[Array, " m"]
+
+    def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        x = (b * self.unit).astype(self.below.dtype)
+        return combined(combined(x, self.below.T), self.above.T).astype(b.dtype) * self.unit
+
+
+def factored(gram: Any) -> Solve:
+    """`gram⁻¹ b` as a function of `b`. What is added to the diagonal of a large matrix is an error
+    of the solution, which `solve` removes, and so do the steps of an iteration."""
+    if isinstance(gram, BlockGram):
+        return gram.factored()
+    diagonal = jnp.abs(jnp.diagonal(gram))
+    unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    matrix = gram * unit[:, None] * unit
+    if not _is_large(gram):
+        one = jnp.eye(len(gram), dtype=gram.dtype)
+        below, above = eliminated(matrix, one, one)
+        return Factors(below, above.T, unit)
+    return _large_factors(matrix, unit)
+
+
+def _large_factors(matrix: Float[Array, "m m"], unit: Float[Array, " m"]) -> Factors:
+    dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
+    eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
+    added = eps**ADDED_POWER * len(matrix) ** 0.5
+    lu, _, order = lax.linalg.lu(matrix.astype(dtype) + added * one)
+    triangle = ft.partial(jsp.linalg.solve_triangular, lu)
+    return Factors(triangle(one[order], lower=True, unit_diagonal=True), triangle(one), unit)
+
+
+def _is_large(gram: Any) -> bool:
+    return len(gram) > WRITTEN_OUT
+
+
+def refined(
+    solve: Solve, product: Callable[[Array], Array], b: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """The solution of `product(x) = b` by iterative refinement, from a `solve` that is inaccurate,
+    because something was added to the matrix."""
+    x = solve(b)
+    for _ in range(REFINEMENTS - 1):
+        x = x + solve(b - product(x))
+    return x
+
+
+def eliminated(
+    gram: Float[Array, "m m"], b: Array, rows: Array
+) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
+    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`."""
+    m, least = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
+    matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
+    b, rows = list(b), list(rows)  # pyright: ignore
+    for k in range(m):
+        # If the pivot is roundoff, it counts as infinite, so that the multiplier is zero.
+        regular = jnp.abs(matrix[k][k]) > least * jnp.abs(gram[k, k])
+        pivot = jnp.where(regular, matrix[k][k], jnp.inf)
+        for i in range(k + 1, m):
+            below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
+            b[i], rows[i] = b[i] - below * b[k], rows[i] - beside * rows[k]
+            for j in range(k + 1, m):
+                matrix[i][j] = matrix[i][j] - below * matrix[k][j]
+        b[k] = b[k] / pivot
+    return jnp.stack(b), jnp.stack(rows)
+
+
+def is_determined(gram: Any, sizes: Float[Array, " m"] | None = None) -> Bool[Array, ""]:
+    """Whether a derivative that is solved for with this matrix `U Vᵀ` has digits.
+
+    Its error is one unit of roundoff over the pivot of a constraint, relative to the `sizes`, the
+    lengths of the rows of `U` times those of `V`, by default the diagonal. That is the square of the
+    sine of the angle between its gradient and those before it. So half of the digits are right if
+    no pivot is below the root of roundoff. A pivot that is itself roundoff belongs to a constraint
+    that depends on others, which does no harm. More than four constraints are not tested.
+    """
+    if _is_large(gram):
+        return jnp.asarray(True)
+    eps = float(jnp.finfo(gram.dtype).eps)
+    sizes = jnp.abs(jnp.diagonal(gram)) if sizes is None else sizes
+    pivots = jnp.abs(_pivots(gram)) / jnp.where(sizes > 0, sizes, 1)
+    return jnp.all((pivots >= eps**0.5) | (pivots <= ROUNDOFF * eps))
+
+
+def _pivots(gram: Float[Array, "m m"]) -> Float[Array, " m"]:
+    for k in range(len(gram)):
+        pivot = jnp.where(gram[k, k] == 0, jnp.inf, gram[k, k])
+        change = gram[:, k, None] * gram[k] / pivot
+        below = np.arange(len(gram))[:, None] > k
+        gram = jnp.where(below, gram - change, gram)
+    return jnp.diagonal(gram)
+
+
+def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
+    """The largest element of each row, or one if all are zero, and the rows divided by it.
+
+    The products in a Gram matrix could otherwise overflow or underflow in float32. In float64 they
+    do not in usual units, so there the sizes are one, which saves time.
+    """
+    if jnp.result_type(*jtu.tree_leaves(rows)) == jnp.float64:
+        return jnp.ones(len(rows)), rows
+    if isinstance(rows, SparseRows):
+        return rows.scaled()
+    sizes = jnp.max(jnp.abs(rows), axis=1)
+    sizes = jnp.where(sizes > 0, sizes, 1)
+    return sizes, rows / sizes[:, None]
