@@ -122,10 +122,10 @@ def written_out_loop(
     """The functions of a loop, `first = start(y)` and `y, counter = advance(first, y, counter)`, in
     scalars, with `y` as a tuple of them. They are given back as they are if one is too large."""
     first = jax.eval_shape(start, y)
-    written = in_scalars(start, y), in_scalars(advance, first, y, counter)
-    if written[0] is None or written[1] is None:
+    starts, advances = in_scalars(start, y), in_scalars(advance, first, y, counter)
+    if starts is None or advances is None:
         return start, advance, y
-    return *written, components(y)
+    return starts, advances, components(y)
 
 
 def components(x: Array) -> Any:

@@ -44,8 +44,8 @@ class _Linear(eqx.Module):
     """The constraints at one position.
 
     - `jacobian`: `G`.
-    - `factors`: those of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By it both
-      the velocities at this position and the positions of the next step are found.
+    - `factors`: those of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By it
+      both the velocities at this position and the positions of the next step are found.
     """
 
     jacobian: Jacobian

@@ -24,7 +24,7 @@ from .._solver.unrolled import Unrolled
 from .._solver.wrapper import ForwardingSolver
 from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
-from .._step.implicit import root
+from .._step.implicit import known_if, root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
 from .._step.linear import combined, gram_matrix, is_determined, scaled_rows, solve, times
 from .._tree import ravel, unravel
@@ -289,8 +289,7 @@ def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) 
     along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
     gram = d - c @ along
     multiplier = solve(gram, below - c @ at)
-    tangent = jnp.concatenate([at - along @ multiplier, multiplier])
-    return lax.stop_gradient(jnp.where(is_determined(gram), 1, jnp.nan)) * tangent
+    return known_if(is_determined(gram), jnp.concatenate([at - along @ multiplier, multiplier]))
 
 
 def _check_symmetric(solver: Any) -> None:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from .._step.constants import MAX_STEPS, NEAREST
 from .._step.equations import Equations, measured
-from .._step.implicit import AbstractSystem, solution
+from .._step.implicit import AbstractSystem, known_if, solution
 from .._step.iterate import Solved, damped
 from .._step.linear import (
     combined,
@@ -109,9 +109,8 @@ class _Optimality(eqx.Module):
 
 
 class _Nearest(AbstractSystem):
-    """The nearest point to the candidate. The unknowns are the state and its multipliers, divided by
-    the sizes of the gradients; the multipliers are NaN if only a point of the manifold was
-    found."""
+    """The nearest point to the candidate. The unknowns are the state and its multipliers times the
+    sizes of the gradients. The multipliers are NaN if only a point of the manifold was found."""
 
     equations: Equations
     candidate: Float[Array, " n"]
@@ -168,8 +167,8 @@ class _Nearest(AbstractSystem):
         return equations, sizes, units, jnp.concatenate([y, fits])
 
     def _conditions(self, y: Array) -> tuple[_Optimality, Array, Array]:
-        """The Lagrange conditions, with the `sizes` and `units` of a state. These are no parameters:
-        they only say in which units the unknowns are."""
+        """The Lagrange conditions, with the `sizes` and `units` of a state. These are no
+        parameters: they only say in which units the unknowns are."""
         _, sizes, units, _ = tree_stop_gradient(self._at(y))
         equations = self.equations.dense()
         return _Optimality(equations, self.candidate, self.bounds, sizes), sizes, units
@@ -202,7 +201,7 @@ class _Nearest(AbstractSystem):
         tangent = fixed + units * solve_large(matrix / rows[:, None] * units, right / rows)
         gradients = self.equations.dense()
         gradients = scaled_rows(gradients.in_units(gradients.linearise(y)[1]))[1]
-        right = jnp.all(jnp.isfinite(multiplier)) & is_determined(gram_matrix(gradients, gradients))
-        right = right | ~self.equations.holds(y)
-        tangent = lax.stop_gradient(jnp.where(right, 1, jnp.nan)).astype(tangent.dtype) * tangent
+        is_known = is_determined(gram_matrix(gradients, gradients))
+        is_known = is_known & jnp.all(jnp.isfinite(multiplier)) | ~self.equations.holds(y)
+        tangent = known_if(is_known, tangent)
         return tangent[: y.size], tangent[y.size :]

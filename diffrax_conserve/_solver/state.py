@@ -20,6 +20,7 @@ from .._manifold import Constraint, is_entry
 from .._options import found_in
 from .._printing import is_traced, printed
 from .._projection.base import ProjectionInfo
+from .._step.constants import ROUNDOFF
 from .._step.equations import Equations, length, reach, shown_terms
 from .._step.metric import Units
 from .._step.roundoff import hidden_scale
@@ -55,12 +56,6 @@ FIRST = register(
 # The causes of a failure, in the order of their messages above, of which `FIRST` is the first. Zero
 # is no failure.
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
-# If a step moves a component by at most this many units of roundoff of itself, it may move it by
-# rounding alone: a dozen stages are added up, each with an error of a few units.
-_AT_ROUNDOFF = 64
-# A step of at most this many units of roundoff of the time is no time: the controller computes the
-# ends of a step by a few additions.
-_INSTANT = 8
 # Corrections are usually shorter than the error estimate of their step, because that is the
 # estimate for a method of lower order. If one is longer by this factor, the quantity is probably
 # not conserved. The number is a choice.
@@ -256,7 +251,7 @@ def cause_of_failure(
 
 
 def is_final(
-    state: State, t0: RealScalarLike, t1: RealScalarLike, moved: Array, candidate: Y
+    state: State, t0: RealScalarLike, t1: RealScalarLike, change: Array, candidate: Y
 ) -> Bool[Array, ""]:
     """Whether a step that failed is so short that no shorter one is better.
 
@@ -264,7 +259,7 @@ def is_final(
     by no more than roundoff, or when no time passes. Time is compared with the length of the first
     step too, because many solves start at zero, beside which every step is long.
     """
-    size = jnp.abs(ravel(candidate))
-    still = jnp.all(moved <= _AT_ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size)
-    instant = _INSTANT * float(jnp.finfo(jnp.result_type(t1)).eps)
-    return still | (jnp.abs(t1 - t0) <= instant * jnp.maximum(jnp.abs(t1), state.first_step))
+    size, eps = jnp.abs(ravel(candidate)), lambda x: float(jnp.finfo(jnp.result_type(x)).eps)
+    still = jnp.all(change <= ROUNDOFF * eps(size) * size)
+    time = jnp.maximum(jnp.abs(t1), state.first_step)
+    return still | (jnp.abs(t1 - t0) <= ROUNDOFF * eps(t1) * time)

@@ -1,11 +1,11 @@
 """The derivative of what an iteration finds, by the implicit function theorem.
 
 Whatever solves the equations `F(x, p) = 0` for the unknowns `x`, its derivative by the parameters
-`p` is `ẋ = -(∂F/∂x)⁻¹ ∂F/∂p ṗ`. It holds for the unknowns that were computed, whatever the number of
-steps, and no step is unrolled. That is one rule, `solution`. Equations say how they are solved,
-what `F` is, and how a linear system with its derivative is solved. The parameters are the arrays of
-which they consist: the candidate, the values that are conserved, the units, parameters of the
-user's functions.
+`p` is `ẋ = -(∂F/∂x)⁻¹ ∂F/∂p ṗ`. It holds for the unknowns that were computed, whatever the number
+of steps, and no step is unrolled. That is one rule, `solution`. A system of equations says how it
+is solved, what `F` is, and how a linear system with its derivative is solved. The parameters are
+the arrays of which it consists: the candidate, the values that are conserved, the units, parameters
+of the user's functions.
 """
 
 import abc
@@ -61,8 +61,8 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
 
 @final
 class Along(AbstractSystem):
-    """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows of
-    `U` are the `directions`, or the gradients at the candidate `ŷ`.
+    """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows
+    of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
     The unknowns are `y` and `λ`. The iteration returns only `y`, from which `λ` follows. The
     equations are `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
@@ -85,9 +85,9 @@ class Along(AbstractSystem):
         return self.equations.in_units(self.equations.linearise(self.candidate)[1])
 
     def _state(self, solved: Solved) -> Float[Array, " n"]:
-        """The result of a failed projection is discarded. In reverse mode its cotangent is zero, but
-        zero times a tangent that is not finite would be NaN. So we differentiate at the candidate
-        there."""
+        """The result of a failed projection is discarded. In reverse mode its cotangent is zero,
+        but zero times a tangent that is not finite would be NaN. So we differentiate at the
+        candidate there."""
         return jnp.where(solved.ok, solved.y, self.candidate)
 
     def defect(self, solved: Solved) -> tuple[Array, Array]:
@@ -116,14 +116,19 @@ class Along(AbstractSystem):
         # `more` tells whether the state is of the form above.
         sizes = [jnp.linalg.norm(x, axis=1) for x in (rows, along) if not isinstance(x, SparseRows)]
         sizes = sizes[0] * sizes[1] if sizes else None
-        right = solved.more & is_determined(gram_matrix(rows, along), sizes) | ~solved.ok
-        return lax.stop_gradient(jnp.where(right, 1, jnp.nan)).astype(t_y.dtype) * t_y
+        is_known = solved.more & is_determined(gram_matrix(rows, along), sizes) | ~solved.ok
+        return known_if(is_known, t_y)
+
+
+def known_if(is_known: Any, tangent: Array) -> Array:
+    """A tangent, or NaN where it is not known."""
+    return lax.stop_gradient(jnp.where(is_known, 1, jnp.nan)).astype(tangent.dtype) * tangent
 
 
 @final
 class General(AbstractSystem):
-    """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that solves
-    them from a guess. The linear systems have their dense Jacobian."""
+    """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that
+    solves them from a guess. The linear systems have their dense Jacobian."""
 
     residual: Callable[[Any], Any]
     iterate: Callable[[Any], Solved]
@@ -154,9 +159,10 @@ def root(
     guess: Any,
     solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]],
 ) -> Solved:
-    """The root of `residual` that `iterate(guess)` finds, for unknowns that are a vector or a PyTree
-    of vectors. Its derivative is by the theorem, with `solve(matrix, vector)` for linear systems.
-    The arrays over which the functions close, such as parameters, have their derivatives too."""
+    """The root of `residual` that `iterate(guess)` finds, for unknowns that are an array or a
+    PyTree of them. Its derivative is by the theorem, with `solve(matrix, vector)` for linear
+    systems. The arrays over which the functions close, such as parameters, have their derivatives
+    too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
     return solution(General(residual, iterate, guess, solve))
 

@@ -7,10 +7,10 @@ written once, in `iterate`.
 - `nearby` is for candidates as near as the local error of a solver's step (Hairer, Lubich and
   Wanner, IV.4, equations (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
   is on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
-  gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function of
-  the candidate and of the multipliers, and has a derivative by the implicit function theorem; see
-  `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration is
-  Newton's method. With many constraints it is that at the candidate.
+  gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
+  of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
+  see `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration
+  is Newton's method. With many constraints it is that at the candidate.
 - `damped` is for starts far away. Each step is the shortest, in the metric, that solves the
   equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
   Springer 2004, Section 4.4). A step that increases the largest residual, or leaves the domain of a
@@ -34,7 +34,7 @@ from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
 from .constants import AT_BOUND, FROZEN_STEPS, SHORTER, WRITTEN_OUT
 from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
-from .linear import combined, corrected, factored, gram_matrix, scaled_rows, solve, solve
+from .linear import combined, corrected, factored, gram_matrix, scaled_rows, solve
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -143,9 +143,9 @@ def nearby(
     *,
     max_steps: int,
 ) -> Solved:
-    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions`, or the gradients
-    at the candidate; instead of the latter, those at each state after `FROZEN_STEPS` steps. Then the
-    state is not of this form: `more` tells whether it is."""
+    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions`, or the
+    gradients at the candidate; instead of the latter, those at each state after `FROZEN_STEPS`
+    steps. Then the state is not of this form: `more` tells whether it is."""
     if equations.magnitude.size > WRITTEN_OUT:
         return _of_many(equations, candidate, max_steps)
     return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
@@ -159,7 +159,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     equations, candidate, directions = given
     last_frozen = max_steps + 1 - FROZEN_STEPS
 
-    def start(y: Any) -> Any:
+    def first_rows(y: Any) -> Any:
         """The gradients at the candidate, which the steps share."""
         if directions is not None:
             return directions
@@ -179,10 +179,11 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
 
     # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for
     # each use of the candidate.
-    y: Any = candidate if lanes else lax.optimization_barrier(candidate)
+    loop: Any = first_rows, advance, candidate if lanes else lax.optimization_barrier(candidate)
     if lanes:
-        start, advance, y = written_out_loop(start, advance, y, tests(max_steps))
-    found = iterate(ft.partial(advance, start(y)), y, max_steps=max_steps)
+        loop = written_out_loop(first_rows, advance, candidate, tests(max_steps))
+    start, step, y = loop
+    found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
     frozen = (directions is not None) | (found.num_steps <= FROZEN_STEPS)
     return found._replace(y=joined(candidate, found.y), more=frozen)
 

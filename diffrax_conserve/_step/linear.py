@@ -84,9 +84,9 @@ def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Arr
 
 class Factors(eqx.Module):
     """The inverses of the two factors of a matrix, so that a solve is two products with a matrix.
-    These are faster than two substitutions, in a batch above all. Their product is not formed: where
-    constraints depend on each other, the elements of an inverse are as large as one over what is
-    added, and their roundoff would spoil what the constraints determine.
+    These are faster than two substitutions, in a batch above all. Their product is not formed:
+    where constraints depend on each other, the elements of an inverse are as large as one over what
+    is added, and their roundoff would spoil what the constraints determine.
 
     - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
     """
@@ -164,10 +164,11 @@ def is_determined(gram: Any, sizes: Float[Array, " m"] | None = None) -> Bool[Ar
     """Whether a derivative that is solved for with this matrix `U Vᵀ` has digits.
 
     Its error is one unit of roundoff over the pivot of a constraint, relative to the `sizes`, the
-    lengths of the rows of `U` times those of `V`, by default the diagonal. That is the square of the
-    sine of the angle between its gradient and those before it. So half of the digits are right if
-    no pivot is below the root of roundoff. A pivot that is itself roundoff belongs to a constraint
-    that depends on others, which does no harm. More than four constraints are not tested.
+    lengths of the rows of `U` times those of `V`, by default the diagonal. That is the square of
+    the sine of the angle between its gradient and those before it. So half of the digits are right
+    if no pivot is below the root of roundoff. A pivot that is itself roundoff belongs to a
+    constraint that depends on others, which does no harm. More than four constraints are not
+    tested.
     """
     if _is_large(gram):
         return jnp.asarray(True)

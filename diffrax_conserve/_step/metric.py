@@ -22,11 +22,6 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._options import check_function, check_number
 from .._tree import ravel, real_view
 
-# Elements of a matrix that a user passes may differ from their mirror images by this share of
-# themselves. A mass matrix that is computed in float32, with units of roundoff of 1e-7, is
-# symmetric to about 1e-6.
-_SYMMETRIC = 1e-5
-
 
 class MatrixUnits(eqx.Module):
     """A factor `S` of `M⁻¹ = S Sᵀ`, where the metric `M` is a matrix in some parts of the state. In
@@ -104,7 +99,8 @@ def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any]
 
 
 def _is_positive_definite(matrix: np.ndarray) -> bool:
-    symmetric = np.allclose(matrix, matrix.T, rtol=_SYMMETRIC, atol=0)
+    # A matrix may have been computed in float32, from terms that cancel.
+    symmetric = np.allclose(matrix, matrix.T, rtol=np.finfo(np.float32).eps ** 0.5, atol=0)
     return bool(symmetric and np.all(np.linalg.eigvalsh((matrix + matrix.T) / 2) > 0))
 
 
