@@ -50,10 +50,10 @@ from ._projection.staged import Staged as Staged
 from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
-from ._solver.rk4 import RK4 as RK4
 from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
 from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
+from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled
 from ._symmetric.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
 from ._symmetric.rattle import RATTLE as RATTLE

@@ -17,7 +17,7 @@ FirstIntegral, Constraint, Simplified = dfc.FirstIntegral, dfc.Constraint, dfc.S
 ENERGY = FirstIntegral(rotational_energy)
 SPHERE = Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 GAIN = FirstIntegral(rotational_energy, value=1.0, rate=lambda t, y, args: 1j * y[0])
-NOT_EXPLICIT = dfx.Euler(), dfx.Kvaerno5(), "Tsit5", dfc.RK4()
+NOT_EXPLICIT = dfx.Euler(), dfx.Kvaerno5(), dfx.Kvaerno5().tableau, "Tsit5"
 IMPLICIT = dfx.HalfSolver(dfx.Kvaerno3())
 
 

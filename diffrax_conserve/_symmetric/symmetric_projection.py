@@ -23,10 +23,8 @@ from .._projection.implicit import certain
 from .._projection.options import MAX_STEPS, check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
-from .._solver.rk4 import RK4
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
-from .._solver.unrolled import Unrolled
 from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf, root
@@ -336,8 +334,7 @@ def _check_symmetric(solver: Any) -> None:
     if isinstance(tableau, dfx.ButcherTableau):
         symmetric = _is_symmetric(tableau)
     else:
-        ours = isinstance(inner, RK4 | Unrolled)
-        symmetric = not (ours or type(inner).__module__.startswith("diffrax."))
+        symmetric = not type(inner).__module__.startswith("diffrax.")
     projects = issubclass(type(solver), ForwardingSolver)  # which `isinstance` would not tell
     if projects or not symmetric:
         raise ValueError(

@@ -17,7 +17,7 @@ from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
-from .._solver.rk4 import RK4
+from .._solver.unrolled import RK4
 from ._networks.flat import (
     as_states,
     check_scalars,
