@@ -13,7 +13,7 @@ What is conserved    FirstIntegral, Constraint, find_invariants
 Diagnostics          check_invariance, drift, off_manifold, statistics
 Solvers              ManifoldProjection, RK4, Unrolled
 Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
-Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
+Projections          SimplifiedNewton, Newton, AlongLine, Staged, project
 Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
@@ -35,16 +35,15 @@ from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
 from ._manifold import entry_name as entry_name
 from ._projection import closed_forms as closed_forms
+from ._projection.along_line import AlongLine as AlongLine
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
 from ._projection.base import ProjectionInfo as ProjectionInfo
 from ._projection.base import Step as Step
 from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
-from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
-from ._projection.relaxation import Relaxation as Relaxation
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
 from ._projection.tangent import TangentField as TangentField

@@ -140,7 +140,7 @@ def test_integral_of_wrong_type(wrong):
 
 NO_TOLERANCES = (-1.0, ValueError), (np.nan, ValueError), ("a", TypeError), (True, TypeError)
 NO_COUNTS = (0, ValueError), (1.5, TypeError), ("2", TypeError), (True, TypeError)
-NEWTONS = Simplified, dfc.Newton, dfc.Directional
+NEWTONS = Simplified, dfc.Newton, ft.partial(dfc.AlongLine, direction="step")
 WRAP, TANGENT = ft.partial(wrap, ENERGY), ft.partial(dfc.tangent, rigid_body, ENERGY)
 
 
@@ -150,6 +150,7 @@ WRAP, TANGENT = ft.partial(wrap, ENERGY), ft.partial(dfc.tangent, rigid_body, EN
         *((kind, "rtol", wrong, error) for kind in NEWTONS for wrong, error in NO_TOLERANCES),
         *((kind, "max_steps", wrong, error) for kind in NEWTONS for wrong, error in NO_COUNTS),
         (dfc.Newton, "lower", "a", TypeError),
+        (dfc.AlongLine, "direction", "estimate", ValueError),
         (Simplified, "atol", -1.0, ValueError),
         (Simplified, "upper", {"q": np.nan}, ValueError),
         (Simplified, "metric", "mass", TypeError),

@@ -280,8 +280,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
-- `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Relaxation`, `Staged`,
-    or your own.
+- `projection`: a `SimplifiedNewton`, `Newton`, `AlongLine`, `ClosedForm`, `Staged`, or your own.
 - `max_correction`: a projection fails if its correction is longer than this share of its step, both
     in the metric of the projection. A component that hardly moves counts as moving by
     $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
