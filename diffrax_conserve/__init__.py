@@ -33,7 +33,6 @@ from ._diagnostics.drift import off_manifold as off_manifold
 from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
-from ._manifold import entry_name as entry_name
 from ._projection import closed_forms as closed_forms
 from ._projection.along_line import AlongLine as AlongLine
 from ._projection.base import AbstractProjection as AbstractProjection

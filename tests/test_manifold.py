@@ -101,7 +101,6 @@ MISTAKES = [
     (lambda: dfc.project(RIGID_BODY, OMEGA0), ValueError, "Pass `value="),
     (lambda: dfc.project(Constraint(lambda t, y, args: 1.0 * y), jnp.array(1)), TypeError, "float"),
     (lambda: dfc.project(GAIN, OMEGA0), TypeError, "`rate` of `manifold` returns complex128"),
-    (lambda: dfc.entry_name([ENERGY], 2), ValueError, "entries 0 to 0"),
     (lambda: dfc.drift(run(ENERGY), ENERGY), ValueError, r"SaveAt\(t0=True, t1=True\)"),
     (lambda: drift(dfx.SaveAt(dense=True)), ValueError, "saved states"),
     (lambda: drift(dfx.SaveAt(ts=[0.0, 1.0]), batch), ValueError, r"jax\.vmap"),
@@ -182,9 +181,6 @@ def test_what_is_right():
     FirstIntegral(max)  # has no signature
     FirstIntegral(jax.jit(rotational_energy))
     Constraint(lambda *args, scale=1.0: scale * args[1][0])
-    manifold = {"b": Constraint(jnp.sum), "a": (Constraint(jnp.sum),)}
-    assert dfc.entry_name(manifold, 0) == "manifold['a'][0]"
-    assert dfc.entry_name(manifold, 1) == "manifold['b']"
     one = drift(SUBS, lambda s: dataclasses.replace(s, ts=s.ts[0], ys=s.ys[0]))
     assert one.shape == (2,)
     value = FirstIntegral(rotational_energy, value=jnp.array(0.15))

@@ -156,7 +156,7 @@ class ManifoldProjection(ForwardingSolver):
             motion=moved(y0, y0),
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
-            statistics=ProjectionStatistics.zero(values.dtype),
+            statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import Constraint, is_entry
+from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
-from .._printing import is_traced, printed
+from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
 from .._projection.equations import Equations, length, reach, shown_terms
 from .._projection.metric import Units
@@ -32,7 +32,7 @@ _SMALLER = (
     "at all. "
 )
 _ENTRY = (
-    "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
+    "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
 )
 FIRST = register(
     "a step cannot start: its state violates a `Constraint`, or a function of the "
@@ -79,8 +79,9 @@ class ProjectionStatistics(eqx.Module):
         [`diffrax_conserve.ProjectionInfo`][].
     - `error`: the largest error estimate of the wrapped solver, in the metric of `correction`; NaN
         if it has none. Corrections that are much longer tell that a quantity is not conserved.
-    - `worst`: the position of the entry of the manifold that failed last, as
-        [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
+    - `worst`: the position in `names` of the entry of the manifold that failed last; -1 if none
+        failed. `print` shows the name.
+    - `names`: the names of the entries of the manifold, such as `manifold['energy']`.
     """
 
     num_projections: Int[Array, "..."]
@@ -92,17 +93,20 @@ class ProjectionStatistics(eqx.Module):
     roundoff: Float[Array, "..."]
     error: Float[Array, "..."]
     worst: Int[Array, "..."]
+    names: tuple[str, ...] = eqx.field(static=True)
 
     @classmethod
-    def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
-        count, size = jnp.asarray(0), jnp.zeros((), dtype)
-        return cls(count, count, count, size, size, size, size, size * jnp.nan, jnp.asarray(-1))
+    def zero(cls, manifold: Manifold, dtype: jnp.dtype) -> "ProjectionStatistics":
+        count, size, worst = jnp.asarray(0), jnp.zeros((), dtype), jnp.asarray(-1)
+        names = tuple(name for name, _ in named_entries(manifold))
+        return cls(count, count, count, size, size, size, size, size * jnp.nan, worst, names)
 
     def __str__(self) -> str:
         if is_traced(self):
             return repr(self)
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        if np.all(np.asarray(self.worst) < 0):
+        rows["worst"] = names_at(self.worst, rows.pop("names"))
+        if not rows["worst"]:
             del rows["worst"]
         text = printed("projections of the accepted steps", rows)
         if np.any(np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)):
@@ -127,6 +131,7 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.roundoff, info.roundoff),
             self.error if error is None else jnp.fmax(self.error, error),
             jnp.where(info.ok, self.worst, info.worst),
+            self.names,
         )
 
 
@@ -135,8 +140,8 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     They are part of the state of a `ManifoldProjection`, which `diffeqsolve` returns by
     `SaveAt(solver_state=True)`; otherwise they are not computed. Rejected steps appear only in
-    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept:
-    `entry_name(manifold, int(statistics(sol).worst))` is the name of the entry that failed.
+    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept: `print` then names
+    the entry of the manifold that failed.
 
     **Arguments:**
 

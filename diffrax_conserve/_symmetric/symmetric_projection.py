@@ -165,7 +165,7 @@ class SymmetricProjection(ForwardingSolver):
         t = t0 * time_direction(terms, t0)
         values = conserved_values(self.manifold, t, y0, args)
         values, hidden = started(values, self.manifold, t, y0, args)
-        statistics = ProjectionStatistics.zero(values.dtype)
+        statistics = ProjectionStatistics.zero(self.manifold, values.dtype)
         inner = self.solver.init(terms, t0, t1, y0, args)
         return _State(inner, values, hidden, jnp.zeros_like(values), statistics)
 
