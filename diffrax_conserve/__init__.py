@@ -25,8 +25,6 @@ accurate: measure its error too.
 
 from . import learned as learned
 from . import systems as systems
-from ._diagnostics.check_invariance import InvarianceEntry as InvarianceEntry
-from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
 from ._diagnostics.drift import off_manifold as off_manifold
@@ -37,7 +35,6 @@ from ._projection import closed_forms as closed_forms
 from ._projection.along_line import AlongLine as AlongLine
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
-from ._projection.base import ProjectionInfo as ProjectionInfo
 from ._projection.base import Step as Step
 from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
@@ -45,11 +42,9 @@ from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
-from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
 from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
-from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled

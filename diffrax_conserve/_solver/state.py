@@ -75,8 +75,8 @@ class ProjectionStatistics(eqx.Module):
 
     - `num_projections`: the number of projected steps.
     - `num_iterations`, `max_iterations`: the number of iterations of all, and the largest of one.
-    - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in
-        [`diffrax_conserve.ProjectionInfo`][].
+    - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in a
+        `ProjectionInfo`.
     - `error`: the largest error estimate of the wrapped solver, in the metric of `correction`; NaN
         if it has none. Corrections that are much longer tell that a quantity is not conserved.
     - `worst`: the position in `names` of the entry of the manifold that failed last; -1 if none
@@ -149,7 +149,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Returns:**
 
-    A [`diffrax_conserve.ProjectionStatistics`][].
+    A `ProjectionStatistics`.
 
     **Raises:**
 
