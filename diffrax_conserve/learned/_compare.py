@@ -28,7 +28,7 @@ from ._networks.flat import (
 )
 from ._networks.flow_map import args_domain_of, as_flow_map, known_args
 from ._solvers.checks import check_output
-from ._solvers.flow_map_solver import FlowMapSolver
+from ._solvers.flow_map_solver import DeepONetSolver
 
 # Substeps that are tried for an equal error.
 _SUBSTEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
@@ -180,7 +180,7 @@ def compare(
         return np.asarray(jnp.max(jnp.abs(found) / unit, axis=1))
 
     methods: dict[str, dfx.AbstractSolver] = {
-        "network": FlowMapSolver(flow_map, check_field=False),
+        "network": DeepONetSolver(flow_map, check_field=False),
         "RK4": RK4(),
         "Tsit5": dfx.Tsit5(),
         "Dopri8": dfx.Dopri8(),
