@@ -13,7 +13,7 @@ What is conserved    FirstIntegral, Constraint, find_invariants
 Diagnostics          check_invariance, drift, off_manifold, statistics
 Solvers              ManifoldProjection, RK4, Unrolled
 Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
-Projections          SimplifiedNewton, Newton, Directional, Relaxation, Staged, project
+Projections          SimplifiedNewton, Newton, AlongLine, Staged, project
 Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
 Systems              systems.get("kepler"), systems.names()
@@ -25,38 +25,31 @@ accurate: measure its error too.
 
 from . import learned as learned
 from . import systems as systems
-from ._diagnostics.check_invariance import InvarianceEntry as InvarianceEntry
-from ._diagnostics.check_invariance import InvarianceReport as InvarianceReport
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.drift import drift as drift
 from ._diagnostics.drift import off_manifold as off_manifold
 from ._diagnostics.find_invariants import find_invariants as find_invariants
 from ._manifold import Constraint as Constraint
 from ._manifold import FirstIntegral as FirstIntegral
-from ._manifold import entry_name as entry_name
 from ._mechanics.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
 from ._mechanics.rattle import RATTLE as RATTLE
 from ._mechanics.symmetric_projection import SymmetricProjection as SymmetricProjection
 from ._projection import closed_forms as closed_forms
+from ._projection.along_line import AlongLine as AlongLine
 from ._projection.base import AbstractProjection as AbstractProjection
 from ._projection.base import Problem as Problem
-from ._projection.base import ProjectionInfo as ProjectionInfo
 from ._projection.base import Step as Step
 from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
-from ._projection.directional import Directional as Directional
 from ._projection.newton import Newton as Newton
 from ._projection.project import project as project
-from ._projection.relaxation import Relaxation as Relaxation
 from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
-from ._projection.tangent import TangentField as TangentField
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
-from ._solver.rk4 import RK4 as RK4
 from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
-from ._solver.state import ProjectionStatistics as ProjectionStatistics
 from ._solver.state import statistics as statistics
+from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled
 from .learned._files import load as load
 from .learned._files import save as save

@@ -195,39 +195,6 @@ def named_entries(manifold: Manifold, root: str = "manifold") -> list[tuple[str,
     return [(f"{root}{jtu.keystr(path)}", entry) for path, entry in flat]
 
 
-def entry_name(manifold: Manifold, position: int) -> str:
-    """The name of an entry of a manifold, its path; a failed projection reports its number.
-
-    **Arguments:**
-
-    - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
-    - `position`: the number of the entry, in the order in which JAX flattens the PyTree.
-
-    **Raises:**
-
-    `ValueError` if the manifold has no entry of that number.
-
-    !!! example
-
-        ```python
-        import diffrax_conserve as dfc
-
-        print(dfc.entry_name(dfc.systems.RigidBody().manifold, 0))
-        ```
-
-        ```text
-        manifold['energy']
-        ```
-    """
-    names = [name for name, _ in named_entries(manifold)]
-    if not 0 <= position < len(names):
-        raise ValueError(
-            f"`position` is {position}, but the manifold has the entries 0 to {len(names) - 1}: "
-            f"{', '.join(names)}."
-        )
-    return names[position]
-
-
 def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by `fn(t, y, args)`."""
     value = lambda entry: jtu.tree_map(jnp.asarray, exactly(entry.fn, t, y, args))  # noqa: E731

@@ -1,6 +1,6 @@
 """Printing of records of numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.core
@@ -12,6 +12,11 @@ def printed(title: str, rows: Mapping[str, Any]) -> str:
     """`title`, and a line for each row with its name and its number, or the range over a batch."""
     width = max(map(len, rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {_text(x)}" for name, x in rows.items())])
+
+
+def names_at(positions: Any, names: Sequence[str]) -> str:
+    """The names at one position, or at those of a batch, each once; a negative one has none."""
+    return ", ".join(names[int(i)] for i in np.unique(positions) if i >= 0)
 
 
 def is_traced(tree: Any) -> bool:

@@ -12,11 +12,7 @@ import diffrax_conserve as dfc
 
 LORENZ = dfc.systems.ConservativeLorenz()
 SMALL = dict(width=8, depth=2)
-CORES = {
-    "product": dfc.learned.Product,
-    "concatenated": dfc.learned.Concatenated,
-    "gated": dfc.learned.Gated,
-}
+CORES = "product", "concatenated", "gated"
 
 
 @eqx.filter_jit

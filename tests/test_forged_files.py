@@ -10,6 +10,7 @@ import jax.random as jr
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._files import read_info
 
 from .learned import LORENZ, SMALL, flow_map, solution, states
 
@@ -20,7 +21,7 @@ NETWORKS = {
     "framed": dfc.learned.Repeated(
         dfc.DeepONet(
             states(9, VORTICES), 0.5, frame=VORTICES.frame, key=jr.key(0),
-            core=dfc.learned.Gated, **SMALL,
+            core="gated", **SMALL,
         ),
         2,
     ),
@@ -92,7 +93,7 @@ def test_mutated_headers(network, count, tmp_path):
     header, body = parts(path, network)
     for _ in range(count):
         path.write_bytes(forged(mutated(header, rng), body))
-        for function in (dfc.learned.read_info, dfc.load):
+        for function in (read_info, dfc.load):
             try:
                 function(path)
             except ValueError as error:
@@ -120,6 +121,6 @@ def test_headers_that_are_none(tmp_path):
     path = tmp_path / "a.network"
     for raw in HEADERS:
         path.write_bytes(forged(None, b"", raw))
-        for function in (dfc.learned.read_info, dfc.load):
+        for function in (read_info, dfc.load):
             with pytest.raises(ValueError, match=r"malformed, though its checksum is right"):
                 function(path)

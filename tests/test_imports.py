@@ -50,10 +50,11 @@ MAY_IMPORT = {
 # Packages that only one part may import, because they are optional.
 CONFINED = {"asdex": "_projection", "hypothesis": "testing", "matplotlib": "reproduce"}
 
-# Private names of other packages that have no public equivalent: `(file, name)`, and why.
+# Private names of other packages that have no public equivalent: `(file, name)`. The file says why.
 PRIVATE_ALLOWED = {
     ("_solver/diffrax_private.py", "diffrax._term.WrapTerm"),
     ("_solver/diffrax_private.py", "diffrax._term.AdjointTerm"),
+    ("_solver/diffrax_private.py", "diffrax.RESULTS._index_to_message"),
 }
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._files import read_info
 from diffrax_conserve.reproduce import _command, _job, main
 
 from .problems import KEPLER0, kepler, solve
@@ -210,7 +211,7 @@ def test_training_anew(tmp_path):
     assert {"loss.png", "schedule.png"} <= {file.name for file in (tmp_path / "out").iterdir()}
     for kind in ("standard", "conservative"):
         file = tmp_path / "out" / f"{kind}.network"
-        assert dfc.learned.read_info(file)["info"]["seed"] == 1
+        assert read_info(file)["info"]["seed"] == 1
         assert (dfc.load(file).layer is None) == (kind == "standard")
     # Three epochs teach nothing, and the manifold holds all the same.
     assert metrics["solvers"]["conservative"]["state_error"] > 1e-3

@@ -279,14 +279,16 @@ SPHERE = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
 
 def test_the_report_is_printed_as_success_or_failure_or_by_its_ranges():
     on_two = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 2)
-    _, info = dfc.project((SPHERE, on_two), jnp.array([1.0, 2.0, 2.0]))
+    _, info = dfc.project({"one": (SPHERE,), "two": on_two}, jnp.array([1.0, 2.0, 2.0]))
     assert str(info).startswith("NOT PROJECTED: ")
-    assert f"worst            {int(info.worst)}" in str(info)
+    name = ("manifold['one'][0]", "manifold['two']")[info.worst]
+    assert str(info).endswith(f"worst            {name}")
     lines = str(dfc.project(SPHERE, jnp.array([1.0, 2.0, 2.0]))[1]).splitlines()
     assert lines[0] == "projected"
     assert "  correction       2.0e+00" in lines
     project = jax.jit(jax.vmap(lambda y: dfc.project(SPHERE, y)))
     ys = jnp.array([[2.0, 0.0], [5.0, 0.0], [jnp.nan, 0.0]])
     assert str(project(ys)[1]).startswith("2 of 3 projections succeeded")
+    assert str(project(ys)[1]).endswith("worst            manifold")
     _, info = project(ys.at[2, 0].set(3.0))
     assert "correction       1.0e+00 to 4.0e+00" in str(info)

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._files import read_info
+from diffrax_conserve.learned._pretrained import pretrained_path
 
 from .learned import (
     EAST,
@@ -46,14 +48,14 @@ NETWORKS = {
     "deeponet": flow_map(depth=3),
     "conservative pinn": solution(layer=CONSERVING),
     "windows": solution(windows=3, slope=2.0),
-    "gated": flow_map(core=dfc.learned.Gated, taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)),
+    "gated": flow_map(core="gated", taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)),
     "concatenated": flow_map(
-        core=dfc.learned.Concatenated,
+        core="concatenated",
         taylor=dfc.learned.Taylor(LORENZ.vector_field),
         layer=CONSERVING,
     ),
     "framed": vortices(taylor=dfc.learned.Taylor(VORTICES.vector_field)),
-    "repeated": dfc.learned.Repeated(vortices(core=dfc.learned.Concatenated), 3),
+    "repeated": dfc.learned.Repeated(vortices(core="concatenated"), 3),
     "transformed": dfc.learned.Transformed(flow_map(), dfc.learned.BoxCox(0.125)),
     "family": flow_map(args_domain=dfc.learned.Box({"a": 0.5}, {"a": jnp.array(1.5)})),
     "single": in_single(flow_map()),
@@ -118,7 +120,7 @@ def test_another_vector_field_is_told(path):
 
 def test_the_info(path):
     dfc.save(path, NETWORKS["deeponet"], info={"system": "lorenz", "errors": [1.0, 2.0]})
-    found = dfc.learned.read_info(path)
+    found = read_info(path)
     assert found["info"] == {"system": "lorenz", "errors": [1.0, 2.0]}
     assert found["network"]["DeepONet"]["max_step"] == 0.25
     assert set(found) == {"info", "network"}
@@ -209,7 +211,7 @@ def test_bad_files(path, change, match):
 # 3 could be an open file.
 @pytest.mark.parametrize("path", [3, None, b"a.network", "/dev/zero", "/"])
 def test_what_is_no_file(path):
-    for function in (dfc.load, dfc.learned.read_info, lambda p: dfc.save(p, NETWORKS["pinn"])):
+    for function in (dfc.load, read_info, lambda p: dfc.save(p, NETWORKS["pinn"])):
         with pytest.raises(ValueError, match=r"`path` is .*must be the path of a file"):
             function(path)
 
@@ -221,8 +223,8 @@ NAMES = [
 
 @some_of("name", NAMES, ids=NAMES, period=5)
 def test_every_pretrained_network_errs_as_noted(name):
-    network, file = dfc.load_pretrained(name), dfc.learned.pretrained_path(name)
-    info = dfc.learned.read_info(file)["info"]
+    network, file = dfc.load_pretrained(name), pretrained_path(name)
+    info = read_info(file)["info"]
     system = dfc.systems.get(info["system"])
     assert file.stat().st_size < 200_000
     assert (network.layer is not None) == name.endswith("-conservative")

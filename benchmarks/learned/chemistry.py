@@ -110,7 +110,7 @@ def train(data, spec):
         spec.step,
         width=spec.width,
         depth=3,
-        core=dfc.learned.Concatenated,
+        core="concatenated",
         key=jr.key(1),
     )
     epochs = spec.epochs

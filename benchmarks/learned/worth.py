@@ -97,9 +97,7 @@ def sample(key):
 
 def train(field, epochs):
     states = jax.vmap(sample)(jr.split(jr.key(0), 500))
-    network = dfc.DeepONet(
-        states, STEP, width=32, depth=2, core=dfc.learned.Concatenated, key=jr.key(1)
-    )
+    network = dfc.DeepONet(states, STEP, width=32, depth=2, core="concatenated", key=jr.key(1))
     recipe = dfc.learned.second_order(network, epochs=epochs)
     recipe = dataclasses.replace(recipe, points=min(150, 10 * epochs))
     return dfc.fit(network, field, sample=sample, recipe=recipe, key=jr.key(2))

@@ -24,6 +24,7 @@ import jax.random as jr
 import numpy as np
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._pretrained import pretrained_path
 
 jax.config.update("jax_enable_x64", True)
 RESULTS = Path(__file__).parents[1] / "results" / "worth_stiff.json"
@@ -120,15 +121,13 @@ def contestants(network, smoke):
 
 def untrained(states):
     boxcox = dfc.learned.BoxCox(0.125)
-    inner = dfc.DeepONet(
-        boxcox(states), STEP, width=8, depth=1, core=dfc.learned.Concatenated, key=jr.key(0)
-    )
+    inner = dfc.DeepONet(boxcox(states), STEP, width=8, depth=1, core="concatenated", key=jr.key(0))
     return dfc.learned.Transformed(inner, boxcox)
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    shipped = dfc.learned.pretrained_path("pollu")
+    shipped = pretrained_path("pollu")
     parser.add_argument("network", type=Path, nargs="?", default=shipped)
     parser.add_argument("--smoke", action="store_true", help="toy sizes, nothing is written")
     options = parser.parse_args(argv)

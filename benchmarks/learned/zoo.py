@@ -111,7 +111,7 @@ class Spec:
     depth: int
     epochs: int
     windows: int = 0  # of a PINN; none for a flow map
-    core: type = dfc.learned.Concatenated
+    core: str = "concatenated"
     order: int = 1
     points: int = 250
     duration: float = 20.0  # of the solutions along which its states are drawn
@@ -137,7 +137,7 @@ SPECS = {
         width=40,
         depth=3,
         epochs=1200,
-        core=dfc.learned.Gated,
+        core="gated",
         points=200,
         duration=10.0,
         repeats=4,
@@ -242,13 +242,11 @@ def train_flow_map(system, spec, seed, key):
             key=key, sample=pool, recipe=recipe, progress=True,
         )  # fmt: skip
 
-    network, log = fit(
-        network, points=spec.points, optimiser=dfc.learned.SPRING(damping=spec.damping)
-    )
+    network, log = fit(network, points=spec.points, optimiser="spring", damping=spec.damping)
     if spec.polish:
         network, log = fit(
             network, epochs=spec.polish, points=spec.pool // 8, refresh=None, check_every=1,
-            optimiser=dfc.learned.LevenbergMarquardt(damping=5e-5),
+            optimiser="levenberg-marquardt", damping=5e-5,
         )  # fmt: skip
     network = scaled(network, own) if spec.natural else network
     if spec.extremes is not None:
@@ -280,7 +278,7 @@ def scaled(network, system):
     layers = network.core.hidden
     found = dfc.DeepONet(
         corners, network.max_step / root,
-        width=layers[0].weights[0].shape[1], depth=len(layers), core=dfc.learned.Gated,
+        width=layers[0].weights[0].shape[1], depth=len(layers), core="gated",
         taylor=dfc.learned.Taylor(system.vector_field, network.order), key=jr.key(0),
     )  # fmt: skip
     parts = network.core, network.shift * units, network.scale * units

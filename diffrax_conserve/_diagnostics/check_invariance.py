@@ -136,7 +136,7 @@ def check_invariance(
 
     **Returns:**
 
-    An [`diffrax_conserve.InvarianceReport`][].
+    An `InvarianceReport`.
 
     **Raises:**
 

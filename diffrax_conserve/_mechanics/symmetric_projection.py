@@ -17,10 +17,8 @@ from .._projection.base import Target
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
-from .._solver.rk4 import RK4
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
-from .._solver.unrolled import Unrolled
 from .._solver.wrapper import ForwardingSolver
 from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
@@ -142,7 +140,7 @@ class SymmetricProjection(ForwardingSolver):
         t = t0 * time_direction(terms, t0)
         values = conserved_values(self.manifold, t, y0, args)
         values, hidden = started(values, self.manifold, t, y0, args)
-        statistics = ProjectionStatistics.zero(values.dtype)
+        statistics = ProjectionStatistics.zero(self.manifold, values.dtype)
         inner = self.solver.init(terms, t0, t1, y0, args)
         return _State(inner, values, hidden, jnp.zeros_like(values), statistics)
 
@@ -299,9 +297,9 @@ def _check_symmetric(solver: Any) -> None:
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"`solver` is `{name}`, which is not a diffrax solver. {remedy}.")
     inner = innermost(solver)
-    ours = isinstance(inner, RK4 | Unrolled)
     projects = issubclass(type(solver), ForwardingSolver)  # which `isinstance` would not tell
-    if projects or ours or type(inner).__module__.startswith("diffrax."):
+    explicit = type(inner).__module__.startswith(("diffrax.", "diffrax_conserve._solver."))
+    if projects or explicit:
         raise ValueError(
             f"`solver` is {name}, which is not symmetric: a step backwards does not undo a step, "
             f"and no projection changes that. {remedy}, or use `ManifoldProjection`."

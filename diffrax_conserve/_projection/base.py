@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
 from .._balance import integrated_rates
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
-from .._manifold import evaluate, is_entry
-from .._printing import is_traced, printed
+from .._manifold import evaluate, is_entry, named_entries
+from .._printing import is_traced, names_at, printed
 from .._step.equations import ON, Equations, equations_of, length, relative
 from .._step.metric import MatrixUnits, Units, units_of
 from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
@@ -59,8 +59,9 @@ class ProjectionInfo(eqx.Module):
         projection. In the metric of motion it is a share of the longest step so far.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
-    - `worst`: the position of the entry with the largest relative residual (before or after, the
-        smaller), as [`diffrax_conserve.entry_name`][] takes it; it tells the cause of a failure.
+    - `worst`: the position in `names` of the entry with the largest relative residual (before or
+        after, the smaller), which tells the cause of a failure. `print` shows the name.
+    - `names`: the names of the entries of the manifold, such as `manifold['energy']`.
     """
 
     ok: Bool[Array, ""]
@@ -71,6 +72,7 @@ class ProjectionInfo(eqx.Module):
     correction: Float[Array, ""]
     roundoff: Float[Array, ""]
     worst: Int[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
 
     def __str__(self) -> str:
         if is_traced(self):
@@ -80,9 +82,10 @@ class ProjectionInfo(eqx.Module):
             title = f"{ok.sum()} of {ok.size} projections succeeded"
         else:
             title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
-        names = ("num_steps", "residual_before", "residual_after", "correction", "roundoff")
-        rows = {name: getattr(self, name) for name in names}
-        return printed(title, rows if ok.all() else rows | {"worst": self.worst})
+        numbers = ("num_steps", "residual_before", "residual_after", "correction", "roundoff")
+        rows = {name: getattr(self, name) for name in numbers}
+        worst = {} if ok.all() else {"worst": names_at(self.worst, self.names)}
+        return printed(title, rows | worst)
 
 
 class Problem(eqx.Module):
@@ -94,7 +97,8 @@ class Problem(eqx.Module):
     - `t`, `args`: the time and the parameters.
     - `values`: the conserved values, shaped like the manifold.
     - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s.
-    - `keys`: for each entry of the manifold its first key, such as a key of a dictionary.
+    - `names`, `keys`: for each entry of the manifold its name, `manifold['energy']`, and its first
+        key, such as a key of a dictionary.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
         [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
     """
@@ -104,6 +108,7 @@ class Problem(eqx.Module):
     args: Args
     values: Values
     like: Any
+    names: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[Any, ...] = eqx.field(static=True)
     step: Step | None = None
 
@@ -157,6 +162,7 @@ class Problem(eqx.Module):
             # An iteration that diverged makes every residual large. So we look for the entry whose
             # residual is large both before and after: of both the smaller one counts.
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
+            names=self.names,
         )
 
 
@@ -313,8 +319,9 @@ class Target(eqx.Module):
         manifold, t, args = self.manifold, t * self.direction, self.args
         flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
         keys = tuple(key_of(path[0]) if path else None for path, _ in flat)
+        names = tuple(name for name, _ in named_entries(manifold))
         values = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
-        return Problem(equations, t, args, unflatten(self.value, values), like, keys, step)
+        return Problem(equations, t, args, unflatten(self.value, values), like, names, keys, step)
 
     @eqx.filter_jit  # traced once, though `project_if` asks for its shapes too
     def project(

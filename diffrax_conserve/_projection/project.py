@@ -45,8 +45,8 @@ def project(
 
     **Returns:**
 
-    The state on the manifold, shaped like `y`, and a [`diffrax_conserve.ProjectionInfo`][], whose
-    `ok` tells whether each residual is within its tolerance: nothing is raised at run time.
+    The state on the manifold, shaped like `y`, and a `ProjectionInfo`, whose `ok` tells whether
+    each residual is within its tolerance: nothing is raised at run time.
 
     **Raises:**
 

@@ -66,7 +66,7 @@ def tangent(
 
     **Returns:**
 
-    A [`diffrax_conserve.TangentField`][].
+    A `TangentField`.
 
     **Raises:**
 

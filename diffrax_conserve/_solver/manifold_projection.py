@@ -157,7 +157,7 @@ class ManifoldProjection(ForwardingSolver):
             motion=moved(y0, y0),
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
-            statistics=ProjectionStatistics.zero(values.dtype),
+            statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -275,8 +275,7 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
 - `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
-- `projection`: a `SimplifiedNewton`, `Newton`, `ClosedForm`, `Directional`, `Relaxation`, `Staged`,
-    or your own.
+- `projection`: a `SimplifiedNewton`, `Newton`, `AlongLine`, `ClosedForm`, `Staged`, or your own.
 - `max_correction`: a projection fails if its correction is longer than this share of its step, both
     in the metric of the projection. A component that hardly moves counts as moving by
     $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._manifold import Constraint, is_entry
+from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
-from .._printing import is_traced, printed
+from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
 from .._step.constants import ROUNDOFF
 from .._step.equations import Equations, length, reach, shown_terms
@@ -33,7 +33,7 @@ _SMALLER = (
     "at all. "
 )
 _ENTRY = (
-    "`diffrax_conserve.statistics(sol).worst`, with `SaveAt(solver_state=True)`, tells the entry."
+    "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
 )
 FIRST = register(
     "a step cannot start: its state violates a `Constraint`, or a function of the "
@@ -70,12 +70,13 @@ class ProjectionStatistics(eqx.Module):
 
     - `num_projections`: the number of projected steps.
     - `num_iterations`, `max_iterations`: the number of iterations of all, and the largest of one.
-    - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in
-        [`diffrax_conserve.ProjectionInfo`][].
+    - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in a
+        `ProjectionInfo`.
     - `error`: the largest error estimate of the wrapped solver, in the metric of `correction`; NaN
         if it has none. Corrections that are much longer tell that a quantity is not conserved.
-    - `worst`: the position of the entry of the manifold that failed last, as
-        [`diffrax_conserve.entry_name`][] takes it; -1 if none failed.
+    - `worst`: the position in `names` of the entry of the manifold that failed last; -1 if none
+        failed. `print` shows the name.
+    - `names`: the names of the entries of the manifold, such as `manifold['energy']`.
     """
 
     num_projections: Int[Array, "..."]
@@ -87,17 +88,20 @@ class ProjectionStatistics(eqx.Module):
     roundoff: Float[Array, "..."]
     error: Float[Array, "..."]
     worst: Int[Array, "..."]
+    names: tuple[str, ...] = eqx.field(static=True)
 
     @classmethod
-    def zero(cls, dtype: jnp.dtype) -> "ProjectionStatistics":
-        count, size = jnp.asarray(0), jnp.zeros((), dtype)
-        return cls(count, count, count, size, size, size, size, size * jnp.nan, jnp.asarray(-1))
+    def zero(cls, manifold: Manifold, dtype: jnp.dtype) -> "ProjectionStatistics":
+        count, size, worst = jnp.asarray(0), jnp.zeros((), dtype), jnp.asarray(-1)
+        names = tuple(name for name, _ in named_entries(manifold))
+        return cls(count, count, count, size, size, size, size, size * jnp.nan, worst, names)
 
     def __str__(self) -> str:
         if is_traced(self):
             return repr(self)
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        if np.all(np.asarray(self.worst) < 0):
+        rows["worst"] = names_at(self.worst, rows.pop("names"))
+        if not rows["worst"]:
             del rows["worst"]
         text = printed("projections of the accepted steps", rows)
         if np.any(np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)):
@@ -122,6 +126,7 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.roundoff, info.roundoff),
             self.error if error is None else jnp.fmax(self.error, error),
             jnp.where(info.ok, self.worst, info.worst),
+            self.names,
         )
 
 
@@ -130,8 +135,8 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     They are part of the state of a `ManifoldProjection`, which `diffeqsolve` returns by
     `SaveAt(solver_state=True)`; otherwise they are not computed. Rejected steps appear only in
-    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept:
-    `entry_name(manifold, int(statistics(sol).worst))` is the name of the entry that failed.
+    `sol.stats["num_rejected_steps"]`. A failed step that ends a solve is kept: `print` then names
+    the entry of the manifold that failed.
 
     **Arguments:**
 
@@ -139,7 +144,7 @@ def statistics(sol: dfx.Solution) -> ProjectionStatistics:
 
     **Returns:**
 
-    A [`diffrax_conserve.ProjectionStatistics`][].
+    A `ProjectionStatistics`.
 
     **Raises:**
 

@@ -9,8 +9,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import RealScalarLike
+from .._projection.along_line import AlongLine
 from .._projection.base import AbstractProjection
-from .._projection.directional import Directional
 from .diffrax_private import AdjointTerm, WrapTerm
 
 
@@ -58,11 +58,12 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
 
 
 def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
-    if isinstance(projection, Directional) and dfx.HalfSolver in map(type, _layers(solver)):
+    along_error = isinstance(projection, AlongLine) and projection.direction == "error"
+    if along_error and dfx.HalfSolver in map(type, _layers(solver)):
         raise ValueError(
-            "`Directional` moves along the error estimate, which `diffrax.HalfSolver` gives "
-            "without its sign. Wrap a solver with an embedded method, such as `diffrax.Tsit5()`, "
-            "or pass `projection=SimplifiedNewton()`."
+            '`AlongLine(direction="error")` moves along the error estimate, which '
+            "`diffrax.HalfSolver` gives without its sign. Wrap a solver with an embedded method, "
+            'such as `diffrax.Tsit5()`, or pass `projection=AlongLine(direction="step")`.'
         )
 
 

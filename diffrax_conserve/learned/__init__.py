@@ -3,10 +3,6 @@
 from . import paper as paper
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
-from ._files import read_info as read_info
-from ._networks.cores import Concatenated as Concatenated
-from ._networks.cores import Gated as Gated
-from ._networks.cores import Product as Product
 from ._networks.domain import Box as Box
 from ._networks.domain import Frame as Frame
 from ._networks.flow_map import AbstractFlowMap as AbstractFlowMap
@@ -15,13 +11,9 @@ from ._networks.taylor import Taylor as Taylor
 from ._networks.wrappers import BoxCox as BoxCox
 from ._networks.wrappers import Repeated as Repeated
 from ._networks.wrappers import Transformed as Transformed
-from ._pretrained import pretrained_path as pretrained_path
-from ._solvers.flow_map_solver import FlowMapSolver as FlowMapSolver
 from ._solvers.policies import steps_outside as steps_outside
 from ._training.data import reachable_states as reachable_states
 from ._training.data import trajectories as trajectories
 from ._training.loop import FitLog as FitLog
 from ._training.recipe import Recipe as Recipe
 from ._training.recipe import second_order as second_order
-from ._training.second_order import SPRING as SPRING
-from ._training.second_order import LevenbergMarquardt as LevenbergMarquardt

@@ -17,7 +17,7 @@ from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
-from .._solver.rk4 import RK4
+from .._solver.unrolled import RK4
 from ._networks.flat import (
     as_states,
     check_scalars,
@@ -28,7 +28,7 @@ from ._networks.flat import (
 )
 from ._networks.flow_map import args_domain_of, as_flow_map, known_args
 from ._solvers.checks import check_output
-from ._solvers.flow_map_solver import FlowMapSolver
+from ._solvers.flow_map_solver import DeepONetSolver
 
 # Substeps that are tried for an equal error.
 _SUBSTEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
@@ -180,7 +180,7 @@ def compare(
         return np.asarray(jnp.max(jnp.abs(found) / unit, axis=1))
 
     methods: dict[str, dfx.AbstractSolver] = {
-        "network": FlowMapSolver(flow_map, check_field=False),
+        "network": DeepONetSolver(flow_map, check_field=False),
         "RK4": RK4(),
         "Tsit5": dfx.Tsit5(),
         "Dopri8": dfx.Dopri8(),

@@ -1,7 +1,7 @@
-"""Files of networks: `save`, `load` and `read_info`. No pickle.
+"""Files of networks: `save` and `load`. No pickle.
 
 A file is a line `diffrax-conserve network <version> <SHA-256 of all that follows>`, a line of JSON
-with the description of the network, and the bytes of its arrays.
+with the description of the network and the `info` of whoever saved it, and the bytes of its arrays.
 
 There numbers, strings and `None` are themselves. All else is an object with one entry: a container
 (`tuple`, `list`, `dict`), an `array` with its dtype and shape, an `activation` by name, a `method`
@@ -67,7 +67,8 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
         in [`diffrax_conserve.learned.Transformed`][] (with a `BoxCox`) or `Repeated`. Methods of a
         system of the catalogue are stored by name; a layer, polynomial or frame with other
         functions must be passed to [`diffrax_conserve.load`][] again.
-    - `info`: what JSON can express, for [`diffrax_conserve.learned.read_info`][].
+    - `info`: notes for whoever reads the file, which JSON can express. They are in its second line,
+        which is JSON.
 
     **Raises:**
 
@@ -138,18 +139,7 @@ def load(
 
 def read_info(path: PathLike) -> dict[str, Any]:
     """What the file `path` says about its network, without building it: a dictionary of the `info`
-    that was given to [`diffrax_conserve.save`][], and the `network`. Raises as
-    [`diffrax_conserve.load`][].
-
-    !!! example
-
-        ```python
-        import diffrax_conserve as dfc
-
-        path = dfc.learned.pretrained_path("rigid-body-conservative")
-        command = dfc.learned.read_info(path)["info"]["command"]  # that trained it
-        ```
-    """
+    that was given to `save`, and the `network`. Raises as `load`."""
     return _read(path, lambda header, body: header)
 
 

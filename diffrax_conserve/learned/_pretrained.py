@@ -6,8 +6,7 @@ from ._files import Network, load
 
 
 def pretrained_path(name: str) -> Path:
-    """The file of a network that comes with the package, of a `name` as for
-    [`diffrax_conserve.load_pretrained`][]. Raises a `ValueError` for another name."""
+    """The file of a network that comes with the package. Raises a `ValueError` for another name."""
     folder = Path(__file__).parents[1] / "pretrained"
     known = {file.stem: file for file in sorted(folder.glob("*.network"))}
     if str(name) not in known:
@@ -22,7 +21,7 @@ def load_pretrained(name: str) -> Network:
     `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
     [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
     up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
-    chemistry. [`diffrax_conserve.learned.read_info`][] tells how each was made.
+    chemistry. The second line of each file, JSON, tells how it was made.
 
     !!! example
 

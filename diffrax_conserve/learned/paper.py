@@ -11,7 +11,6 @@ import optax
 from jaxtyping import Array, Float
 
 from .._custom_types import RealScalarLike, Y
-from ._networks.cores import Product
 from ._networks.deeponet import DeepONet
 from ._networks.pinn import PINN
 from ._networks.trainable import LayerSchedule
@@ -28,7 +27,7 @@ def pinn(y0: Y, t0: RealScalarLike, t1: RealScalarLike, **options: Any) -> PINN:
 def deeponet(states: Y, max_step: RealScalarLike, **options: Any) -> DeepONet:
     """A [`diffrax_conserve.DeepONet`][] of the paper's kind and size, 20 products of a branch and a
     trunk for each component, both of four layers of 40 units, with its other arguments."""
-    sizes: dict[str, Any] = dict(core=Product, width=40, depth=4, latent=20)
+    sizes: dict[str, Any] = dict(core="product", width=40, depth=4, latent=20)
     return DeepONet(states, max_step, **(sizes | options))
 
 

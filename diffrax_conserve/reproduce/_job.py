@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
-from .._solver.rk4 import RK4
+from .._solver.unrolled import RK4
 from .._tree import tree_size
 from ..learned._files import save
 from ..learned._replace_file import replace_file

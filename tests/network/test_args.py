@@ -10,7 +10,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..learned import Still
+from ..learned import CORES, Still
 
 BOX = dfc.learned.Box(
     {"w": 0.5, "b": jnp.array([0.0, 0.1])}, {"w": 1.5, "b": jnp.array([0.2, 0.3])}
@@ -31,7 +31,7 @@ TERM = dfx.ODETerm(spring)
 
 def family(order=0, args_domain=BOX, **options):
     taylor = dfc.learned.Taylor(spring, order) if order else None
-    options = dict(width=16, depth=2, core=dfc.learned.Concatenated, taylor=taylor) | options
+    options = dict(width=16, depth=2, core="concatenated", taylor=taylor) | options
     return dfc.DeepONet(STATES, 0.5, args_domain=args_domain, key=jr.key(1), **options)
 
 
@@ -49,7 +49,7 @@ def solve(flow_map, args, check_field=False, **options):
 
 
 @pytest.mark.parametrize("order", [0, 1])
-@pytest.mark.parametrize("core", [dfc.learned.Product, dfc.learned.Concatenated, dfc.learned.Gated])
+@pytest.mark.parametrize("core", CORES)
 def test_it_starts_at_its_state_and_sees_all_args(core, order):
     flow_map = family(order, core=core)
     np.testing.assert_array_equal(flow_map(Y0, ARGS, 0.0), Y0)

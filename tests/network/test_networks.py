@@ -58,7 +58,7 @@ def test_the_ansatz_of_the_pinn():
 
 
 def test_the_ansatz_of_the_deeponet():
-    net, y0, h = flow_map(core=dfc.learned.Product), LORENZ.y0, 0.2
+    net, y0, h = flow_map(core="product"), LORENZ.y0, 0.2
     mean, deviation = jnp.mean(states(), axis=0), jnp.std(states(), axis=0)
     b = net.core.branch((y0 - mean) / deviation).reshape(3, 4)
     tau = net.core.trunk(jnp.array([2 * h / 0.25 - 1])).reshape(3, 4)
@@ -87,7 +87,7 @@ def test_the_ansatz_of_the_deeponet():
         (lambda: solution(layer=2), TypeError, "must be a `ConservativeLayer`"),
         (lambda: dfc.learned.Box(2.0, 1.0), ValueError, "must be at most `upper`"),
         (lambda: dfc.DeepONet(jnp.array([[jnp.nan]]), 1.0, key=KEY), ValueError, "not finite"),
-        (lambda: flow_map(core="gated"), TypeError, "`core` is 'gated', but it must be"),
+        (lambda: flow_map(core="mlp"), ValueError, "`core` is 'mlp', but it must be one of 'gated"),
         (lambda: flow_map()(jnp.ones(4), 0.1), ValueError, "of 3 numbers, not 4"),
         (lambda: dfc.DeepONet((EAST, LORENZ.y0), 1.0, key=KEY), ValueError, "leading axis"),
         (lambda: dfc.DeepONet(LORENZ.sample, 1.0, key=KEY), TypeError, "Draw states from it"),
@@ -103,7 +103,7 @@ def test_mistakes_are_named(make, error, match):
 # ---- The parts of a flow map beyond branch times trunk, and the windows of a PINN ----
 
 
-KINDS = pytest.mark.parametrize("core", CORES.values(), ids=CORES)
+KINDS = pytest.mark.parametrize("core", CORES)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
@@ -174,7 +174,7 @@ def products(jaxpr):
     return found
 
 
-@pytest.mark.parametrize("core", CORES.values(), ids=CORES)
+@pytest.mark.parametrize("core", CORES)
 def test_only_the_network_is_rounded(core):
     network, single = both(core)
     y0s, h = states(20), 0.2

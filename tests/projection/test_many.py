@@ -93,7 +93,7 @@ WORK = {
     "simplified": dfc.SimplifiedNewton(),
     "bounded": dfc.SimplifiedNewton(lower=-2.0),
     "formula": dfc.ClosedForm(lambda t, y, args, v: y * jnp.sqrt(v["square"] / jnp.sum(y**2))),
-    "directional": dfc.Directional(),
+    "along a line": dfc.AlongLine(direction="error"),
     "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
 }
 

@@ -33,6 +33,7 @@ FIRST, SECOND = (
     dfc.SimplifiedNewton(metric=(1.0, INF), atol=1e-15),
     dfc.SimplifiedNewton(metric=(INF, 1.0), atol=1e-15),
 )
+ALONG_ERROR = dfc.AlongLine(direction="error")
 STAGED = dfc.Staged(("circle", FIRST), ("tangent", SECOND))
 Y0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
 
@@ -99,7 +100,7 @@ def test_mistakes_are_named():
     with pytest.raises(TypeError, match="must be a pair"):
         dfc.Staged(FIRST)
     with pytest.raises(TypeError, match="a projection with `sees_step = False`"):
-        dfc.Staged(("circle", dfc.Directional()))
+        dfc.Staged(("circle", ALONG_ERROR))
 
 
 TODA = dfc.systems.get("toda-lattice")
@@ -118,7 +119,7 @@ ONE = jnp.array(1.0)
 
 
 def along(inner, y0=TODA0, args=ONE, t1=3.0, dt0=0.05, **options):
-    solver = dfc.ManifoldProjection(inner, TODA_ENERGY, projection=dfc.Directional())
+    solver = dfc.ManifoldProjection(inner, TODA_ENERGY, projection=ALONG_ERROR)
     options = dict(t1=t1, dt0=dt0, args=args) | options
     return problems.solve(TODA.vector_field, solver, y0, **options)
 
@@ -170,7 +171,7 @@ def test_a_tangent_direction_is_a_failure():
             return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
 
     circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    solver = dfc.ManifoldProjection(Tangent(), circle, projection=dfc.Directional())
+    solver = dfc.ManifoldProjection(Tangent(), circle, projection=ALONG_ERROR)
     field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
     sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
     assert sol.result != dfx.RESULTS.successful
@@ -180,7 +181,7 @@ def test_what_cannot_be_is_refused_before_compilation():
     two = (TODA_ENERGY, dfc.FirstIntegral(lambda t, y, args: momentum(y)))
 
     def step(inner, manifold):
-        solver = dfc.ManifoldProjection(inner, manifold, projection=dfc.Directional())
+        solver = dfc.ManifoldProjection(inner, manifold, projection=ALONG_ERROR)
         dfx.diffeqsolve(TODA_TERM, solver, 0, 1, 0.1, TODA0, ONE)
 
     for inner, manifold, match in [
@@ -190,5 +191,5 @@ def test_what_cannot_be_is_refused_before_compilation():
     ]:
         with pytest.raises(ValueError, match=match):
             step(inner, manifold)
-    with pytest.raises(ValueError, match=r"Elsewhere pass `projection=Newton\(\)`"):
-        dfc.project(TODA_ENERGY, TODA0, args=ONE, value=0.0, projection=dfc.Directional())
+    with pytest.raises(ValueError, match=r"outside a solve. Pass `projection=Newton\(\)`"):
+        dfc.project(TODA_ENERGY, TODA0, args=ONE, value=0.0, projection=ALONG_ERROR)

@@ -21,9 +21,8 @@ from ..problems import (
 )
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)
-
-
-RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=dfc.Relaxation())
+STEP = dfc.AlongLine(direction="step")
+RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=STEP)
 
 
 @eqx.filter_jit
@@ -47,7 +46,7 @@ def carrying(t, y, args):
 @pytest.mark.parametrize(("inner", "order"), [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"])
 def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(inner, order):
     kept = dfc.FirstIntegral(lambda t, y, args: ENERGY.fn(t, y["y"], args))
-    solver = dfc.ManifoldProjection(inner, kept, projection=dfc.Relaxation())
+    solver = dfc.ManifoldProjection(inner, kept, projection=STEP)
     y0 = {"y": EXPONENTIAL0, "time": jnp.zeros(())}
 
     @jax.jit
@@ -78,7 +77,7 @@ def test_derivatives_of_relaxation_agree_with_differences():
 def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
     """There all is conserved, but time stands still."""
     square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    solver = dfc.ManifoldProjection(inner, square, projection=dfc.Relaxation())
+    solver = dfc.ManifoldProjection(inner, square, projection=STEP)
     term = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -y[0] - friction * y[1]]))
     y0 = jnp.array([0.3, 0.7])
     sol = dfx.diffeqsolve(term, solver, 0.0, 2.0, 0.1, y0, throw=False)
@@ -86,9 +85,9 @@ def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
 
 
 def test_relaxation_is_refused_without_a_step_and_with_two_integrals():
-    with pytest.raises(ValueError, match="there is none outside a solve"):
-        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=dfc.Relaxation())
-    twice = dfc.ManifoldProjection(dfx.Heun(), (ENERGY, ENERGY), projection=dfc.Relaxation())
+    with pytest.raises(ValueError, match="no step outside a solve"):
+        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=STEP)
+    twice = dfc.ManifoldProjection(dfx.Heun(), (ENERGY, ENERGY), projection=STEP)
     with pytest.raises(ValueError, match="has one unknown, but `manifold` has 2"):
         solve(twice)
 

@@ -151,15 +151,37 @@ def test_dense_output_of_rk4_is_of_fourth_order():
 SOLVERS = [dfx.Tsit5(), dfx.Dopri5(), dfx.Dopri8(), dfx.Bosh3(), dfx.Heun(), dfx.Ralston()]
 
 
-def adaptive(solver):
-    controller = dfx.PIDController(rtol=1e-6, atol=1e-6)
-    options = dict(stepsize_controller=controller, saveat=dfx.SaveAt(ts=jnp.linspace(0, 1.5, 7)))
+def adaptive(solver, ts=tuple(np.linspace(0, 1.5, 7)), **options):
+    controller = dfx.PIDController(rtol=1e-6, atol=1e-6, **options)
+    options = dict(stepsize_controller=controller, saveat=dfx.SaveAt(ts=ts))
     return solve(kepler, solver, KEPLER0, t1=1.5, dt0=None, **options)
+
+
+def assert_same_steps(ours, theirs):
+    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
+    for x, y in zip(jtu.tree_leaves(ours.ys), jtu.tree_leaves(theirs.ys), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
 
 
 @some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=6)
 def test_same_steps_and_dense_output(solver):
-    ours, theirs = adaptive(dfc.Unrolled(solver)), adaptive(solver)
-    assert ours.stats["num_steps"] == theirs.stats["num_steps"]
-    for x, y in zip(jtu.tree_leaves(ours.ys), jtu.tree_leaves(theirs.ys), strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
+    assert_same_steps(adaptive(dfc.Unrolled(solver)), adaptive(solver))
+
+
+def test_same_steps_by_a_tableau_alone():
+    unrolled, again = (dfc.Unrolled(dfx.Tsit5().tableau) for _ in range(2))
+    assert unrolled == again
+    assert hash(unrolled) == hash(again)
+    assert_same_steps(adaptive(unrolled, (1.5,), error_order=5), adaptive(dfx.Tsit5(), (1.5,)))
+
+
+def test_rk4_is_its_tableau_and_has_no_error_estimate():
+    rk4 = dfc.RK4()
+    assert not isinstance(rk4, dfx.AbstractAdaptiveSolver)
+    ours, theirs = (
+        solve(kepler, solver, KEPLER0, t1=1.5, dt0=0.1, saveat=dfx.SaveAt(ts=jnp.linspace(0, 1, 9)))
+        for solver in (dfc.Unrolled(rk4.tableau), rk4)
+    )
+    assert_same_steps(ours, theirs)
+    with pytest.raises(RuntimeError, match="error estimates"):
+        adaptive(rk4)

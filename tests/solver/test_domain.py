@@ -179,7 +179,7 @@ def test_mistakes_are_named(make, error, text):
 
 TAYLOR = dfc.DeepONet(
     states(), 0.25, width=6, depth=1, key=jr.key(0),
-    core=dfc.learned.Concatenated, taylor=dfc.learned.Taylor(LORENZ.vector_field),
+    core="concatenated", taylor=dfc.learned.Taylor(LORENZ.vector_field),
 )  # fmt: skip
 MESSAGE = "not trained for this vector field"
 

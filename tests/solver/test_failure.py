@@ -43,7 +43,7 @@ def test_the_error_of_fixed_steps_leads_to_the_entry_and_a_remedy(errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match=NOT_REACHED) as e:
         run(OUT_OF_REACH)
     assert "smaller steps" in str(e.value)
-    assert "statistics(sol).worst" in str(e.value)
+    assert "print(diffrax_conserve.statistics(sol))" in str(e.value)
 
 
 def test_statistics_name_the_entry_that_failed():
@@ -54,8 +54,7 @@ def test_statistics_name_the_entry_that_failed():
     y0, saveat = jnp.array([0.5, 0.25, 1.0, 0.0]), dfx.SaveAt(t1=True, solver_state=True)
     sol = run({"first": jump, "kept": kept}, None, y0, field, throw=False, saveat=saveat)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
-    worst = int(dfc.statistics(sol).worst)
-    assert dfc.entry_name({"first": jump, "kept": kept}, worst) == "manifold['first']"
+    assert "worst            manifold['first']" in str(dfc.statistics(sol))
 
 
 def test_the_list_of_messages_is_the_same_whatever_was_solved():

@@ -15,7 +15,7 @@ from .. import problems
 from ..learned import LORENZ, flow_map, solution, unchecked
 
 # Random weights; the path of the other core changes too fast for the dense output.
-DEEPONET, PINN = flow_map(core=dfc.learned.Concatenated), solution()
+DEEPONET, PINN = flow_map(core="concatenated"), solution()
 FLOW, FOLLOW = unchecked(DEEPONET), dfc.PINNSolver(PINN)
 SOLVERS = pytest.mark.parametrize("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"])
 

@@ -32,7 +32,7 @@ EXACT = jax.jit(jax.vmap(lambda y0, ts: jax.vmap(lambda t: rotated(y0, t))(ts)))
 
 @eqx.filter_jit
 def network():
-    options = dict(width=16, depth=1, core=dfc.learned.Concatenated)
+    options = dict(width=16, depth=1, core="concatenated")
     return dfc.DeepONet(Y0S, 0.5, key=jr.key(0), **options)
 
 

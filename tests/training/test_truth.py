@@ -181,7 +181,7 @@ class Interrupt:
 
 
 def small_flow_map():
-    network = flow_map(core=dfc.learned.Concatenated)
+    network = flow_map(core="concatenated")
     chosen = dataclasses.replace(
         dfc.learned.second_order(network, epochs=24), points=20, check_every=4
     )

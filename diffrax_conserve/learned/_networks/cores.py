@@ -204,3 +204,11 @@ class Gated(AbstractCore):
 
     def output_layer(self) -> MLP:
         return self.last
+
+
+# The words by which a flow map chooses its network.
+CORES: dict[str, type[AbstractCore]] = {
+    "gated": Gated,
+    "concatenated": Concatenated,
+    "product": Product,
+}

@@ -1,7 +1,7 @@
 """A deep operator network: the flow map of an autonomous system, for steps up to a given length."""
 
 import dataclasses
-from typing import Any, final
+from typing import Any, Literal, final
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._options import check_counts
 from ..._tree import unflatten
-from .cores import AbstractCore, Activation, Gated, Sizes, find_activation
+from .cores import CORES, AbstractCore, Activation, Sizes, find_activation
 from .domain import Box, FramedBox, MakeFrame, check_frame, frame_at
 from .flat import (
     as_states,
@@ -58,7 +58,8 @@ class DeepONet(AbstractFlowMap):
     ??? cite "Reference"
 
         L. Lu, P. Jin, G. Pang, Z. Zhang and G. E. Karniadakis, Nature Machine Intelligence 3
-        (2021); S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023) for the flow map.
+        (2021); S. Wang and P. Perdikaris, J. Comput. Phys. 475 (2023) for the flow map; S. Wang, Y.
+        Teng and P. Perdikaris, SIAM J. Sci. Comput. 43 (2021) for the gates.
     """
 
     core: AbstractCore
@@ -79,7 +80,7 @@ class DeepONet(AbstractFlowMap):
         width: int = 20,
         depth: int = 3,
         latent: int = 20,
-        core: type[AbstractCore] = Gated,
+        core: Literal["gated", "concatenated", "product"] = "gated",
         activation: str | Activation = "tanh",
         taylor: Taylor | None = None,
         frame: MakeFrame | None = None,
@@ -101,9 +102,9 @@ class DeepONet(AbstractFlowMap):
                 "`taylor` has `args` of its own, but this flow map takes them as inputs: write "
                 "`Taylor(vector_field, order)`."
             )
-        if not (isinstance(core, type) and issubclass(core, AbstractCore)):
-            raise TypeError(
-                f"`core` is {core!r}, but it must be `learned.Gated`, `Concatenated` or `Product`."
+        if core not in CORES:
+            raise ValueError(
+                f"`core` is {core!r}, but it must be one of {', '.join(map(repr, CORES))}."
             )
         check_scalars(max_step=max_step, above=0.0, optional=False)
         if max_step == jnp.inf:
@@ -120,7 +121,7 @@ class DeepONet(AbstractFlowMap):
             seen, m = frames.inputs, frames.basis.shape[-1]
         sizes = Sizes(width, depth, latent, find_activation(activation))
         known = 0 if args_domain is None else flatten(args_domain.lower).size
-        self.core = core(seen.shape[1] + known, m, sizes, dtype, key)
+        self.core = CORES[core](seen.shape[1] + known, m, sizes, dtype, key)
         self.args_domain, self.layer, self.taylor = args_domain, layer, taylor
         self.max_step, deviation = float(max_step), jnp.std(seen, axis=0)
         self.shift, self.scale = jnp.mean(seen, axis=0), jnp.where(deviation > 0, deviation, 1)
@@ -215,11 +216,13 @@ DeepONet.__init__.__doc__ = r"""**Arguments:**
 - `max_step`: the longest step $\Delta$.
 - `key`: a random key, for the initial weights.
 - `width`, `depth`: the number of units in each hidden layer, and of hidden layers.
-- `core`: one network of the state and the step that feeds both into each layer,
-    [`diffrax_conserve.learned.Gated`][]; or only into the first, less accurate and faster,
-    [`diffrax_conserve.learned.Concatenated`][]; or as in the literature, and least accurate at the
-    same size, [`diffrax_conserve.learned.Product`][].
-- `latent`: only of a `Product`, the number $L$ of products in each component.
+- `core`: the kind of network. `"gated"`: the state and the step go into every hidden layer, which
+    interpolates between two encodings of them, $z \leftarrow a \tilde z + b (1 - \tilde z)$ with
+    the output $\tilde z$ of the layer for $z$. `"concatenated"`: both go only into the first
+    layer, which is less accurate and faster. `"product"`: $\sum_l b_{jl}(u_0) \tau_{jl}(h) /
+    \sqrt L$, a branch network times a trunk network, as in the literature, and least accurate at
+    the same size.
+- `latent`: only of a `"product"`, the number $L$ of products in each component.
 - `activation`: `"tanh"`, `"sin"`, `"gelu"`, `"silu"`, `"softplus"`, `"sigmoid"`, or a function
     (which [`diffrax_conserve.save`][] cannot write).
 - `taylor`: a [`diffrax_conserve.learned.Taylor`][].

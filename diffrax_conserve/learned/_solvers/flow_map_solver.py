@@ -27,7 +27,7 @@ class _State(NamedTuple):
 
 
 @final
-class FlowMapSolver(dfx.AbstractSolver[_State]):
+class DeepONetSolver(dfx.AbstractSolver[_State]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive
@@ -110,7 +110,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> _State:
-        check_learned_terms(terms, "FlowMapSolver")
+        check_learned_terms(terms, "DeepONetSolver")
         known = known_args(self.flow_map, args)
         check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
         refused = refused_from_start(
@@ -167,7 +167,7 @@ class FlowMapSolver(dfx.AbstractSolver[_State]):
         return StepResult(y1, unravel(error), coefficients(states), dfx.RESULTS.successful)
 
 
-FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
+DeepONetSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.learned.AbstractFlowMap`][] such as
     [`diffrax_conserve.DeepONet`][], or a Module `(y0, h) -> y` with an attribute `max_step`.
@@ -190,5 +190,5 @@ FlowMapSolver.__init__.__doc__ = r"""**Arguments:**
 and a state that is not finite end with a failed [`result`][diffrax.RESULTS].
 """
 
-# An alias, named after the usual flow map.
-DeepONetSolver = FlowMapSolver
+# Pickles of earlier versions know it by this name.
+FlowMapSolver = DeepONetSolver

@@ -134,7 +134,7 @@ class Loop:
             parts.append("the vector field may not be finite where the network leads")
         if problem.data is not None:
             parts.append("`data` may hold a state at which the loss has no derivative")
-        if not isinstance(problem.recipe.optimiser, SecondOrder):
+        if not isinstance(problem.recipe.method, SecondOrder):
             parts.append("the updates may be too long: lower the learning rate")
         reasons = "; ".join(parts)
         return f"None of the {count} updates was finite: {reasons}."

@@ -166,7 +166,7 @@ def start(problem: Problem, model: AbstractTrainable, key: PRNGKeyArray) -> tupl
     dtype = jnp.result_type(*jtu.tree_leaves(weights))
     carry = Carry(
         weights=weights,
-        optimiser_state=problem.recipe.optimiser.init(weights),
+        optimiser_state=problem.recipe.method.init(weights),
         best_weights=weights,
         best=jnp.asarray(jnp.inf, dtype),
         skipped=jnp.asarray(0),
@@ -213,7 +213,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
     weights, optimiser_state, loss = _updated(objective, carry, epoch)
     finite = jnp.isfinite(loss) & tree_all_finite(weights)
     # If not, continue from the best model: the same weights and points would give the same result.
-    fresh = objective.problem.recipe.optimiser.init(carry.best_weights)
+    fresh = objective.problem.recipe.method.init(carry.best_weights)
     return carry._replace(
         weights=_where(finite, weights, carry.best_weights),
         optimiser_state=_where(finite, optimiser_state, fresh),
@@ -223,7 +223,7 @@ def _epoch(objective: Objective, carry: Carry, epoch: Int[Array, ""]) -> Carry:
 
 
 def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any, Float[Array, ""]]:
-    optimiser, schedule = objective.problem.recipe.optimiser, objective.schedule(epoch)
+    optimiser, schedule = objective.problem.recipe.method, objective.schedule(epoch)
     weights, points, state = carry.weights, objective.points(epoch), carry.optimiser_state
     if not isinstance(optimiser, SecondOrder):
         loss, gradient = eqx.filter_value_and_grad(objective.loss)(weights, points, schedule)

@@ -21,7 +21,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike
-from ..._options import check_number
 
 # A function from the squared norm of the defect at each point, and a typical squared norm of `f`,
 # to a loss.
@@ -74,13 +73,7 @@ class SPRING(eqx.Module):
         G. Goldshlager, N. Abrahamsen and L. Lin, J. Comput. Phys. 516 (2024), for wave functions.
     """
 
-    momentum: float = 0.9
-    damping: float = 1e-2
-
-    def __check_init__(self):
-        if not 0 <= self.momentum < 1:
-            raise ValueError(f"`momentum` must be from 0 to below 1, but is {self.momentum}.")
-        check_number("damping", self.damping, above=0.0, optional=False)
+    damping: float  # in units of the loss
 
     def init(self, weights: Any) -> SpringState:
         vector, _ = ravel_pytree(weights)
@@ -97,7 +90,7 @@ class SPRING(eqx.Module):
         del linear
         r, jacobian, loss = problem.rows(weights)
         running = jnp.where(jnp.isfinite(state.loss), 0.95 * state.loss + 0.05 * loss, loss)
-        zeta = self.momentum * state.update
+        zeta = _MOMENTUM * state.update
         damping, target = self.damping * running, r + jacobian @ zeta
         if r.dtype == jnp.float64:
             update = zeta - _by_gram_matrix(jacobian, target, damping)
@@ -107,6 +100,8 @@ class SPRING(eqx.Module):
         return weights + length * update, SpringState(update, running), loss
 
 
+# The factor `μ` of the last update.
+_MOMENTUM = 0.9
 _LENGTH = optax.linear_schedule(1.0, 0.0, 0.6, transition_begin=0.4)  # pyright: ignore
 
 
@@ -139,13 +134,6 @@ def _by_triangular_factor(matrix: Array, rhs: Array, damping: Array) -> Array:
     return matrix.T @ jsl.solve_triangular(r, half)
 
 
-SPRING.__init__.__doc__ = r"""**Arguments:**
-
-- `momentum`: the factor $\mu$ of the last update.
-- `damping`: $\lambda$ in units of the loss.
-"""
-
-
 @final
 class LevenbergMarquardt(eqx.Module):
     r"""Gauss-Newton steps with an adaptive damping, for small networks and fixed points.
@@ -163,10 +151,7 @@ class LevenbergMarquardt(eqx.Module):
         and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), for variable projection.
     """
 
-    damping: float = 1e-2
-
-    def __check_init__(self):
-        check_number("damping", self.damping, above=0.0, optional=False)
+    damping: float  # that of the first update
 
     def init(self, weights: Any) -> Float[Array, ""]:
         return jnp.asarray(self.damping, ravel_pytree(weights)[0].dtype)
@@ -194,12 +179,12 @@ class LevenbergMarquardt(eqx.Module):
         return jnp.where(better, weights + update, weights), state, loss
 
 
-LevenbergMarquardt.__init__.__doc__ = "**Arguments:**\n\n- `damping`: that of the first update."
-
 # The unit of the weights of the last layer. In these units they are damped like all others.
 _FREEDOM = 1e6
 
 SecondOrder = SPRING | LevenbergMarquardt
+# The words by which a recipe chooses one.
+METHODS = {"spring": SPRING, "levenberg-marquardt": LevenbergMarquardt}
 
 
 def _damped_least_squares(
