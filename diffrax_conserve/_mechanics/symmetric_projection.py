@@ -20,11 +20,11 @@ from .._solver.diffrax_private import member
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
-from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF
+from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF, WRITTEN_OUT
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
 from .._step.implicit import known_if, root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._step.linear import combined, gram_matrix, is_determined, scaled_rows, solve, times
+from .._step.linear import combined, gram_matrix, pivots, scaled_rows, solve, times
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -163,7 +163,7 @@ class SymmetricProjection(ForwardingSolver):
             self.manifold,
             state.values,
             state.hidden,
-            jnp.zeros_like(vector),
+            None,
             None,
             args,
             direction,
@@ -287,7 +287,12 @@ def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) 
     along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
     gram = d - c @ along
     multiplier = solve(gram, below - c @ at)
-    return known_if(is_determined(gram), jnp.concatenate([at - along @ multiplier, multiplier]))
+    tangent = jnp.concatenate([at - along @ multiplier, multiplier])
+    if len(gram) > WRITTEN_OUT:
+        return tangent
+    # Half of the digits are right, or the constraint depends on others; see `well_conditioned`.
+    eps, found = float(jnp.finfo(gram.dtype).eps), pivots(gram, jnp.abs(jnp.diagonal(gram)))
+    return known_if(jnp.all((found >= eps**0.5) | (found <= ROUNDOFF * eps)), tangent)
 
 
 def _check_symmetric(solver: Any) -> None:

@@ -241,7 +241,7 @@ class Target(eqx.Module):
     manifold: Manifold
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    motion: Float[Array, " n"]
+    motion: Float[Array, " n"] | None
     units: Float[Array, " n"] | None
     args: Args
     direction: Real[Array, ""]

@@ -18,12 +18,11 @@ from jaxtyping import Array, Float
 
 from .._step.constants import MAX_STEPS, NEAREST
 from .._step.equations import Equations, measured
-from .._step.implicit import AbstractSystem, known_if, solution
+from .._step.implicit import AbstractSystem, known_if, solution, well_conditioned
 from .._step.iterate import Solved, damped
 from .._step.linear import (
     combined,
     gram_matrix,
-    is_determined,
     scaled_rows,
     solve,
     solve_large,
@@ -201,7 +200,7 @@ class _Nearest(AbstractSystem):
         tangent = fixed + units * solve_large(matrix / rows[:, None] * units, right / rows)
         gradients = self.equations.dense()
         gradients = scaled_rows(gradients.in_units(gradients.linearise(y)[1]))[1]
-        is_known = is_determined(gram_matrix(gradients, gradients))
+        is_known = well_conditioned(self.equations, y, gradients, gradients)
         is_known = is_known & jnp.all(jnp.isfinite(multiplier)) | ~self.equations.holds(y)
         tangent = known_if(is_known, tangent)
         return tangent[: y.size], tangent[y.size :]

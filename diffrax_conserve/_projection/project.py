@@ -68,8 +68,8 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    hidden, size, direction = jnp.zeros_like(values), jnp.abs(ravel(y)), jnp.asarray(1)
-    target = Target(projection, manifold, values, hidden, size, None, args, direction)
+    hidden, direction = jnp.zeros_like(values), jnp.asarray(1)
+    target = Target(projection, manifold, values, hidden, None, None, args, direction)
     return _projected(target, t, y)
 
 

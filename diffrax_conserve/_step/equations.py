@@ -9,7 +9,8 @@ in each component of the state change, divided by `ε`. Terms that cancel inside
 no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
 measures them, and they are added as the *hidden* part of the scale. And a component that a
 correction has moved by `s_k` is known to roundoff of `s_k` only, which matters where the component
-itself vanishes, as on `q[0] = 0`. So its size counts as `|y_k| + s_k`.
+itself vanishes, as on `q[0] = 0`. So in a solve, where we know how far it moves in a step, its size
+counts as `|y_k| + s_k`.
 """
 
 import dataclasses
@@ -53,8 +54,7 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `motion`: how far each component may be moved: in a solve, how far it moves in a step;
-      elsewhere, how large it is at first.
+    - `motion`: how far each component moves in a step of a solve; `None` outside a solve.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.

@@ -17,13 +17,14 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._large.sparse import SparseRows
-from .._tree import tree_stop_gradient, tree_tangents, unflatten
+from .._tree import tree_stop_gradient, tree_tangents, unflatten, without_pattern
+from .constants import ROUNDOFF, WRITTEN_OUT
 from .equations import Equations, Jacobian, measured
 from .iterate import Solved, nearby
-from .linear import combined, corrected, gram_matrix, is_determined, scaled_rows, solve, times
+from .linear import combined, corrected, gram_matrix, pivots, scaled_rows, solve, times
 
 
 class AbstractSystem(eqx.Module):
@@ -114,10 +115,36 @@ class Along(AbstractSystem):
         along = scaled_rows(self._along())[1]
         t_y = t_y - equations.change(corrected(rows, along, t_g / heights))
         # `more` tells whether the state is of the form above.
-        sizes = [jnp.linalg.norm(x, axis=1) for x in (rows, along) if not isinstance(x, SparseRows)]
-        sizes = sizes[0] * sizes[1] if sizes else None
-        is_known = solved.more & is_determined(gram_matrix(rows, along), sizes) | ~solved.ok
-        return known_if(is_known, t_y)
+        # `more` tells whether the state is of the form above.
+        is_known = solved.more & well_conditioned(equations, y, rows, along)
+        return known_if(is_known | ~solved.ok, t_y)
+
+
+def well_conditioned(
+    equations: Equations, y: Float[Array, " n"], rows: Jacobian, along: Jacobian
+) -> Bool[Array, ""]:
+    """Whether a derivative at the state `y` that is solved for with `rows alongᵀ` has digits.
+
+    Its error is one unit of roundoff over the pivot of a constraint. So half of the digits are
+    right if no pivot is below the root of roundoff. A constraint that depends on others everywhere does
+    no harm. To tell it from one whose gradient is nearly parallel only here, we look at another
+    state, each component of which has the same sign and another size. More than four constraints
+    are not tested.
+    """
+    if len(rows) > WRITTEN_OUT or isinstance(rows, SparseRows) or isinstance(along, SparseRows):
+        return jnp.asarray(True)
+    eps = float(jnp.finfo(y.dtype).eps)
+    determined = _pivots(rows, along) >= eps**0.5
+    if len(rows) == 1:
+        return jnp.all(determined)
+    elsewhere = y * (1 + without_pattern(y.size, y.dtype) / 2)
+    beside = scaled_rows(equations.in_units(equations.linearise(elsewhere)[1]))[1]
+    return jnp.all(determined | (_pivots(beside, beside) <= ROUNDOFF * eps))
+
+
+def _pivots(rows: Array, along: Array) -> Float[Array, " m"]:
+    lengths = jnp.linalg.norm(rows, axis=1) * jnp.linalg.norm(along, axis=1)
+    return jnp.where(lengths > 0, pivots(gram_matrix(rows, along), lengths), 1)
 
 
 def known_if(is_known: Any, tangent: Array) -> Array:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._large.sparse import BlockGram, SparseRows
 from .constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
@@ -160,31 +160,16 @@ def eliminated(
     return jnp.stack(b), jnp.stack(rows)
 
 
-def is_determined(gram: Any, sizes: Float[Array, " m"] | None = None) -> Bool[Array, ""]:
-    """Whether a derivative that is solved for with this matrix `U Vᵀ` has digits.
-
-    Its error is one unit of roundoff over the pivot of a constraint, relative to the `sizes`, the
-    lengths of the rows of `U` times those of `V`, by default the diagonal. That is the square of
-    the sine of the angle between its gradient and those before it. So half of the digits are right
-    if no pivot is below the root of roundoff. A pivot that is itself roundoff belongs to a
-    constraint that depends on others, which does no harm. More than four constraints are not
-    tested.
-    """
-    if _is_large(gram):
-        return jnp.asarray(True)
-    eps = float(jnp.finfo(gram.dtype).eps)
-    sizes = jnp.abs(jnp.diagonal(gram)) if sizes is None else sizes
-    pivots = jnp.abs(_pivots(gram)) / jnp.where(sizes > 0, sizes, 1)
-    return jnp.all((pivots >= eps**0.5) | (pivots <= ROUNDOFF * eps))
-
-
-def _pivots(gram: Float[Array, "m m"]) -> Float[Array, " m"]:
+def pivots(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, " m"]:
+    """The pivots of a small matrix `U Vᵀ` relative to `sizes`, the lengths of the rows of `U` times
+    those of `V`. They are the squares of the sines of the angles between the gradient of each
+    constraint and those before it, so that they are roundoff where it depends on these."""
+    sizes = jnp.where(sizes > 0, sizes, 1)
     for k in range(len(gram)):
-        pivot = jnp.where(gram[k, k] == 0, jnp.inf, gram[k, k])
-        change = gram[:, k, None] * gram[k] / pivot
-        below = np.arange(len(gram))[:, None] > k
-        gram = jnp.where(below, gram - change, gram)
-    return jnp.diagonal(gram)
+        regular = jnp.abs(gram[k, k]) > ROUNDOFF * float(jnp.finfo(gram.dtype).eps) * sizes[k]
+        share = gram[:, k] / jnp.where(regular, gram[k, k], jnp.inf)
+        gram = gram - jnp.where(np.arange(len(gram)) > k, share, 0)[:, None] * gram[None, k]
+    return jnp.abs(jnp.diagonal(gram)) / sizes
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:

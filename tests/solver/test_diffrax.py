@@ -67,15 +67,6 @@ def test_gradient_with_respect_to_conserved_value_end_time_and_what_is_closed_ov
     np.testing.assert_allclose(dk, -2 * np.sin(2.0), atol=1e-4)
 
 
-def test_the_first_projection_to_a_given_value_scales_the_state():
-    """Not along the motion of the first step, in which a state at a turning point hardly moves."""
-    larger = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2), value=4.0)
-    sol = solve(
-        rotation, dfc.ManifoldProjection(dfc.RK4(), larger), jnp.array([1.0, 0.0]), dt0=1e-3
-    )
-    np.testing.assert_allclose(sol.ys[-1], 2 * np.array([np.cos(1), -np.sin(1)]), atol=5e-3)
-
-
 def test_event_lands_on_the_manifold_at_the_right_time_with_a_right_gradient():
     event = dfx.Event(lambda t, y, args, **kwargs: y[0], optx.Newton(1e-12, 1e-12))
 
