@@ -56,7 +56,7 @@ class ProjectionInfo(eqx.Module):
         projected state, relative to the scale of its constraint at the latter,
         $|I_0| + \\sum_k |y_k \\partial g/\\partial y_k|$ plus the terms that cancel inside `fn`.
     - `correction`: the length of the projected state minus the candidate in the metric of the
-        projection. In the metric of motion it is a share of the longest step so far.
+        projection.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
     - `worst`: the position in `names` of the entry with the largest relative residual (before or

@@ -172,8 +172,11 @@ class _Nearest(AbstractSystem):
         equations = self.equations.dense()
         return _Optimality(equations, self.candidate, self.bounds, sizes), sizes, units
 
-    def defect(self, solved: Solved) -> Array:
-        y, multiplier = solved.y
+    def unknowns(self, solved: Solved) -> tuple[Array, Array]:
+        return solved.y
+
+    def defect(self, unknowns: tuple[Array, Array]) -> Array:
+        y, multiplier = unknowns
         if not self._is_sought():
             return jnp.concatenate([self.candidate, multiplier])
         conditions, _, _ = self._conditions(y)

@@ -27,8 +27,8 @@ from .state import (
     ProjectionStatistics,
     State,
     cause_of_failure,
+    distances,
     is_final,
-    moved,
     started,
     violated,
 )
@@ -50,14 +50,22 @@ class ManifoldProjection(ForwardingSolver):
     continues from a `solver_state` keeps the original values.
 
     **The metric of motion.** A candidate is moved to the manifold along the gradients of the
-    functions, and the metric shares out the correction among the components. By default the unit of
-    a component is its largest change in one step of this solve so far, $M = \mathrm{diag}(1/s^2)$,
-    $s_k = \max |\hat y_k - y_k|$: local errors are proportional to how fast a component moves, and
-    the correction is shared out as they are. So the result does not depend on the units of the
-    state. A component that never moves, such as a parameter, is never corrected. Stochastic
-    equations have the Euclidean metric in the numbers of the state, because there the metric
-    decides which equation is solved: for mixed units pass
-    `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`. `metric=1.0` is Euclidean.
+    functions, and the metric shares out the correction among the components. By default it is
+    $M = \mathrm{diag}(1/s^2)$ with a unit $s$ for each quantity of the state, the largest geometric
+    mean so far of its size and of its change in a step,
+
+    $$s = \max \sqrt{|\hat y|\, |\hat y - y_n|}.$$
+
+    If the state has several leaves, each vector along the last axis of a leaf is one quantity, such
+    as the place of a body, and $|\cdot|$ is its largest component: put quantities with unlike units
+    into leaves of their own. If the state is one array, each component is a quantity. So the result
+    does not depend on the units of the leaves, or of the components of a single array, and a
+    quantity that never moves, such as a parameter, is never corrected. For a field in a single
+    array, all of whose components have one unit, pass `projection=SimplifiedNewton(metric=1.0)`,
+    which is the Euclidean metric: a travelling wave with all of its integrals kept needs it.
+    Stochastic equations have the Euclidean metric in the numbers of the state, because there the
+    metric decides which equation is solved: for mixed units pass
+    `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`.
 
     Conserving one integral is not always better than none: see "Choosing a projection". The
     projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
@@ -154,7 +162,7 @@ class ManifoldProjection(ForwardingSolver):
             values=values,
             hidden=hidden,
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
-            motion=moved(y0, y0),
+            motion=distances(y0, y0),
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
             statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
@@ -185,8 +193,8 @@ class ManifoldProjection(ForwardingSolver):
         )
         # The projection. `start` is its target with the balances at the start of the step, from
         # which dense output integrates them to any time in the step; `target` is that at the end.
-        change = moved(y0, candidate)
-        motion = state.moved_by(change, candidate)
+        change = distances(y0, candidate)
+        motion = state.motion_after(change, candidate)
         start = self._target(terms, t1, state, motion, args).following(t0, y0)
         # The dense output of the step is needed only for balances, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)

@@ -10,6 +10,7 @@ from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -24,7 +25,7 @@ from .._step.constants import ROUNDOFF
 from .._step.equations import Equations, length, reach, shown_terms
 from .._step.metric import Units
 from .._step.roundoff import hidden_scale
-from .._tree import ravel
+from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
 
 _SMALLER = (
@@ -173,8 +174,8 @@ class State(eqx.Module):
 
     - `inner`: the state of the wrapped solver.
     - `values`, `hidden`, `gained`: as in a `Target`.
-    - `motion`: the largest change of each component in one step so far, at least the root of
-      roundoff of the component itself; zero before the first step.
+    - `motion`: the unit of each component, see `motion_after`, the largest of all steps so far;
+      zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
     """
@@ -188,15 +189,30 @@ class State(eqx.Module):
     num_steps: Int[Array, ""] | None
     statistics: ProjectionStatistics
 
-    def moved_by(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
-        """`motion` after a step that changed the components by `change`.
+    def motion_after(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
+        """`motion` after a step to `end` that changed the components by `change`.
 
-        A component that hardly moves counts as moving by `√ε` of itself, which is a floor. We carry
-        the maximum including this floor. If the floor were applied later, XLA could not compile the
-        loop of a small solve as one function, which would make it slower.
+        The unit of a quantity in a step is the geometric mean of its size and its change. Each
+        alone misleads: a quantity may be large only because its origin is far away, and it may
+        hardly change for a while, at a turning point, or along the axis of a rotation. Where
+        squares are exchanged, as by the components of a vector of constant length, or between a
+        place and a velocity by an energy, `|y Δy|` is the same on both sides.
+
+        In a state of several leaves each vector along the last axis of a leaf is a quantity, such
+        as the place of a body, because unlike units within a vector would turn the correction. It
+        is measured by its largest component. A single array may hold unlike quantities, so there
+        each component is one.
+
+        A quantity that hardly changes counts as changing by `ε` of itself. This floor is inside the
+        root, so that the derivative stays finite, and the root is that of a ratio, so that nothing
+        is squared and a power of two as a unit changes no bit.
         """
-        least = float(jnp.finfo(change.dtype).eps) ** 0.5 * jnp.abs(ravel(end))
-        return jnp.maximum(self.motion, jnp.maximum(change, least))
+        size = jnp.maximum(jnp.abs(ravel(end)), change)
+        if len(jtu.tree_leaves(end)) > 1:
+            size, change = largest_of_vector(size, end), largest_of_vector(change, end)
+        share = change / jnp.where(size > 0, size, 1)
+        share = jnp.maximum(share, float(jnp.finfo(change.dtype).eps))
+        return jnp.maximum(self.motion, size * jnp.sqrt(share))
 
     def next(self, **fields: Any) -> "State":
         """The state after a step, with these fields."""
@@ -204,7 +220,19 @@ class State(eqx.Module):
         return dataclasses.replace(self, num_steps=num_steps, **fields)
 
 
-def moved(start: Y, end: Y) -> Float[Array, " n"]:
+def largest_of_vector(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
+    """Each component of `x` replaced by the largest of its vector, along the last axis of its leaf,
+    where `x` is the `ravel` of a state like `like`."""
+
+    def largest(part: Array) -> Array:
+        axis = -1 if part.ndim else None
+        most = jnp.max(part, axis=axis, keepdims=True, initial=0)
+        return jnp.broadcast_to(most, part.shape)
+
+    return ravel(jtu.tree_map(largest, unflatten(x, jax.eval_shape(real_view, like))))
+
+
+def distances(start: Y, end: Y) -> Float[Array, " n"]:
     """How far each component moves from one state to another."""
     return jnp.abs(ravel(end) - ravel(start))
 

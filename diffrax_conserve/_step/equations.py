@@ -54,7 +54,8 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `motion`: how far each component moves in a step of a solve; `None` outside a solve.
+    - `motion`: the unit of each component in a solve, at least as large as its change in a step;
+      `None` outside a solve.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.

@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._large.sparse import SparseRows
-from .._tree import tree_stop_gradient, tree_tangents, unflatten, without_pattern
+from .._tree import tree_tangents, unflatten, without_pattern
 from .constants import ROUNDOFF, WRITTEN_OUT
 from .equations import Equations, Jacobian, measured
 from .iterate import Solved, nearby
@@ -35,12 +35,16 @@ class AbstractSystem(eqx.Module):
         """The unknowns that solve the equations, as far as the iteration gets."""
 
     @abc.abstractmethod
-    def defect(self, solved: Solved) -> Any:
-        """`F`, at the unknowns of `solved`, which are constant here. It is only differentiated."""
+    def unknowns(self, solved: Solved) -> Any:
+        """All unknowns `x`, of which an iteration may return only some."""
+
+    @abc.abstractmethod
+    def defect(self, unknowns: Any) -> Any:
+        """`F` at these unknowns. It is only differentiated, by the arrays of the system."""
 
     @abc.abstractmethod
     def linear_solution(self, solved: Solved, right: Any) -> Any:
-        """`(∂F/∂x)⁻¹ right`."""
+        """`(∂F/∂x)⁻¹ right`, for the unknowns that the iteration returns."""
 
 
 @eqx.filter_custom_jvp
@@ -53,11 +57,12 @@ def solution(system: AbstractSystem) -> Solved:
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     (system,), (t_system,) = primals, tangents
     solved = solution(system)
-    fixed = tree_stop_gradient(solved)
-    defect, t_defect = eqx.filter_jvp(lambda system: system.defect(fixed), (system,), (t_system,))
+    x = system.unknowns(solved)
+    defect, t_defect = eqx.filter_jvp(lambda system: system.defect(x), (system,), (t_system,))
     right = tree_tangents(defect, t_defect)
     tangent = system.linear_solution(solved, jtu.tree_map(jnp.negative, right))
-    return solved, Solved(tangent, None, None, None)  # pyright: ignore
+    none = jtu.tree_map(lambda _: None, solved)
+    return solved, none._replace(y=tangent)
 
 
 @final
@@ -65,8 +70,7 @@ class Along(AbstractSystem):
     """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
-    The unknowns are `y` and `λ`. The iteration returns only `y`, from which `λ` follows. The
-    equations are `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
+    The unknowns are `y` and `λ`, and the equations `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
     """
 
     equations: Equations
@@ -91,12 +95,14 @@ class Along(AbstractSystem):
         candidate there."""
         return jnp.where(solved.ok, solved.y, self.candidate)
 
-    def defect(self, solved: Solved) -> tuple[Array, Array]:
-        y = self._state(solved)
-        fixed = tree_stop_gradient(self)
-        sizes, rows = scaled_rows(fixed._along())
-        along = times(rows, measured(lax.stop_gradient(y) - fixed.candidate, fixed.equations.units))
-        multiplier = solve(gram_matrix(rows, rows), along) / sizes
+    def unknowns(self, solved: Solved) -> Array:
+        """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`; the state follows from them."""
+        sizes, rows = scaled_rows(self._along())
+        change = measured(self._state(solved) - self.candidate, self.equations.units)
+        return solve(gram_matrix(rows, rows), times(rows, change)) / sizes
+
+    def defect(self, unknowns: Array) -> tuple[Array, Array]:
+        multiplier = unknowns
         if self.directions is not None:
             change = combined(multiplier, self.directions)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
@@ -115,7 +121,6 @@ class Along(AbstractSystem):
         along = scaled_rows(self._along())[1]
         t_y = t_y - equations.change(corrected(rows, along, t_g / heights))
         # `more` tells whether the state is of the form above.
-        # `more` tells whether the state is of the form above.
         is_known = solved.more & well_conditioned(equations, y, rows, along)
         return known_if(is_known | ~solved.ok, t_y)
 
@@ -126,10 +131,10 @@ def well_conditioned(
     """Whether a derivative at the state `y` that is solved for with `rows alongᵀ` has digits.
 
     Its error is one unit of roundoff over the pivot of a constraint. So half of the digits are
-    right if no pivot is below the root of roundoff. A constraint that depends on others everywhere does
-    no harm. To tell it from one whose gradient is nearly parallel only here, we look at another
-    state, each component of which has the same sign and another size. More than four constraints
-    are not tested.
+    right if no pivot is below the root of roundoff. A constraint that depends on others everywhere
+    does no harm. To tell it from one whose gradient is nearly parallel only here, we look at
+    another state, each component of which has the same sign and another size. More than four
+    constraints are not tested.
     """
     if len(rows) > WRITTEN_OUT or isinstance(rows, SparseRows) or isinstance(along, SparseRows):
         return jnp.asarray(True)
@@ -167,8 +172,11 @@ class General(AbstractSystem):
     def found(self) -> Solved:
         return self.iterate(self.guess)
 
-    def defect(self, solved: Solved) -> Any:
-        return self.residual(solved.y)
+    def unknowns(self, solved: Solved) -> Any:
+        return solved.y
+
+    def defect(self, unknowns: Any) -> Any:
+        return self.residual(unknowns)
 
     def linear_solution(self, solved: Solved, right: Any) -> Any:
         flat = _flat(right)
