@@ -1,14 +1,14 @@
 """The verdict for a projection: solves without it and with it, judged by an accurate solve.
 
-This file makes the solves. What they are judged by, the table and the sentence are in
-`comparison.py`; linear invariants are found in `linear_invariants.py`.
+This file checks what it is given and says which solvers to compare. The solves themselves are in
+`compared_solves.py`; what is judged, the table and the sentence in `comparison.py`; linear
+invariants are found in `linear_invariants.py`.
 """
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -16,36 +16,25 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import check_manifold, check_vector_field, is_entry, named_entries, slope_of
+from .._manifold import check_manifold, check_vector_field, is_entry, slope_of
 from .._options import ONE_STATE, calling, check_counts, check_number, dtype_of
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
-from .._tree import key_of
+from .._tree import key_of, tree_size
+from .compared_solves import Task, drifts, references, sizes_of, switched, timed
 from .comparison import NOTHING, ComparisonReport, ComparisonRow, distance
-from .drift import drift
 from .linear_invariants import changes, linear_invariants
 
-# States are compared at so many times, evenly spread.
+# States are compared at about so many times, evenly spread.
 _TIMES = 100
-# With more entries than these, an entry is left out with the default metric only, or none is. Each
-# combination is a program, which takes some two seconds to compile.
-_WITH_METRICS, _LEFT_OUT = 3, 8
-# The tolerances of the two solves that are the reference, in units of the largest values of the
-# components. Implicit methods cannot solve their equations more accurately.
-_EXPLICIT, _IMPLICIT = (1e-11, 1e-13), (1e-8, 1e-10)
-# A component that stays much smaller than others of its leaf is as accurate as if it had this share
-# of their size: what is left of it may be the roundoff of theirs.
-_SMALL = 1e-3
-# The reference takes at most so many steps. An explicit method reaches them where the field is
-# stiff.
-_REFERENCE_STEPS = 1_000_000
-# An adaptive solve that must keep its dense output can take at most so many steps.
+# With more entries than these none is left out.
+_LEFT_OUT = 8
+# An adaptive solve that must keep its dense output, as balances need it, takes at most so many
+# steps.
 _DENSE_STEPS = 4096
-# A solve is timed at most so often, and not again after so many seconds.
-_RUNS, _SECONDS = 5, 0.3
 # Linear invariants are searched for in states of at most so many components.
 _COMPONENTS = 300
 
@@ -134,27 +123,27 @@ def compare(
         vector_field = vector_field.vector_field
     check_vector_field(vector_field)
     check_manifold(manifold)
-    _check_solver(solver)
+    _check_solvers(solver, reference)
     _check_float64()
     y0s = _stacked(y0, batch)
-    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0s))).dtype
     first = jtu.tree_map(lambda x: x[0], y0s)
+    dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0s))).dtype
+    start = jnp.asarray(t0, dtype)
     with calling("`vector_field`", "vector_field(t, y, args)", t0, first, args):
-        eqx.filter_eval_shape(
-            lambda y: slope_of(vector_field, jnp.asarray(t0, dtype), y, args), first
-        )
-    controller, ts, max_steps = _steps(t0, t1, dt0, rtol, atol, max_steps)
-    has_rates = any(
-        getattr(entry, "rate", None) is not None for _, entry in named_entries(manifold)
-    )
-    if has_rates:
-        max_steps = min(max_steps, _DENSE_STEPS)
-    task = _Task(
-        dfx.ODETerm(vector_field), args, y0s, jnp.asarray(ts, dtype),
-        None if dt0 is None else jnp.asarray(dt0, dtype), controller, batch, has_rates, max_steps,
+        eqx.filter_eval_shape(lambda y: slope_of(vector_field, start, y, args), first)
+    entries = entries_of(manifold)
+    dense = any(getattr(entry, "rate", None) is not None for entry in entries.values())
+    steps = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
+    task = Task(
+        dfx.ODETerm(vector_field), args, y0s, start, jnp.asarray(t1, dtype),
+        None if dt0 is None else jnp.asarray(dt0, dtype), steps.controller, steps.saveat,
+        batch, steps.most,
     )  # fmt: skip
     variants = _variants(solver, manifold, projection, metric, first)
-    report = _report(task, variants, entries_of(manifold), reference)
+    if reference is None:
+        implicit = isinstance(solver, dfx.AbstractImplicitSolver)
+        reference = dfx.Kvaerno5() if implicit else dfx.Dopri8()
+    report = _report(task, variants, entries, reference, steps.ts)
     print(report)
     return report
 
@@ -162,7 +151,7 @@ def compare(
 # ---- Before the solves ----
 
 
-def _check_solver(solver: Any) -> None:
+def _check_solvers(solver: Any, reference: Any) -> None:
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(
             f"`solver` is {solver!r}, which is not a diffrax solver. Pass an instance, such as "
@@ -172,6 +161,11 @@ def _check_solver(solver: Any) -> None:
         raise ValueError(
             "`solver` is a `ManifoldProjection`, but `compare` makes those itself. Pass the solver "
             "in it, `solver.solver`, and its `projection`."
+        )
+    if reference is not None and not isinstance(reference, dfx.AbstractSolver):
+        raise TypeError(
+            f"`reference` is {reference!r}, but it must be a diffrax solver with error estimates, "
+            "such as `diffrax.Dopri8()`, or `None`."
         )
 
 
@@ -203,37 +197,50 @@ def _stacked(y0: Any, batch: bool) -> Any:
     return y0
 
 
-def _steps(
-    t0: float, t1: float, dt0: float | None, rtol: float | None, atol: float | None, max_steps: int
-) -> tuple[dfx.AbstractStepSizeController, np.ndarray, int]:
-    """The controller, the times at which states are compared, and the largest number of steps.
+class _Steps(NamedTuple):
+    """The controller, what is saved, at which times, and the largest number of steps."""
 
-    With fixed steps these times are ends of steps.
-    """
+    controller: dfx.AbstractStepSizeController
+    saveat: dfx.SaveAt
+    ts: np.ndarray
+    most: int
+
+
+def _steps(
+    t0: Any, t1: Any, dt0: Any, rtol: Any, atol: Any, max_steps: int, dense: bool, dtype: Any
+) -> _Steps:
     check_number("t0", t0, optional=False)
-    check_number("t1", t1, above=float(t0), optional=False)
+    check_number("t1", t1, above=t0, optional=False)
     check_counts(max_steps=max_steps)
-    if (dt0 is None) == (rtol is None and atol is None):
-        given = "both" if dt0 is not None else "neither"
-        raise ValueError(
-            f"`compare` takes fixed steps, `dt0=...`, or adaptive ones, `rtol=..., atol=...`; "
-            f"{given} were given."
-        )
     t0, t1 = float(t0), float(t1)
-    if dt0 is None:
-        for name, value in {"rtol": rtol, "atol": atol}.items():
-            if value is None:
-                raise ValueError(f"`{name}` is missing: give both `rtol` and `atol`.")
-            check_number(name, value, least=0.0)
-        assert rtol is not None and atol is not None
-        controller = dfx.PIDController(rtol=float(rtol), atol=float(atol))
-        return controller, np.linspace(t0, t1, _TIMES + 1), max_steps
-    check_number("dt0", dt0, above=0.0)
-    # A share of a step less, so that roundoff in the quotient does not add one.
-    count = max(1, math.ceil((t1 - t0) / float(dt0) - 1e-6))
-    ends = np.unique(np.round(np.linspace(0, count, min(count, _TIMES) + 1)))
-    # The sum of many steps may need one more, which is as long as roundoff.
-    return dfx.ConstantStepSize(), np.minimum(t0 + ends * float(dt0), t1), count + 2
+    if (dt0 is None) == (rtol is None and atol is None):
+        raise ValueError(
+            "`compare` takes either fixed steps, `dt0=...`, or adaptive ones, `rtol=...` and "
+            f"`atol=...`, but {'neither was' if dt0 is None else 'both were'} given."
+        )
+    if dt0 is not None:
+        check_number("dt0", dt0, above=0.0)
+        return _fixed(t0, t1, float(dt0), dense)
+    if rtol is None or atol is None:
+        missing = "rtol" if rtol is None else "atol"
+        raise ValueError(f"`{missing}` is missing: adaptive steps need both `rtol` and `atol`.")
+    check_number("rtol", rtol, least=0.0)
+    check_number("atol", atol, least=0.0)
+    ts = np.linspace(t0, t1, _TIMES + 1)
+    most = min(max_steps, _DENSE_STEPS) if dense else max_steps
+    controller = dfx.PIDController(rtol=float(rtol), atol=float(atol))
+    return _Steps(controller, dfx.SaveAt(ts=jnp.asarray(ts, dtype), dense=dense), ts, most)
+
+
+def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
+    """What is saved are ends of steps: to interpolate would compile twice as long."""
+    # A bit less, so that roundoff in the quotient does not add a step.
+    count = max(1, math.ceil((t1 - t0) / dt0 - 1e-6))
+    stride = max(1, count // _TIMES)
+    ts = np.minimum(t0 + np.append(np.arange(0, count, stride), count) * dt0, t1)
+    saveat = dfx.SaveAt(t0=True, t1=True, steps=stride, dense=dense)
+    # The sum of many steps may need another one, as long as roundoff.
+    return _Steps(dfx.ConstantStepSize(), saveat, ts, count + 1)
 
 
 # ---- The variants ----
@@ -245,29 +252,38 @@ def entries_of(manifold: Manifold) -> dict[str, Any]:
     return {".".join(str(key_of(x)) for x in path) or "manifold": entry for path, entry in flat}
 
 
+class _Variant(NamedTuple):
+    """One solver to compare: its name, the entries that it keeps, itself for the user, and in the
+    form in which it is compiled together with others."""
+
+    name: str
+    kept: tuple[str, ...]
+    solver: dfx.AbstractSolver
+    shared: dfx.AbstractSolver
+
+
 def _variants(
-    solver: dfx.AbstractSolver,
-    manifold: Manifold,
-    projection: AbstractProjection | None,
-    metric: PyTree[Any] | None,
-    y0: Any,
-) -> list[tuple[str, tuple[str, ...], dfx.AbstractSolver]]:
-    """The name of each solver to compare, what it keeps, and itself; without projection first."""
+    solver: dfx.AbstractSolver, manifold: Manifold, projection: Any, metric: Any, y0: Any
+) -> list[_Variant]:
+    """Without projection first."""
     entries = entries_of(manifold)
     if projection is None:
         projection = ManifoldProjection(solver, manifold).projection
-    found: list[Any] = [(NOTHING, (), solver)]
     projections = _projections(projection, metric, y0)
-    lists = {"all kept": (tuple(entries), manifold)}
-    if len(projections) > 1 and 1 < len(entries) <= _LEFT_OUT:
-        for name in entries:
-            rest = {k: v for k, v in entries.items() if k != name}
-            lists[f"all but {name}"] = tuple(rest), rest
-    for i, (name, (kept, part)) in enumerate(lists.items()):
-        for j, (suffix, chosen) in enumerate(projections.items()):
-            if i == 0 or j == 0 or len(entries) <= _WITH_METRICS:
-                wrapped = ManifoldProjection(solver, part, projection=chosen)
-                found.append((name + suffix, kept, wrapped))
+    found = [_Variant(NOTHING, (), solver, solver)]
+    leave_out = len(projections) > 1 and 1 < len(entries) <= _LEFT_OUT
+    for left_out in (None, *(entries if leave_out else ())):
+        kept = {name: entry for name, entry in entries.items() if name != left_out}
+        part = shared = manifold if left_out is None else kept
+        if leave_out:
+            shared = {name: switched(entry, name != left_out) for name, entry in entries.items()}
+        name = "all kept" if left_out is None else f"all but {left_out}"
+        for suffix, chosen in projections.items():
+            wrapped = ManifoldProjection(solver, part, projection=chosen)
+            if suffix:  # weights of all components are one program, whatever the weights
+                chosen = dataclasses.replace(chosen, metric=_spread(chosen.metric, y0))
+            compiled = ManifoldProjection(solver, shared, projection=chosen)
+            found.append(_Variant(name + suffix, tuple(kept), wrapped, compiled))
     return found
 
 
@@ -284,11 +300,7 @@ def _projections(projection: Any, metric: Any, y0: Any) -> dict[str, AbstractPro
     metrics = {"": None, ", metric=1.0": 1.0}
     if metric is not None:
         metrics[", given metric"] = metric
-    # Each as weights of all components: so two of them are one program with different numbers.
-    return {
-        suffix: dataclasses.replace(projection, metric=_spread(value, y0))
-        for suffix, value in metrics.items()
-    }
+    return {name: dataclasses.replace(projection, metric=x) for name, x in metrics.items()}
 
 
 def _spread(metric: Any, y0: Any) -> Any:
@@ -308,153 +320,47 @@ def _spread(metric: Any, y0: Any) -> Any:
 # ---- The solves ----
 
 
-class _Task(eqx.Module):
-    """What all solves have in common."""
-
-    term: dfx.ODETerm
-    args: Args
-    y0s: Any
-    ts: Float[Array, " times"]
-    dt0: Float[Array, ""] | None
-    controller: dfx.AbstractStepSizeController
-    batch: bool = eqx.field(static=True)
-    dense: bool = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
-
-    def lanes(self, one: Callable[[Any], Any]) -> Any:
-        """`one` of each state. A single one is not made a batch, which would be slower."""
-        if self.batch:
-            return eqx.filter_vmap(one)(self.y0s)
-        found = one(jtu.tree_map(lambda x: x[0], self.y0s))
-        return jtu.tree_map(lambda x: x[None] if eqx.is_array(x) else x, found)
-
-
-@eqx.filter_jit
-def _solved(task: _Task, solver: dfx.AbstractSolver) -> dfx.Solution:
-    def one(y0: Any) -> dfx.Solution:
-        return dfx.diffeqsolve(
-            task.term, solver, task.ts[0], task.ts[-1], task.dt0, y0, task.args,
-            saveat=dfx.SaveAt(ts=task.ts, dense=task.dense), stepsize_controller=task.controller,
-            adjoint=dfx.ForwardMode(), max_steps=task.max_steps, throw=False,
-        )  # fmt: skip
-
-    return task.lanes(one)
-
-
-@eqx.filter_jit
-def _accurate(task: _Task, solver: dfx.AbstractSolver, units: Any, tolerance: Array) -> Any:
-    """The states of the reference, NaN where it failed."""
-
-    def norm(error: Any) -> Array:
-        scaled = jtu.tree_map(lambda e, u: jnp.max(jnp.abs(e) / u, initial=0), error, units)
-        return jnp.max(jnp.stack(jtu.tree_leaves(scaled)))
-
-    def one(y0: Any) -> Any:
-        # Dense output is less accurate than the steps, so these end at the saved times.
-        controller = dfx.PIDController(rtol=0.0, atol=tolerance, norm=norm)
-        ts = task.ts.astype(float)
-        return dfx.diffeqsolve(
-            task.term, solver, ts[0], ts[-1], None, y0, task.args, saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.ClipStepSizeController(controller, step_ts=ts),
-            adjoint=dfx.ForwardMode(), max_steps=_REFERENCE_STEPS, throw=False,
-        ).ys  # fmt: skip
-
-    precise = lambda x: x.astype(jnp.promote_types(x.dtype, float))  # noqa: E731
-    task = dataclasses.replace(task, y0s=jtu.tree_map(precise, task.y0s))
-    return task.lanes(one)
-
-
-@eqx.filter_jit
-def _drifts(sols: dfx.Solution, entries: dict[str, Any], args: Args) -> dict[str, Array]:
-    """The largest drift of each entry in each lane."""
-    found = eqx.filter_vmap(lambda sol: drift(sol, entries, args))(sols)
-    return {
-        name: jnp.max(
-            jnp.stack([jnp.max(jnp.abs(x.reshape(len(x), -1)), axis=1) for x in jtu.tree_leaves(part)]),
-            axis=0,
-        )
-        for name, part in found.items()
-    }  # fmt: skip
-
-
-def _timed(task: _Task, solver: dfx.AbstractSolver) -> tuple[dfx.Solution, float]:
-    """The solutions, and the seconds of a solve after the compilation."""
-    sols, spent = jax.block_until_ready(_solved(task, solver)), []
-    while len(spent) < _RUNS and sum(spent) < _SECONDS:
-        begun = time.perf_counter()
-        jax.block_until_ready(_solved(task, solver))
-        spent.append(time.perf_counter() - begun)
-    return sols, min(spent) / jtu.tree_leaves(task.y0s)[0].shape[0]
-
-
 def _report(
-    task: _Task,
-    variants: list[tuple[str, tuple[str, ...], dfx.AbstractSolver]],
+    task: Task,
+    variants: list[_Variant],
     entries: dict[str, Any],
-    reference: Any,
+    reference: dfx.AbstractSolver,
+    ts: np.ndarray,
 ) -> ComparisonReport:
-    """Solves by each variant, the first of them without projection."""
-    plain = _timed(task, variants[0][2])
-    sizes = _sizes(task.y0s, plain[0].ys)
-    exact, rough = _references(task, variants[0][2], reference, sizes)
-    invariants = _invariants(task, exact, sizes, entries)
+    plain, *_ = results = [timed(task, variant.shared) for variant in variants]
+    length = len(ts)
+    known = np.asarray(plain[0].ts)[0, :length]
+    ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
+    sizes = sizes_of(task.y0s, plain[0].ys)
+    exact, rough = references(task, reference, ts, sizes)
+    invariants = _invariants(task, ts, exact, sizes, entries)
     rows = []
-    for name, kept, solver in variants:
-        sols, seconds = plain if solver is variants[0][2] else _timed(task, solver)
-        ys = jtu.tree_map(np.asarray, sols.ys)
+    for variant, (sols, seconds) in zip(variants, results, strict=True):
+        ys = jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)
         success = np.asarray(sols.result == dfx.RESULTS.successful)
-        failed = np.flatnonzero(~success)
-        message = ""
-        if failed.size:
-            result = jtu.tree_map(lambda x: x[failed[0]], sols.result)
-            message = " ".join(dfx.RESULTS[result].split()).partition(". ")[0]
-        drifts = _drifts(sols, entries, task.args)
-        rows.append(
-            ComparisonRow(
-                name,
-                kept,
-                solver,
-                distance(ys, exact),
-                success,
-                message,
-                {key: np.asarray(value) for key, value in drifts.items()},
-                changes(invariants, ys, sizes),
-                np.asarray(sols.stats["num_steps"]),
-                seconds,
-            )  # fmt: skip
-        )
-    ts = np.asarray(task.ts, float)
+        row = ComparisonRow(
+            variant.name, variant.kept, variant.solver, distance(ys, exact), success,
+            _message(sols, success), drifts(task, sols, entries), changes(invariants, ys, sizes),
+            np.asarray(sols.stats["num_steps"]), seconds,
+        )  # fmt: skip
+        rows.append(row)
     return ComparisonReport(tuple(rows), ts, distance(rough, exact), len(invariants))
 
 
-def _sizes(y0s: Any, ys: Any) -> Any:
-    """The largest value of each component so far as it is finite, and at least a share of that of
-    its leaf."""
-
-    def largest(y0: Any, y: Any) -> np.ndarray:
-        size = np.nan_to_num(np.abs(np.asarray(y)), nan=0, posinf=0).max(axis=(0, 1))
-        size = np.maximum(size, np.abs(np.asarray(y0)).max(axis=0))
-        top = size.max(initial=0)
-        return np.maximum(size, _SMALL * top if top > 0 else 1.0).astype(float)
-
-    return jtu.tree_map(largest, y0s, ys)
+def _message(sols: dfx.Solution, success: np.ndarray) -> str:
+    """Why the first lane failed that did."""
+    if success.all():
+        return ""
+    first = int(np.argmin(success))
+    message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], sols.result)]
+    return " ".join(message.split()).partition(". ")[0].rstrip(".")
 
 
-def _references(task: _Task, solver: Any, reference: Any, sizes: Any) -> tuple[Any, Any]:
-    """The states of the reference, and those at a tolerance a hundred times as large."""
-    implicit = isinstance(solver, dfx.AbstractImplicitSolver)
-    if reference is None:
-        reference = dfx.Kvaerno5() if implicit else dfx.Dopri8()
-    implicit = isinstance(reference, dfx.AbstractImplicitSolver)
-    rough, tight = (
-        jtu.tree_map(np.asarray, _accurate(task, reference, sizes, jnp.asarray(tolerance)))
-        for tolerance in (_IMPLICIT if implicit else _EXPLICIT)
-    )
-    return tight, rough
-
-
-def _invariants(task: _Task, exact: Any, sizes: Any, entries: dict[str, Any]) -> np.ndarray:
+def _invariants(
+    task: Task, ts: np.ndarray, exact: Any, sizes: Any, entries: dict[str, Any]
+) -> np.ndarray:
     """The linear invariants that nobody declared; none in a state that is too large."""
-    if sum(map(np.size, jtu.tree_leaves(sizes))) > _COMPONENTS:
+    if tree_size(sizes) > _COMPONENTS:
         return np.zeros((0, 0))
-    return linear_invariants(task.term.vector_field, task.ts, exact, sizes, task.args, entries)
+    field = task.term.vector_field
+    return linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)

@@ -160,8 +160,8 @@ class ComparisonReport:
                 "start on: pass shorter steps, or a shorter interval."
             )
         return (
-            f"Nothing can be said, because the reference cannot be trusted: two of its solves differ by "
-            f"{np.median(self.doubt[:, -1]):.0e} at the end, and the smallest error is "
+            "Nothing can be said, because the reference cannot be trusted: two of its solves "
+            f"differ by {np.median(self.doubt[:, -1]):.0e} at the end, and the smallest error is "
             f"{np.median(best[:, -1]):.0e}; pass a shorter interval, or larger tolerances."
         )
 
@@ -185,10 +185,11 @@ class ComparisonReport:
         return [found]
 
     def _failures(self) -> list[str]:
+        lanes = self.doubt.shape[0]
         return [
-            f"`{row.name}` fails in {np.sum(~row.success)} of {row.success.size} lanes: {row.message}."
-            if row.success.size > 1
-            else f"`{row.name}` fails: {row.message}."
+            f"`{row.name}` fails"
+            + (f" in {np.sum(~row.success)} of {lanes} lanes" if lanes > 1 else "")
+            + f": {row.message}."
             for row in self.rows
             if not row.success.all()
         ]
@@ -199,8 +200,8 @@ class ComparisonReport:
         if not row.kept or not change > max(_BROKEN, 10 * before):
             return []
         return [
-            f"It changes linear invariants that nobody declared, by {change:.0e} of the components' "
-            "sizes: `find_invariants(vector_field, states, basis=1)` finds them, keep them too."
+            f"It changes linear invariants that nobody declared, by {change:.0e} of the sizes of "
+            "the components: `find_invariants(vector_field, states, basis=1)` finds them."
         ]
 
     def _units(self) -> list[str]:
@@ -295,8 +296,8 @@ def _compared(ratios: np.ndarray) -> str:
     found = f"the error is {mean:.2g} times that without projection"
     if ratios.size > 1:
         found += (
-            f" in the geometric mean of {ratios.size} lanes, of which {np.mean(ratios > 1):.0%} are "
-            f"worse than without, the worst by {np.max(ratios):.2g}"
+            f" in the geometric mean of {ratios.size} lanes; in {np.mean(ratios > 1):.0%} of them "
+            f"it is larger than without, at most {np.max(ratios):.2g} times"
         )
     return found
 
