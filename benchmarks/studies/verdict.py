@@ -119,9 +119,9 @@ def disk():
         spin = jr.uniform(b, (3,), minval=-1.0, maxval=1.0) + jnp.array([0.0, 0.0, 12.0])
         return start(jr.uniform(a, minval=1.3, maxval=1.9), spin)
 
-    field = dfc.tangent(falling, rolling, metric=weights)
+    field, upright = dfc.tangent(falling, rolling, metric=weights), np.deg2rad(110)
     return Problem(
-        "rolling-disk", field, manifold, sample, start(np.deg2rad(110), jnp.array([0.0, 1.0, 12.0])),
+        "rolling-disk", field, manifold, sample, start(upright, jnp.array([0.0, 1.0, 12.0])),
         dfx.Tsit5(), 5.0, tol=1e-7, projection=dfc.SimplifiedNewton(atol=1e-14),
     )  # fmt: skip
 

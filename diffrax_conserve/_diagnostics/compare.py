@@ -289,7 +289,8 @@ def _variants(
 
 def _projections(projection: Any, metric: Any, y0: Any) -> dict[str, AbstractProjection]:
     """The projection with each metric, by what is added to its name."""
-    if not hasattr(projection, "metric"):
+    options = {x.name for x in dataclasses.fields(projection) if x.init}
+    if "metric" not in options:
         if metric is not None:
             raise ValueError(
                 f"`projection` is a `{type(projection).__name__}`, which has no metric. Leave out "

@@ -37,20 +37,37 @@ def linear_invariants(
     units = np.asarray(ravel(sizes))
     times, states = _states(ts, ys, units)
 
-    @eqx.filter_jit
-    @jax.vmap
-    def measured(t: Array, x: Array) -> tuple[Array, Array]:
-        like = jtu.tree_map(lambda y: y[0, 0], ys)
-        values = lambda x: ravel([e.fn(t, unravel(x, like), args) for e in entries.values()])  # noqa: E731
-        slope = ravel(slope_of(vector_field, t, unravel(x, like), args))
-        return slope / units, jax.jacrev(values)(x) * units
-
-    slopes, gradients = map(np.asarray, measured(times, states))
+    like = jtu.tree_map(lambda y: y[0, 0], ys)
+    found = _measured(vector_field, entries, times, states, like, jnp.asarray(units), args)
+    slopes, gradients = map(np.asarray, found)
     finite = np.isfinite(slopes).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
     if not finite.any():
         return np.zeros((0, units.size))
     declared = _constant(gradients[finite])
     return _without(_null_space(slopes[finite]), declared)
+
+
+@eqx.filter_jit
+def _measured(
+    vector_field: Callable,
+    entries: dict[str, Any],
+    ts: Array,
+    states: Array,
+    like: Any,
+    units: Array,
+    args: Args,
+) -> tuple[Array, Array]:
+    """The slopes at the states and the gradients of the entries, in units of the components."""
+
+    @jax.vmap
+    def measured(t: Array, x: Array) -> tuple[Array, Array]:
+        def values(x: Array) -> Array:
+            return ravel([entry.fn(t, unravel(x, like), args) for entry in entries.values()])
+
+        slope = ravel(slope_of(vector_field, t, unravel(x, like), args))
+        return slope / units, jax.jacrev(values)(x) * units
+
+    return measured(ts, states)
 
 
 def changes(
