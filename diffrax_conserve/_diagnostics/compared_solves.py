@@ -134,17 +134,20 @@ def _accurate(
 
     controller = dfx.PIDController(rtol=0.0, atol=tolerance, norm=norm)
 
-    def step(y: Any, interval: tuple[Array, Array]) -> tuple[Any, Any]:
+    def step(carry: tuple[Any, Array], interval: tuple[Array, Array]) -> tuple[Any, Any]:
+        y, ok = carry
+        start, end = interval
+        end = jnp.where(ok, end, start)  # after a failure nothing is left to do
         sol = dfx.diffeqsolve(
-            task.term, solver, *interval, None, y, task.args, stepsize_controller=controller,
+            task.term, solver, start, end, None, y, task.args, stepsize_controller=controller,
             adjoint=dfx.ForwardMode(), max_steps=_REFERENCE_STEPS, throw=False,
         )  # fmt: skip
-        ok = sol.result == dfx.RESULTS.successful
+        ok = ok & (sol.result == dfx.RESULTS.successful)
         y = jtu.tree_map(lambda x: jnp.where(ok, x[0], jnp.nan), sol.ys)
-        return y, y
+        return (y, ok), y
 
     def one(y0: Any) -> Any:
-        _, ys = lax.scan(step, y0, (ts[:-1], ts[1:]))
+        _, ys = lax.scan(step, (y0, jnp.array(True)), (ts[:-1], ts[1:]))
         return jtu.tree_map(lambda x, xs: jnp.concatenate([x[None], xs]), y0, ys)
 
     precise = lambda x: x.astype(jnp.promote_types(x.dtype, float))  # noqa: E731

@@ -83,9 +83,14 @@ class ComparisonReport:
     # ---- What is judged ----
 
     @property
+    def _best(self) -> Float[np.ndarray, "lanes times"]:
+        """The smallest error of all rows, each the largest up to its time."""
+        return np.min([_so_far(row) for row in self.rows], axis=0)
+
+    @property
     def last(self) -> Int[np.ndarray, " lanes"]:
         """The index of the last time that is judged in each lane; 0 if none is."""
-        best = np.min([_so_far(row) for row in self.rows], axis=0)
+        best = self._best
         with np.errstate(invalid="ignore"):
             known = (_running(self.doubt) <= _TRUSTED * best) & (best <= _LOST)
         known[:, 0] = True
@@ -145,7 +150,9 @@ class ComparisonReport:
         if not rivals:
             return "Do not project: every projection fails."
         best = min(rivals, key=lambda i: _mean(ratios[i]))
-        return f"Do not project: of `{self.rows[best].name}` {_compared(ratios[best])}."
+        name = self.rows[best].name
+        told = f"Do not project: with `{name}`, the best of the projections, "
+        return f"{told}{_compared(ratios[best])}."
 
     def _unjudged(self) -> str:
         if not np.isfinite(self.doubt).all():
@@ -153,7 +160,7 @@ class ComparisonReport:
                 "Nothing can be said, because the reference failed: pass a shorter interval, or "
                 "another `reference`, such as `diffrax.Kvaerno5()` for a stiff field."
             )
-        best = np.min([row.errors for row in self.rows], axis=0)
+        best = self._best
         if np.median(best[:, 1:]) > _LOST:
             return (
                 "Nothing can be said, because every error is as large as the state nearly from the "
@@ -168,14 +175,17 @@ class ComparisonReport:
     @property
     def notes(self) -> list[str]:
         """What else there is to know, a sentence each."""
-        return [*self._horizon(), *self._failures(), *self._broken(), *self._units()]
+        found = [*self._horizon(), *self._failures(), *self._broken(), *self._units()]
+        if self.doubt.shape[0] == 1:
+            found.append("This is one start: others may differ, so try several with `batch=True`.")
+        return found
 
     def _horizon(self) -> list[str]:
         last, end = self.last, len(self.ts) - 1
         if self.index is None or np.all(last == end):
             return []
         until = self.ts[last[last > 0]].min()
-        best = np.min([_so_far(row) for row in self.rows], axis=0)[:, -1]
+        best = self._best[:, -1]
         cause = "the reference cannot be trusted"
         if np.all(best[last < end] > _LOST):
             cause = "every error is as large as the state"
