@@ -15,7 +15,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve._diagnostics.compared_solves import switched
 from diffrax_conserve._diagnostics.comparison import ComparisonReport, ComparisonRow
 from diffrax_conserve._diagnostics.linear_invariants import changes, linear_invariants
-from diffrax_conserve.reproduce import main
+from diffrax_conserve.reproduce import _verdict, main
 
 from .problems import KEPLER0, kepler, kepler_energy
 
@@ -179,7 +179,7 @@ def report_of(*errors, doubt=1e-13, lanes=1):
         ((1e-3, 2e-3, 1.5e-3), 1e-9, "nothing kept", ("Do not project", "choice 2", "1.5 times")),
         ((1e-3, 1.08e-3), 1e-9, "choice 1", ("1.1 times", "Take")),
         ((np.nan, 1e-3), 1e-9, "choice 1", ("without projection the solve fails",)),
-        ((1e-3, np.nan), 1e-9, "nothing kept", ("every projection fails",)),
+        ((1e-3, np.nan), 1e-9, "nothing kept", ("every projection fails.",)),
         ((np.nan, np.nan), 1e-9, None, ("Take shorter steps", "it failed")),
         ((1e-3, 1e-4), 1e-4, None, ("cannot be trusted", "shorter interval")),
         ((1e-3, 1e-4), np.nan, None, ("reference failed", "Kvaerno5")),
@@ -328,13 +328,12 @@ def test_what_the_command_refuses(arguments, words, capsys):
     assert [word for word in words if word not in message] == []
 
 
-def test_the_command_passes_on_what_it_is_given(monkeypatch, capsys):
-    from diffrax_conserve.reproduce import _verdict
-
+def test_the_command_passes_on_what_it_is_given_and_draws(monkeypatch, tmp_path):
     given = {}
 
     def remember(field, solver, manifold, y0, **options):
         given.update(options, solver=solver, y0=y0)
+        return report_of(1e-3, 1e-4)
 
     monkeypatch.setattr(_verdict, "compare", remember)
     assert main(["compare", "pollu", "--starts", "3", "--seed", "1", "--tol", "1e-5"]) == 0
@@ -342,5 +341,6 @@ def test_the_command_passes_on_what_it_is_given(monkeypatch, capsys):
     assert given["y0"].shape == (3, 20)
     assert (given["rtol"], given["atol"], given["t1"]) == (1e-5, 1e-9, dfc.systems.Pollu.t1)
     assert given["projection"] is not None
-    assert main(["compare", "kepler", "--t1", "3"]) == 0
+    assert main(["compare", "kepler", "--t1", "3", "--out", str(tmp_path)]) == 0
+    assert {file.name for file in tmp_path.iterdir()} == {"verdict.png", "verdict.pdf"}
     assert (given["t1"], given["dt0"], given["batch"]) == (3.0, dfc.systems.Kepler.dt, False)

@@ -113,7 +113,6 @@ def compare(
         ```python
         import contextlib
 
-        import diffrax
         import diffrax_conserve as dfc
         import jax
 
@@ -124,6 +123,10 @@ def compare(
                 system.vector_field, dfc.RK4(), system.manifold, system.y0, t1=20.0, dt0=0.2
             )
         print(report.choice)
+        ```
+
+        ```text
+        all kept
         ```
     """
     if isinstance(vector_field, dfx.ODETerm):

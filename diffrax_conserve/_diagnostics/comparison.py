@@ -136,19 +136,21 @@ class ComparisonReport:
     def verdict(self) -> str:
         """What to take, in one sentence."""
         if self.index is None:
-            if not any(row.success.any() for row in self.rows):
+            if not any(row.success.all() for row in self.rows) and np.isfinite(self.doubt).all():
                 return f"Take shorter steps: every solve fails ({self.rows[0].message})."
             return self._unjudged()
-        judged = self.last > 0
-        error = np.maximum(self.error[:, judged], _TINY)
-        if not np.isfinite(error[0]).all():
-            return f"Take `{self.choice}`: without projection the solve fails."
-        ratios = error / error[0]
+        error = np.maximum(self.error[:, self.last > 0], _TINY)
+        failures = np.sum(np.isinf(error), axis=1)
+        if failures[0] > failures[self.index]:
+            where = f" in {failures[0]} of {error.shape[1]} lanes" if error.shape[1] > 1 else ""
+            return f"Take `{self.choice}`: without projection the solve fails{where}."
+        ratios = error[:, np.isfinite(error[0])] / error[0, np.isfinite(error[0])]
         if self.index > 0:
             return f"Take `{self.choice}`: {_compared(ratios[self.index])}."
         rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
         if not rivals:
-            return "Do not project: every projection fails."
+            where = " in some lane" if error.shape[1] > 1 else ""
+            return f"Do not project: every projection fails{where}."
         best = min(rivals, key=lambda i: _mean(ratios[i]))
         name = self.rows[best].name
         told = f"Do not project: with `{name}`, the best of the projections, "
@@ -265,7 +267,9 @@ class ComparisonReport:
         shown = [0, *sorted(np.argsort(means[1:], kind="stable")[:5] + 1)]
         for i in shown:
             row = self.rows[i]
-            curve = np.median(np.where(row.success[:, None], row.errors, np.nan), axis=0)
+            if not row.success.any():
+                continue
+            curve = np.median(row.errors[row.success], axis=0)
             look = dict(linewidth=2.5) if i == self.index else dict(linewidth=1)
             ax.semilogy(self.ts[1:], np.maximum(curve[1:], _TINY), label=row.name, **look)
         doubt = np.median(self.doubt, axis=0)
@@ -291,25 +295,28 @@ def _mean(errors: np.ndarray) -> float:
 
 
 def _chosen(error: np.ndarray) -> int | None:
-    """Of the rows of which the geometric mean of the errors is about the least, the first with a
-    projection, if there is one."""
+    """Of the rows that fail in the fewest lanes, and of which the geometric mean of the errors is
+    about the least, the first with a projection, if there is one."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
-    if not error.size or np.isinf(error).any(axis=1).all():
+    failures = np.sum(np.isinf(error), axis=1)
+    able = np.flatnonzero(failures == failures.min())
+    common = np.isfinite(error[able]).all(axis=0)
+    if not common.any():
         return None
-    means = [_mean(x) for x in error]
-    near = [i for i, mean in enumerate(means) if mean <= (1 + _EQUAL) * min(means)]
+    means = {int(i): _mean(error[i, common]) for i in able}
+    near = [i for i, mean in means.items() if mean <= (1 + _EQUAL) * min(means.values())]
     return next((i for i in near if i > 0), 0)
 
 
 def _compared(ratios: np.ndarray) -> str:
-    mean = _mean(ratios)
-    found = f"the error is {mean:.2g} times that without projection"
-    if ratios.size > 1:
-        found += (
-            f" in the geometric mean of {ratios.size} lanes; in {np.mean(ratios > 1):.0%} of them "
-            f"it is larger than without, at most {np.max(ratios):.2g} times"
-        )
-    return found
+    found = f"the error is {_mean(ratios):.2g} times that without projection"
+    if ratios.size == 1:
+        return found
+    found += (
+        f" in the geometric mean of {ratios.size} lanes, and {np.max(ratios):.2g} times at worst"
+    )
+    larger = int(np.sum(ratios > 1))
+    return found + f"; in {larger} of them it is larger" if larger else found
 
 
 def _median(x: np.ndarray) -> float:
