@@ -213,6 +213,17 @@ def test_a_failure_in_one_lane_counts():
     assert "`choice 1` fails in 1 of 3 lanes: it failed." in report.notes
 
 
+def test_of_equal_means_the_one_without_risk_is_taken():
+    report = report_of(1e-3, 1e-3, 1e-3, lanes=2)
+    plain, first, second = report.rows
+    risky = first.errors * np.array([[0.5], [1.9]])
+    rows = plain, dataclasses.replace(first, errors=risky), second
+    assert dataclasses.replace(report, rows=rows).choice == "choice 2"
+    report = dataclasses.replace(report, rows=rows[:2])
+    assert report.choice == "nothing kept"
+    assert "1.9 times at worst; in 1 of them it is larger" in report.verdict
+
+
 def test_the_picture_has_a_curve_for_each_and_the_choice_is_bold():
     pytest.importorskip("matplotlib").use("Agg")
     ax = report_of(1e-3, 1e-4, 1e-5).plot()

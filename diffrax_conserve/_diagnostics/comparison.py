@@ -19,6 +19,9 @@ _LOST = 0.3
 _SHORTEST = 0.1
 # Errors that differ by less than this share count as equal. Then what keeps more is preferred.
 _EQUAL = 0.1
+# Where a projection is about as accurate as none in the mean, it is not taken if a lane is worse by
+# this factor.
+_RISK = 1.5
 # An error below this is roundoff. It stands in the place of zero, which has no logarithm.
 _TINY = 1e-18
 # A change of a conserved combination that is larger than this is more than roundoff.
@@ -296,7 +299,7 @@ def _mean(errors: np.ndarray) -> float:
 
 def _chosen(error: np.ndarray) -> int | None:
     """Of the rows that fail in the fewest lanes, and of which the geometric mean of the errors is
-    about the least, the first with a projection, if there is one."""
+    about the least, the first with a projection, if there is one without a risk."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
     failures = np.sum(np.isinf(error), axis=1)
     able = np.flatnonzero(failures == failures.min())
@@ -305,7 +308,15 @@ def _chosen(error: np.ndarray) -> int | None:
         return None
     means = {int(i): _mean(error[i, common]) for i in able}
     near = [i for i, mean in means.items() if mean <= (1 + _EQUAL) * min(means.values())]
-    return next((i for i in near if i > 0), 0)
+    if 0 not in means:
+        return near[0]
+    better = [
+        i
+        for i in near
+        if means[i] < (1 - _EQUAL) * means[0]
+        or np.max(error[i, common] / error[0, common]) <= _RISK
+    ]
+    return next((i for i in better if i > 0), 0)
 
 
 def _compared(ratios: np.ndarray) -> str:
