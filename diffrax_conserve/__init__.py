@@ -10,7 +10,7 @@ Define the conserved quantities, wrap the solver, and use `diffrax.diffeqsolve` 
     solution = diffrax.diffeqsolve(term, solver, 0, 10, 0.1, jnp.array([1.0, 0.0]))
 
 What is conserved    FirstIntegral, Constraint, find_invariants
-Diagnostics          check_invariance, drift, off_manifold, statistics
+Diagnostics          check_invariance, compare, drift, off_manifold, statistics
 Solvers              ManifoldProjection, RK4, Unrolled
 Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
 Projections          SimplifiedNewton, Newton, AlongLine, Staged, project
@@ -26,6 +26,9 @@ accurate: measure its error too.
 from . import learned as learned
 from . import systems as systems
 from ._diagnostics.check_invariance import check_invariance as check_invariance
+from ._diagnostics.compare import compare as compare
+from ._diagnostics.comparison import ComparisonReport as ComparisonReport
+from ._diagnostics.comparison import ComparisonRow as ComparisonRow
 from ._diagnostics.drift import drift as drift
 from ._diagnostics.drift import off_manifold as off_manifold
 from ._diagnostics.find_invariants import find_invariants as find_invariants

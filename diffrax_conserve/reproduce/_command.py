@@ -12,11 +12,13 @@ import jax
 from .. import __version__, systems
 from ._job import SetupError
 from ._job import reproduce as _reproduce
+from ._verdict import verdict
 
 _NAMES = (*systems.names(), *systems.names(stiff=True))
 _EXAMPLES = """examples:
   diffrax-conserve list
   diffrax-conserve reproduce kepler --out out/kepler
+  diffrax-conserve compare kepler
 """
 _EXAMPLES_OF_LIST = """example:
   diffrax-conserve list
@@ -25,6 +27,10 @@ _EXAMPLES_OF_REPRODUCE = """examples:
   diffrax-conserve reproduce kepler
   diffrax-conserve reproduce kepler --t1 50 --dt 0.1 --out out/longer
   diffrax-conserve reproduce rigid-body --train --epochs 500 --seed 1
+"""
+_EXAMPLES_OF_COMPARE = """examples:
+  diffrax-conserve compare lotka-volterra
+  diffrax-conserve compare rigid-body --tol 1e-6 --starts 8 --out out/verdict
 """
 
 
@@ -42,6 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     # The references need float64, and drifts are compared with its roundoff.
     jax.config.update("jax_enable_x64", True)
+    if options.command == "compare":
+        return _compare(parser, options)
     if not options.train and (options.seed is not None or options.epochs is not None):
         parser.error("--seed and --epochs are options of --train: give --train too")
     if options.epochs is not None and options.epochs < 1:
@@ -60,6 +68,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SetupError as error:
         parser.error(str(error))
     return 0 if ok else 1
+
+
+def _compare(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    if options.tol is not None and options.dt is not None:
+        parser.error("--tol and --dt are adaptive steps and fixed ones: give one of them")
+    try:
+        verdict(
+            systems.get(options.name),
+            t1=options.t1,
+            dt=options.dt,
+            tol=options.tol,
+            starts=options.starts,
+            seed=options.seed,
+            out=options.out,
+        )
+    except SetupError as error:
+        parser.error(str(error))
+    return 0
 
 
 def run() -> int:
@@ -104,4 +130,24 @@ def _parser() -> argparse.ArgumentParser:
     reproduce.add_argument("--train", action="store_true", help="train the networks again")
     reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
     reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
+    compare = commands.add_parser(
+        "compare",
+        help="say whether a projection makes a solution of a system better",
+        description=(
+            "Solves without projection, with all entries of the manifold kept, and with each of\n"
+            "them left out, in several metrics. Prints errors and drifts, and says what to take.\n"
+            "The solver is RK4, with a tolerance Tsit5, and for stiff systems Kvaerno5."
+        ),
+        epilog=_EXAMPLES_OF_COMPARE,
+        **raw,
+    )
+    compare.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
+    compare.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
+    compare.add_argument("--dt", type=float, metavar="H", help="length of fixed steps")
+    compare.add_argument("--tol", type=float, metavar="X", help="tolerance of adaptive steps")
+    compare.add_argument(
+        "--starts", type=int, metavar="N", help="random initial states; default: that of the system"
+    )
+    compare.add_argument("--seed", type=int, metavar="N", default=0, help="of them (default: 0)")
+    compare.add_argument("--out", type=Path, metavar="DIR", help="for a figure of the errors")
     return parser

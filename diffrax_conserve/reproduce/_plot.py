@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from .._diagnostics.comparison import ComparisonReport
 from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
 from ._solve import COMPARED_MAX, Run
@@ -86,6 +87,14 @@ def draw(
     for name, figure in figures.items():
         for suffix in ("png", "pdf"):
             replace_file(out / f"{name}.{suffix}", lambda path, f=figure: save(f, path))
+
+
+@mpl.rc_context(_STYLE)
+def verdict(report: ComparisonReport) -> Figure:
+    """The errors of a comparison against time."""
+    figure = Figure(figsize=(5.5, 3.5), layout="constrained")
+    report.plot(figure.subplots())
+    return figure
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -1,0 +1,348 @@
+"""What `compare` returns: errors with and without projection, a sentence about them, a picture."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+# The name of the solve without projection.
+NOTHING = "nothing kept"
+# The reference is trusted where the two of its solves differ by at most this share of the smallest
+# error. Its own error is smaller, because one of the tolerances is a hundredth of the other.
+_TRUSTED = 1 / 3
+# If every error is larger than this share of the state, none of the solutions tells anything.
+_LOST = 0.3
+# A lane that can be judged for less than this share of its interval counts as not judged.
+_SHORTEST = 0.1
+# Errors that differ by less than this share count as equal. Then what keeps more is preferred.
+_EQUAL = 0.1
+# Where a projection is about as accurate as none in the mean, it is not taken if a lane is worse by
+# this factor.
+_RISK = 1.5
+# An error below this is roundoff. It stands in the place of zero, which has no logarithm.
+_TINY = 1e-18
+# A change of a conserved combination that is larger than this is more than roundoff.
+_BROKEN = 1e-11
+
+
+def distance(ys: Any, exact: Any) -> Float[np.ndarray, "lanes times"]:
+    """The error of states with leading axes over lanes and times: in each leaf relative to its
+    largest component at any time, the largest of all leaves. NaN where it is not known."""
+    found = []
+    for y, x in zip(jtu.tree_leaves(ys), jtu.tree_leaves(exact), strict=True):
+        y, x = (np.asarray(a).reshape(*a.shape[:2], -1) for a in (y, x))
+        if x.shape[2]:
+            with np.errstate(invalid="ignore", over="ignore"):
+                size = np.max(np.abs(x), axis=(1, 2))
+                error = np.max(np.abs(y - x), axis=2)
+            found.append(error / np.where(size > 0, size, 1.0)[:, None])
+    return np.max(found, axis=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ComparisonRow:
+    """One solver of a comparison.
+
+    - `name`: such as `"all but energy, metric=1.0"`.
+    - `kept`: the names of the entries that it keeps.
+    - `solver`: itself, ready for `diffrax.diffeqsolve`.
+    - `errors`: the error of the state in each lane at each time.
+    - `success`, `message`: whether each lane succeeded, and why the first of the others did not.
+    - `drift`: the largest drift of each entry in each lane, kept or not.
+    - `linear`: the largest change in each lane of linear invariants that nobody declared.
+    - `steps`: the number of steps in each lane; `seconds`: the time of one solve.
+    """
+
+    name: str
+    kept: tuple[str, ...]
+    solver: dfx.AbstractSolver
+    errors: Float[np.ndarray, "lanes times"]
+    success: Bool[np.ndarray, " lanes"]
+    message: str
+    drift: dict[str, Float[np.ndarray, " lanes"]]
+    linear: Float[np.ndarray, " lanes"]
+    steps: Int[np.ndarray, " lanes"]
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ComparisonReport:
+    """What `compare` found, printed as a table with a sentence that says what to take.
+
+    - `rows`: a [`diffrax_conserve.ComparisonRow`][] for each solver, without projection first.
+    - `ts`: the times at which states were compared.
+    - `doubt`: how far the two solves of the reference are apart, in each lane at each time.
+    - `num_linear`: the number of linear invariants that no entry declares.
+    """
+
+    rows: tuple[ComparisonRow, ...]
+    ts: Float[np.ndarray, " times"]
+    doubt: Float[np.ndarray, "lanes times"]
+    num_linear: int
+
+    # ---- What is judged ----
+
+    @property
+    def _best(self) -> Float[np.ndarray, "lanes times"]:
+        """The smallest error of all rows, each the largest up to its time."""
+        return np.min([_so_far(row) for row in self.rows], axis=0)
+
+    @property
+    def last(self) -> Int[np.ndarray, " lanes"]:
+        """The index of the last time that is judged in each lane; 0 if none is."""
+        best = self._best
+        with np.errstate(invalid="ignore"):
+            known = (_running(self.doubt) <= _TRUSTED * best) & (best <= _LOST)
+        known[:, 0] = True
+        last = known.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
+        return np.where(
+            self.ts[last] - self.ts[0] >= _SHORTEST * (self.ts[-1] - self.ts[0]), last, 0
+        )
+
+    @property
+    def error(self) -> Float[np.ndarray, "rows lanes"]:
+        """The largest error of each row and lane up to the last time that is judged: infinite if
+        the solve failed, NaN if nothing is judged."""
+        return self._at_last([_so_far(row) for row in self.rows])
+
+    @property
+    def error_at_end(self) -> Float[np.ndarray, "rows lanes"]:
+        """The error of each row and lane at the last time that is judged."""
+        return self._at_last([np.where(r.success[:, None], r.errors, np.inf) for r in self.rows])
+
+    def _at_last(self, errors: list[np.ndarray]) -> np.ndarray:
+        last = self.last
+        found = np.stack(errors)[:, np.arange(len(last)), last]
+        return np.where(last > 0, found, np.nan)
+
+    @property
+    def index(self) -> int | None:
+        """The row to take; `None` if that cannot be said."""
+        return _chosen(self.error)
+
+    @property
+    def choice(self) -> str | None:
+        """The name of the row to take."""
+        return None if self.index is None else self.rows[self.index].name
+
+    @property
+    def solver(self) -> dfx.AbstractSolver:
+        """The solver to take; that without projection if nothing can be said."""
+        return self.rows[self.index or 0].solver
+
+    # ---- Words ----
+
+    @property
+    def verdict(self) -> str:
+        """What to take, in one sentence."""
+        if self.index is None:
+            if not any(row.success.all() for row in self.rows) and np.isfinite(self.doubt).all():
+                return f"Take shorter steps: every solve fails ({self.rows[0].message})."
+            return self._unjudged()
+        error = np.maximum(self.error[:, self.last > 0], _TINY)
+        failures = np.sum(np.isinf(error), axis=1)
+        if failures[0] > failures[self.index]:
+            where = f" in {failures[0]} of {error.shape[1]} lanes" if error.shape[1] > 1 else ""
+            return f"Take `{self.choice}`: without projection the solve fails{where}."
+        ratios = error[:, np.isfinite(error[0])] / error[0, np.isfinite(error[0])]
+        if self.index > 0:
+            return f"Take `{self.choice}`: {_compared(ratios[self.index])}."
+        rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
+        if not rivals:
+            where = " in some lane" if error.shape[1] > 1 else ""
+            return f"Do not project: every projection fails{where}."
+        best = min(rivals, key=lambda i: _mean(ratios[i]))
+        name = self.rows[best].name
+        told = f"Do not project: with `{name}`, the best of the projections, "
+        return f"{told}{_compared(ratios[best])}."
+
+    def _unjudged(self) -> str:
+        if not np.isfinite(self.doubt).all():
+            return (
+                "Nothing can be said, because the reference failed: pass a shorter interval, or "
+                "another `reference`, such as `diffrax.Kvaerno5()` for a stiff field."
+            )
+        best = self._best
+        if np.median(best[:, 1:]) > _LOST:
+            return (
+                "Nothing can be said, because every error is as large as the state nearly from the "
+                "start on: pass shorter steps, or a shorter interval."
+            )
+        return (
+            "Nothing can be said, because the reference cannot be trusted: two of its solves "
+            f"differ by {np.median(self.doubt[:, -1]):.0e} at the end, and the smallest error is "
+            f"{np.median(best[:, -1]):.0e}; pass a shorter interval, or larger tolerances."
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        """What else there is to know, a sentence each."""
+        found = [*self._horizon(), *self._failures(), *self._broken(), *self._units()]
+        if self.doubt.shape[0] == 1:
+            found.append("This is one start: others may differ, so try several with `batch=True`.")
+        return found
+
+    def _horizon(self) -> list[str]:
+        last, end = self.last, len(self.ts) - 1
+        if self.index is None or np.all(last == end):
+            return []
+        until = self.ts[last[last > 0]].min()
+        best = self._best[:, -1]
+        cause = "the reference cannot be trusted"
+        if np.all(best[last < end] > _LOST):
+            cause = "every error is as large as the state"
+        found = f"Judged up to t = {until:.3g} only, because later {cause}, as in chaos."
+        if np.any(last == 0):
+            found += f" {np.sum(last == 0)} of {len(last)} lanes are not judged at all."
+        return [found]
+
+    def _failures(self) -> list[str]:
+        lanes = self.doubt.shape[0]
+        return [
+            f"`{row.name}` fails"
+            + (f" in {np.sum(~row.success)} of {lanes} lanes" if lanes > 1 else "")
+            + f": {row.message}."
+            for row in self.rows
+            if not row.success.all()
+        ]
+
+    def _broken(self) -> list[str]:
+        row = self.rows[self.index or 0]
+        change, before = (np.max(r.linear, initial=0) for r in (row, self.rows[0]))
+        if not row.kept or not change > max(_BROKEN, 10 * before):
+            return []
+        return [
+            f"It changes linear invariants that nobody declared, by {change:.0e} of the sizes of "
+            "the components: `find_invariants(vector_field, states, basis=1)` finds them."
+        ]
+
+    def _units(self) -> list[str]:
+        if self.choice is None or "metric=1.0" not in self.choice:
+            return []
+        return ["`metric=1.0` depends on the units of the state."]
+
+    def __str__(self) -> str:
+        lanes = self.doubt.shape[0]
+        head = ["error", "at the end"] if lanes == 1 else ["error", "worst", "worse"]
+        head += [f"drift of {name}" for name in self.rows[0].drift]
+        head += ["linear"] * (self.num_linear > 0) + ["steps", "time"]
+        width = max(len(row.name) for row in self.rows)
+        table = ["  ".join([" " * width, *(f"{x:>10}" for x in head)])]
+        for i, row in enumerate(self.rows):
+            cells = [f"{x:>{max(10, len(h))}}" for x, h in zip(self._cells(i), head, strict=True)]
+            table.append("  ".join([f"{row.name:{width}}", *cells]))
+        return "\n".join([*table, *self.notes, self.verdict])
+
+    def _cells(self, i: int) -> list[str]:
+        row, error, first = self.rows[i], self.error, self.error[0]
+        if error.shape[1] == 1:
+            found = [_number(error[i, 0]), _number(self.error_at_end[i, 0])]
+        else:
+            judged = self.last > 0
+            worse = np.mean(error[i, judged] > first[judged]) if judged.any() else np.nan
+            found = [
+                _number(_median(error[i])),
+                _number(_worst(error[i])),
+                f"{worse:.0%}" if i else "",
+            ]
+        found += [_number(_worst(x)) for x in row.drift.values()]
+        found += [_number(_worst(row.linear))] * (self.num_linear > 0)
+        return [*found, f"{np.median(row.steps):.0f}", _duration(row.seconds)]
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draws the error against time, in a batch its median over the lanes, and returns the axes.
+
+        At most six curves are drawn: that without projection, and the best others. It needs
+        matplotlib: `pip install 'diffrax-conserve[plots]'`.
+
+        **Arguments:**
+
+        - `ax`: the axes of matplotlib to draw in. Default: those of a new figure.
+        """
+        import matplotlib.pyplot as plt
+
+        if ax is None:
+            _, ax = plt.subplots(layout="constrained")
+        means = [_mean(np.maximum(x, _TINY)) for x in self.error]
+        shown = [0, *sorted(np.argsort(means[1:], kind="stable")[:5] + 1)]
+        for i in shown:
+            row = self.rows[i]
+            if not row.success.any():
+                continue
+            curve = np.median(row.errors[row.success], axis=0)
+            look = dict(linewidth=2.5) if i == self.index else dict(linewidth=1)
+            ax.semilogy(self.ts[1:], np.maximum(curve[1:], _TINY), label=row.name, **look)
+        doubt = np.median(self.doubt, axis=0)
+        ax.semilogy(self.ts[1:], np.maximum(doubt[1:], _TINY), "k:", linewidth=1, label="reference")
+        ax.set(xlabel="t", ylabel="relative error of the state")
+        ax.legend()
+        return ax
+
+
+def _so_far(row: ComparisonRow) -> np.ndarray:
+    """The largest error up to each time; infinite in lanes that failed."""
+    return np.where(row.success[:, None], _running(row.errors), np.inf)
+
+
+def _running(errors: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(errors, axis=1)
+
+
+def _mean(errors: np.ndarray) -> float:
+    """The geometric mean: infinite if one is, NaN if there is none."""
+    known = errors[~np.isnan(errors)]
+    return float(np.exp(np.mean(np.log(known)))) if known.size else np.nan
+
+
+def _chosen(error: np.ndarray) -> int | None:
+    """Of the rows that fail in the fewest lanes, and of which the geometric mean of the errors is
+    about the least, the first with a projection, if there is one without a risk."""
+    error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
+    failures = np.sum(np.isinf(error), axis=1)
+    able = np.flatnonzero(failures == failures.min())
+    common = np.isfinite(error[able]).all(axis=0)
+    if not common.any():
+        return None
+    means = {int(i): _mean(error[i, common]) for i in able}
+    near = [i for i, mean in means.items() if mean <= (1 + _EQUAL) * min(means.values())]
+    if 0 not in means:
+        return near[0]
+    better = [
+        i
+        for i in near
+        if means[i] < (1 - _EQUAL) * means[0]
+        or np.max(error[i, common] / error[0, common]) <= _RISK
+    ]
+    return next((i for i in better if i > 0), 0)
+
+
+def _compared(ratios: np.ndarray) -> str:
+    found = f"the error is {_mean(ratios):.2g} times that without projection"
+    if ratios.size == 1:
+        return found
+    found += (
+        f" in the geometric mean of {ratios.size} lanes, and {np.max(ratios):.2g} times at worst"
+    )
+    larger = int(np.sum(ratios > 1))
+    return found + f"; in {larger} of them it is larger" if larger else found
+
+
+def _median(x: np.ndarray) -> float:
+    known = x[~np.isnan(x)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _worst(x: np.ndarray) -> float:
+    known = x[~np.isnan(x)]
+    return float(np.max(known)) if known.size else np.nan
+
+
+def _number(x: float) -> str:
+    return "-" if np.isnan(x) else "failed" if np.isinf(x) else f"{x:.1e}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{1e6 * seconds:.3g} µs" if seconds < 1e-3 else f"{1e3 * seconds:.3g} ms"

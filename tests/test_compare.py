@@ -1,0 +1,357 @@
+"""The verdict for a projection: what it reports against independent truth, and what it says.
+
+Functions are given numbers by `args`, so that tests share what is compiled.
+"""
+
+import dataclasses
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+from diffrax_conserve._diagnostics.compared_solves import switched
+from diffrax_conserve._diagnostics.comparison import ComparisonReport, ComparisonRow
+from diffrax_conserve._diagnostics.linear_invariants import changes, linear_invariants
+from diffrax_conserve.reproduce import _verdict, main
+
+from .problems import KEPLER0, kepler, kepler_energy
+
+STEPS, DT = 600, 0.25
+Y0 = np.array([0.3, 0.2, 0.1, -0.4])  # two positions, two velocities
+
+
+def henon_heiles(t, y, args):
+    """Two oscillators, coupled by `args[0]`."""
+    (x, z, u, v), c = y, args[0]
+    return jnp.stack([u, v, -x - 2 * c * x * z, -z - c * (x**2 - z**2)])
+
+
+def energy(t, y, args):
+    """It is conserved if `args[1]` is one."""
+    (x, z, u, v), c = y, args[0]
+    return (u**2 + v**2) / 2 * args[1] + (x**2 + z**2) / 2 + c * (x**2 * z - z**3 / 3)
+
+
+def compared(coupling, factor, capsys, y0=Y0, dt0=DT):
+    report = dfc.compare(
+        henon_heiles, dfc.RK4(), dfc.FirstIntegral(energy), jnp.asarray(y0), t1=STEPS * dt0,
+        dt0=dt0, args=jnp.array([coupling, factor]),
+    )  # fmt: skip
+    assert capsys.readouterr().out == f"{report}\n"
+    return report
+
+
+def rk4_of_an_oscillator():
+    """Its steps are powers of the Taylor polynomial of a rotation."""
+    a = DT * np.array([[0, 1], [-1, 0]])
+    step = np.eye(2) + a + a @ a / 2 + a @ a @ a / 6 + a @ a @ a @ a / 24
+    start = Y0.reshape(2, 2)
+    return np.stack([np.linalg.matrix_power(step, n) @ start for n in range(STEPS + 1)])
+
+
+def test_errors_and_drifts_are_those_of_the_closed_form(capsys):
+    """RK4 on an oscillator loses amplitude and phase; with the energy kept only the phase."""
+    report = compared(0.0, 1.0, capsys)
+    ys, t = rk4_of_an_oscillator(), DT * np.arange(STEPS + 1)
+    rotations = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]]).transpose(2, 0, 1)
+    exact = rotations @ Y0.reshape(2, 2)
+    shown = np.arange(0, STEPS + 1, STEPS // 100)
+    np.testing.assert_allclose(report.ts, t[shown])
+
+    def errors(ys):
+        return np.max(np.abs(ys - exact), axis=(1, 2))[shown] / np.max(np.abs(exact[shown]))
+
+    plain, kept, euclidean = report.rows
+    np.testing.assert_allclose(plain.errors[0], errors(ys), rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(report.error[0], np.max(errors(ys)), rtol=1e-6)
+    np.testing.assert_allclose(report.error_at_end[0], errors(ys)[-1], rtol=1e-6)
+    square = np.sum(ys**2, axis=(1, 2))
+    drift = np.max(np.abs(square[shown] / square[0] - 1)) / 3
+    np.testing.assert_allclose(plain.drift["manifold"], drift, rtol=1e-9)
+    assert kept.drift["manifold"] < 1e-15
+    # In the Euclidean metric the projection is a division by the norm.
+    scaled = ys * np.sqrt(square[0] / square)[:, None, None]
+    np.testing.assert_allclose(euclidean.errors[0], errors(scaled), rtol=1e-6, atol=1e-10)
+    assert report.choice in ("all kept", "all kept, metric=1.0")
+    assert report.verdict.startswith(f"Take `{report.choice}`: the error is 0.")
+    assert np.all(plain.steps == STEPS)
+
+
+def test_that_a_projection_hurts_is_told(capsys):
+    report = compared(0.0, 1.3, capsys)
+    assert report.choice == "nothing kept"
+    assert report.verdict.startswith("Do not project: with `all kept")
+    assert isinstance(report.solver, dfc.RK4)
+
+
+def test_chaos_is_told(capsys):
+    """At an energy of 1/7 nearly all orbits are chaotic, and separate by a factor of e in a time of
+    about ten."""
+    start = np.array([0.0, 0.1, 0.5, np.sqrt(2 / 7 - 0.25 - 0.01 + 2e-3 / 3)])
+    report = compared(1.0, 1.0, capsys, start, 0.5)
+    assert report.last[0] < len(report.ts) - 1
+    assert "as in chaos" in " ".join([*report.notes, report.verdict])
+
+
+def angular_momentum(t, y, args):
+    q, p = y
+    return q[0] * p[1] - q[1] * p[0]
+
+
+KEPLER = {
+    "energy": dfc.FirstIntegral(kepler_energy),
+    "momentum": dfc.FirstIntegral(angular_momentum),
+}
+
+
+def error_at_end(y, ts, y0):
+    """Against Kepler's equation, which does not share the reference of `compare`."""
+    exact = dfc.systems.Kepler().reference(ts, y0)
+    errors = [
+        jnp.max(jnp.abs(a[-1] - b[-1])) / jnp.max(jnp.abs(b)) for a, b in zip(y, exact, strict=True)
+    ]
+    return float(jnp.max(jnp.stack(errors)))
+
+
+def test_errors_of_a_batch_are_those_of_the_solver_that_it_hands_out():
+    """The programs differ: an entry that is left out is zero where many lists share one."""
+    starts = jax.tree.map(lambda x: jnp.stack([x, 1.02 * x]), KEPLER0)
+    report = dfc.compare(kepler, dfc.RK4(), KEPLER, starts, t1=9.95, dt0=0.1, batch=True)
+    names = [row.name for row in report.rows]
+    assert names[0] == "nothing kept"
+    assert names[1::2] == ["all kept", "all but energy", "all but momentum"]
+    assert "2 lanes" in report.verdict
+    assert report.ts[-1] == 9.95
+    row = report.rows[names.index("all but energy, metric=1.0")]
+    assert row.kept == ("momentum",)
+    assert np.all(row.drift["momentum"] < 1e-14)
+    assert np.all(row.drift["energy"] > 1e-9)
+    y0 = jax.tree.map(lambda x: x[1], starts)
+    sol = dfx.diffeqsolve(dfx.ODETerm(kepler), row.solver, 0.0, 9.95, 0.1, y0)
+    found = error_at_end(sol.ys, report.ts, y0)
+    np.testing.assert_allclose(row.errors[1, -1], found, rtol=1e-6)
+    assert row.steps[1] == sol.stats["num_steps"] == 100
+
+
+@pytest.mark.slow
+def test_adaptive_steps_and_a_balance():
+    """A pendulum with friction, of which the energy is kept with its rate."""
+    balance = dfc.FirstIntegral(
+        lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]), rate=lambda t, y, args: -0.1 * y[1] ** 2
+    )
+    report = dfc.compare(
+        lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0]) - 0.1 * y[1]]), dfx.Tsit5(), balance,
+        jnp.array([2.0, 0.0]), t1=20.0, rtol=1e-5, atol=1e-5,
+    )  # fmt: skip
+    plain, kept, _ = report.rows
+    assert kept.drift["manifold"] < 1e-13 < 1e-8 < plain.drift["manifold"]
+    assert report.last[0] == len(report.ts) - 1 == 100
+    assert report.index is not None
+
+
+# ---- Parts, without a solve ----
+
+
+def report_of(*errors, doubt=1e-13, lanes=1):
+    """A report of errors that are given at five times after the start."""
+    rows = []
+    for i, error in enumerate(errors):
+        curve = np.broadcast_to(np.array(error, float), (lanes, 5))
+        curve = np.concatenate([np.zeros((lanes, 1)), curve], axis=1)
+        row = ComparisonRow(
+            name="nothing kept" if i == 0 else f"choice {i}", kept=("x",) * (i > 0),
+            solver=dfx.Tsit5(), errors=curve, success=np.isfinite(curve).all(axis=1),
+            message="it failed", drift={"x": np.full(lanes, 1e-3)}, linear=np.zeros(lanes),
+            steps=np.full(lanes, 7), seconds=1e-4,
+        )  # fmt: skip
+        rows.append(row)
+    doubts = np.broadcast_to(np.append(0.0, np.broadcast_to(doubt, 5)), (lanes, 6))
+    return ComparisonReport(tuple(rows), np.arange(6.0), doubts, 0)
+
+
+@pytest.mark.parametrize(
+    ("errors", "doubt", "choice", "words"),
+    [
+        ((1e-3, 1e-4, 1e-5), 1e-9, "choice 2", ("0.01 times",)),
+        ((1e-3, 2e-3, 1.5e-3), 1e-9, "nothing kept", ("Do not project", "choice 2", "1.5 times")),
+        ((1e-3, 1.08e-3), 1e-9, "choice 1", ("1.1 times", "Take")),
+        ((np.nan, 1e-3), 1e-9, "choice 1", ("without projection the solve fails",)),
+        ((1e-3, np.nan), 1e-9, "nothing kept", ("every projection fails.",)),
+        ((np.nan, np.nan), 1e-9, None, ("Take shorter steps", "it failed")),
+        ((1e-3, 1e-4), 1e-4, None, ("cannot be trusted", "shorter interval")),
+        ((1e-3, 1e-4), np.nan, None, ("reference failed", "Kvaerno5")),
+        ((0.9, 0.8), 1e-9, None, ("as large as the state",)),
+    ],
+)
+def test_what_is_said(errors, doubt, choice, words):
+    report = report_of(*errors, doubt=doubt)
+    assert report.choice == choice
+    assert [word for word in words if word not in report.verdict] == []
+    assert report.verdict in str(report)
+    assert report.solver is not None
+
+
+def test_errors_are_judged_up_to_where_the_reference_is_trusted():
+    growing = 10.0 ** np.arange(-7, -2)
+    report = report_of(growing, growing / 10, doubt=np.array([0, 0, 0, 1e-3, 1e-2]))
+    assert list(report.last) == [3]
+    np.testing.assert_allclose(report.error[:, 0], [1e-5, 1e-6])
+    assert any("t = 3" in note and "trusted" in note for note in report.notes)
+    lost = report_of((1e-2, 0.1, 0.6, 0.9, 1), (1e-3, 1e-2, 0.5, 1, 1))
+    assert list(lost.last) == [2]
+    assert any("as large as the state, as in chaos" in note for note in lost.notes)
+
+
+def test_a_failure_in_one_lane_counts():
+    report = report_of(1e-3, 1e-4, lanes=3)
+    bad = dataclasses.replace(report.rows[1], success=np.array([True, False, True]))
+    report = dataclasses.replace(report, rows=(report.rows[0], bad))
+    assert report.choice == "nothing kept"
+    assert "`choice 1` fails in 1 of 3 lanes: it failed." in report.notes
+
+
+def test_of_equal_means_the_one_without_risk_is_taken():
+    report = report_of(1e-3, 1e-3, 1e-3, lanes=2)
+    plain, first, second = report.rows
+    risky = first.errors * np.array([[0.5], [1.9]])
+    rows = plain, dataclasses.replace(first, errors=risky), second
+    assert dataclasses.replace(report, rows=rows).choice == "choice 2"
+    report = dataclasses.replace(report, rows=rows[:2])
+    assert report.choice == "nothing kept"
+    assert "1.9 times at worst; in 1 of them it is larger" in report.verdict
+
+
+def test_the_picture_has_a_curve_for_each_and_the_choice_is_bold():
+    pytest.importorskip("matplotlib").use("Agg")
+    ax = report_of(1e-3, 1e-4, 1e-5).plot()
+    widths = {line.get_label(): line.get_linewidth() for line in ax.lines}
+    assert list(widths) == ["nothing kept", "choice 1", "choice 2", "reference"]
+    assert widths["choice 2"] > widths["choice 1"]
+
+
+MASSES = np.array([1.0, 3.0, 1e3])
+
+
+def springs(t, y, args):
+    """Three bodies on a line, with unequal springs."""
+    q, v = y
+    force = 5 * (q[1] - q[0]) ** 3, 2 * jnp.sin(q[2] - q[1])
+    return v, jnp.stack([force[0], force[1] - force[0], -force[1]]) / MASSES
+
+
+def test_linear_invariants_that_nobody_declared_are_found():
+    rng = np.random.default_rng(0)
+    ys = tuple(rng.normal(size=(2, 4, 3)) for _ in range(2))
+    sizes = tuple(np.abs(y).max(axis=(0, 1)) for y in ys)
+    momentum = dfc.FirstIntegral(lambda t, y, args: jnp.sum(MASSES * y[1]))
+    power = dfc.FirstIntegral(lambda t, y, args: jnp.sum(MASSES * y[1] ** 2))
+    ts = jnp.arange(4.0)
+    found = linear_invariants(springs, ts, ys, sizes, None, {"power": power})
+    expected = np.concatenate([np.zeros(3), MASSES * sizes[1]])
+    np.testing.assert_allclose(np.abs(found[0]), expected / np.linalg.norm(expected), atol=1e-8)
+    assert len(found) == 1
+    assert len(linear_invariants(springs, ts, ys, sizes, None, {"p": momentum, "e": power})) == 0
+    still = tuple(np.repeat(y[:, :1], 4, axis=1) for y in ys)
+    np.testing.assert_allclose(changes(found, still, sizes), 0)
+    still[1][0, 2, 1] += sizes[1][1]  # one velocity of one lane changes by its size
+    np.testing.assert_allclose(changes(found, still, sizes), [abs(found[0, 4]), 0], atol=1e-12)
+
+
+def test_an_entry_that_is_left_out_is_zero():
+    entry = dfc.FirstIntegral(
+        lambda t, y, args: {"a": y**2}, value={"a": 4.0}, rate=lambda t, y, args: {"a": y}
+    )
+    on, off = switched(entry, kept=True), switched(entry, kept=False)
+    y = jnp.array(3.0)
+    assert on.fn(0.0, y, None)["a"] == 9
+    assert off.fn(0.0, y, None)["a"] == off.value["a"] == off.rate(0.0, y, None)["a"] == 0
+    assert on.rate(0.0, y, None)["a"] == 3
+    assert isinstance(switched(dfc.Constraint(entry.fn), kept=True), dfc.Constraint)
+
+
+KEPT = dfc.FirstIntegral(energy)
+PROJECTED = dfc.ManifoldProjection(dfc.RK4(), KEPT)
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "error", "words"),
+    [
+        ({}, {"rtol": 1e-6, "atol": 1e-6}, ValueError, ("dt0", "rtol", "both")),
+        ({}, {"dt0": None}, ValueError, ("dt0", "neither")),
+        ({}, {"dt0": None, "rtol": 1e-6}, ValueError, ("`atol` is missing",)),
+        ({}, {"dt0": -0.1}, ValueError, ("dt0", "positive")),
+        ({}, {"t1": -1.0}, ValueError, ("`t1` is -1.0", "it must be")),
+        ({}, {"max_steps": 0}, ValueError, ("max_steps",)),
+        ({"y0": {"a": Y0, "b": Y0[:2]}}, {"batch": True}, ValueError, ("leading axis",)),
+        ({}, {"reference": "Dopri8"}, TypeError, ("reference", "diffrax.Dopri8()")),
+        (
+            {},
+            {"projection": dfc.Directional(), "metric": 2.0},
+            ValueError,
+            ("Directional", "no metric"),
+        ),
+        ({"solver": PROJECTED}, {}, ValueError, ("solver.solver",)),
+        ({"solver": dfx.Tsit5}, {}, TypeError, ("diffrax.Tsit5()",)),
+        ({"manifold": energy}, {}, TypeError, ("FirstIntegral(fn)",)),
+        ({"manifold": {}}, {}, ValueError, ("nothing to conserve",)),
+        ({"y0": np.array([1, 0])}, {}, TypeError, ("floating-point", "dtype=float")),
+        ({"field": lambda y: y}, {}, TypeError, ("vector_field(t, y, args)",)),
+        ({"field": lambda t, y, args: y[:1]}, {}, ValueError, ("`vector_field` returns",)),
+    ],
+)
+def test_what_is_refused(given, options, error, words):
+    known = {"field": henon_heiles, "solver": dfc.RK4(), "manifold": KEPT, "y0": Y0}
+    field, solver, manifold, y0 = (known | given).values()
+    with pytest.raises(error) as raised:
+        dfc.compare(
+            field, solver, manifold, y0, **{"t1": 1.0, "dt0": 0.1, "args": (1.0, 1.0)} | options
+        )
+    message = "\n".join([str(raised.value), *getattr(raised.value, "__notes__", [])])
+    assert [word for word in words if word not in message] == []
+
+
+def test_float64_is_asked_for(monkeypatch):
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(RuntimeError, match="jax_enable_x64"):
+            dfc.compare(henon_heiles, dfc.RK4(), KEPT, jnp.ones(4), t1=1.0, dt0=0.1)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("kepler --tol 1e-6 --dt 0.1", ("--tol", "--dt", "one of them")),
+        ("kepler --starts 0", ("--starts", "positive")),
+        ("kepler --t1=-2", ("--t1", "positive")),
+        ("robertson --dt 0.1", ("stiff", "--tol")),
+    ],
+)
+def test_what_the_command_refuses(arguments, words, capsys):
+    with pytest.raises(SystemExit) as exit:
+        main(["compare", *arguments.split()])
+    assert exit.value.code == 2
+    message = capsys.readouterr().err
+    assert [word for word in words if word not in message] == []
+
+
+def test_the_command_passes_on_what_it_is_given_and_draws(monkeypatch, tmp_path):
+    given = {}
+
+    def remember(field, solver, manifold, y0, **options):
+        given.update(options, solver=solver, y0=y0)
+        return report_of(1e-3, 1e-4)
+
+    monkeypatch.setattr(_verdict, "compare", remember)
+    assert main(["compare", "pollu", "--starts", "3", "--seed", "1", "--tol", "1e-5"]) == 0
+    assert isinstance(given["solver"], dfx.Kvaerno5)
+    assert given["y0"].shape == (3, 20)
+    assert (given["rtol"], given["atol"], given["t1"]) == (1e-5, 1e-9, dfc.systems.Pollu.t1)
+    assert given["projection"] is not None
+    assert main(["compare", "kepler", "--t1", "3", "--out", str(tmp_path)]) == 0
+    assert {file.name for file in tmp_path.iterdir()} == {"verdict.png", "verdict.pdf"}
+    assert (given["t1"], given["dt0"], given["batch"]) == (3.0, dfc.systems.Kepler.dt, False)
