@@ -23,10 +23,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ._constants import MAX_STEPS
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import has_bounds
 from ._projection.within_bounds import AbstractNewton, nearest_within
-from ._step.constants import MAX_STEPS
 from ._step.equations import length
 from ._step.iterate import any_lane, damped
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents

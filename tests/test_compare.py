@@ -289,9 +289,9 @@ PROJECTED = dfc.ManifoldProjection(dfc.RK4(), KEPT)
         ({}, {"reference": "Dopri8"}, TypeError, ("reference", "diffrax.Dopri8()")),
         (
             {},
-            {"projection": dfc.Directional(), "metric": 2.0},
+            {"projection": dfc.AlongLine(direction="error"), "metric": 2.0},
             ValueError,
-            ("Directional", "no metric"),
+            ("AlongLine", "no metric"),
         ),
         ({"solver": PROJECTED}, {}, ValueError, ("solver.solver",)),
         ({"solver": dfx.Tsit5}, {}, TypeError, ("diffrax.Tsit5()",)),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._constants import OPERATIONS
 from diffrax_conserve._fast.jaxprs import jaxprs_inside
 from diffrax_conserve._fast.scalars import components, in_scalars, written_out
-from diffrax_conserve._step.constants import OPERATIONS
 
 from .thinned import some_of
 

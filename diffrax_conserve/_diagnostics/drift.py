@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool
 
 from .._balance import has_rates, integrated_rates
+from .._constants import ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     check_manifold,
@@ -21,7 +22,6 @@ from .._manifold import (
     named_entries,
 )
 from .._options import check_solution
-from .._step.constants import ROUNDOFF
 from .._step.equations import measure, relative, shown_terms
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_add, tree_shapes, tree_sub

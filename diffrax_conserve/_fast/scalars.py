@@ -30,7 +30,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._step.constants import OPERATIONS
+from .._constants import OPERATIONS
 from .jaxprs import closed_jaxpr, outputs, walk
 
 # An array as a tuple of its elements.

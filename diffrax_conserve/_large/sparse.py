@@ -31,8 +31,8 @@ import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
 
+from .._constants import ADDED_POWER, FEW, LEAST_SPARSE
 from .._fast.jaxprs import jaxprs_inside
-from .._step.constants import ADDED_POWER, FEW, LEAST_SPARSE
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30

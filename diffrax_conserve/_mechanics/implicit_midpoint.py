@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 
+from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import option
-from .._step.constants import MAX_STEPS, ROUNDOFF
 from .._tree import tree_stop_gradient
 
 

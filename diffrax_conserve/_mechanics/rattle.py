@@ -19,6 +19,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
+from .._constants import MAX_STEPS, WRITTEN_OUT
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._interpolation import PackedTarget
 from .._large.sparse import BlockGram, SparseRows
@@ -30,7 +31,6 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._step.constants import MAX_STEPS, WRITTEN_OUT
 from .._step.equations import Equations, Jacobian, length, shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done

@@ -10,6 +10,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .._constants import MAX_STEPS, NOISE, ROUNDOFF, WRITTEN_OUT
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import PackedTarget
 from .._manifold import check_manifold, conserved_values, named_entries, rate_of
@@ -20,7 +21,6 @@ from .._solver.diffrax_private import member
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
-from .._step.constants import MAX_STEPS, NOISE, ROUNDOFF, WRITTEN_OUT
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
 from .._step.implicit import known_if, root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done

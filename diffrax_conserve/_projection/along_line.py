@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._step.constants import MAX_STEPS
+from .._constants import MAX_STEPS
 from .._step.implicit import Along, solution
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .options import check_options, option

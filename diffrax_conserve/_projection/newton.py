@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._step.constants import MAX_STEPS, NEAREST
+from .._constants import MAX_STEPS, NEAREST
 from .._step.equations import Equations, measured
 from .._step.implicit import AbstractSystem, known_if, solution, well_conditioned
 from .._step.iterate import Solved, damped

@@ -7,7 +7,7 @@ from typing import final
 
 from jaxtyping import Array, Float
 
-from .._step.constants import MAX_STEPS
+from .._constants import MAX_STEPS
 from .._step.implicit import Along, solution
 from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS, option

@@ -20,8 +20,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .._constants import AT_BOUND
 from .._printing import is_traced
-from .._step.constants import AT_BOUND
 from .._step.equations import Equations
 from .._step.implicit import Along, solution
 from .._step.iterate import Solved, bounded

@@ -14,12 +14,12 @@ import jax.scipy as jsp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from .._constants import ROUNDOFF, SHORTER
 from .._custom_types import Args, RealScalarLike, State, Values, Y
 from .._manifold import Constraint, exactly, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
 from .._projection.options import check_state
-from .._step.constants import ROUNDOFF, SHORTER
 from .._step.equations import shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_step, any_lane, iterate, keep_done

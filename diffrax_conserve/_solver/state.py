@@ -16,12 +16,12 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._constants import ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
-from .._step.constants import ROUNDOFF
 from .._step.equations import Equations, length, reach, shown_terms
 from .._step.metric import Units
 from .._step.roundoff import hidden_scale

@@ -26,11 +26,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, SparseRows, pattern_of
 from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
-from .constants import NOISE, ROUNDOFF
 from .metric import MatrixUnits, Units
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are

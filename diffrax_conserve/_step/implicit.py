@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
+from .._constants import ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import SparseRows
 from .._tree import tree_tangents, unflatten, without_pattern
-from .constants import ROUNDOFF, WRITTEN_OUT
 from .equations import Equations, Jacobian, measured
 from .iterate import Solved, nearby
 from .linear import combined, corrected, gram_matrix, pivots, scaled_rows, solve, times

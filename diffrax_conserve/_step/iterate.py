@@ -30,9 +30,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
+from .._constants import AT_BOUND, FROZEN_STEPS, SHORTER, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
-from .constants import AT_BOUND, FROZEN_STEPS, SHORTER, WRITTEN_OUT
 from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
 from .linear import combined, corrected, factored, gram_matrix, scaled_rows, solve
 

@@ -24,8 +24,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
-from .constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
 

@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._constants import LEAST_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import SparseRows, pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
-from .constants import LEAST_SPARSE
 from .equations import Jacobian, functions_of, shown_terms
 
 # The primitives of JAX that are sums, and sums of products.

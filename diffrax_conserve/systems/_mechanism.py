@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
+from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._projection.closed_form import ClosedForm
-from .._step.constants import MAX_STEPS, ROUNDOFF
 from .._step.equations import OFF, SETTLED
 from .._step.implicit import root
 from .._step.iterate import after_test, iterate, keep_done

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._balance import refuse_rates
+from ..._constants import MAX_STEPS
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._options import check_counts
-from ..._step.constants import MAX_STEPS
 from ..._step.equations import Equations, equations_of
 from ..._step.implicit import Along, solution
 from ..._step.iterate import damped_along
