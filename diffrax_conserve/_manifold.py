@@ -57,9 +57,9 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
     be differentiated) that returns a PyTree of real arrays. Every element is one first integral. It
     is differentiated in reverse mode, in which JAX has no `while_loop`.
 - `value`: the value of `fn` at the start of a solve. Default: that of the initial state. A state
-    that has another one is moved there by the first projection of the solve, with the smallest
-    relative change of its components unless the projection has a `metric`. To choose where it
-    lands, start from `diffrax_conserve.project(manifold, y0, projection=...)`.
+    that has another one is moved there by the first projection of the solve, in the metric of the
+    steps: at a turning point it changes what has moved. To choose where it lands, start from
+    `diffrax_conserve.project(manifold, y0, projection=...)`.
 - `rate`: a callable `rate(t, y, args)` that returns $dI/dt = \partial_t I + \nabla I \cdot f$ along
     the exact solution, like what `fn` returns. Default: zero.
 """
@@ -178,7 +178,8 @@ def check_manifold(manifold: Manifold) -> None:
     if not entries:
         raise ValueError(
             f"`manifold` is {manifold!r}: there is nothing to conserve. Give a `FirstIntegral` or "
-            "`Constraint`, or use the solver without projection."
+            "`Constraint`; bounds for `()`, as `projection=SimplifiedNewton(lower=0)`; or use the "
+            "solver without projection."
         )
     for name, entry in entries:
         if not is_entry(entry):

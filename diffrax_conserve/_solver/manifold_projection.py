@@ -36,6 +36,16 @@ from .terms import check_direction, check_nested, innermost, is_backsolve, is_od
 from .wrapper import ForwardingSolver
 
 
+def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
+    """A constraint that every state satisfies."""
+    return jnp.zeros(())
+
+
+def _or_nothing(manifold: Manifold) -> Manifold:
+    """The manifold; if it is empty, because bounds alone are kept, that of all states."""
+    return manifold if named_entries(manifold) else Constraint(_nothing)
+
+
 @final
 class ManifoldProjection(ForwardingSolver):
     r"""Projects every step of another solver to a manifold.
@@ -71,9 +81,9 @@ class ManifoldProjection(ForwardingSolver):
     projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
     the next step is evaluated again at the projected state; implicit methods keep it.
 
-    Success means that each residual is within 16 units of roundoff of $|I_0| + \sum_k |y_k
-    \partial_k I|$ and the terms that cancel inside `fn`, such as the 1 of `1 - cos(q)`, unless the
-    projection has other tolerances.
+    Success means that each residual is within 16 units of roundoff of
+    $|I_0| + \sum_k (|y_k| + s_k) |\partial_k I|$ and the terms that cancel inside `fn`, such as the
+    1 of `1 - cos(q)`, unless the projection has other tolerances.
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
@@ -105,7 +115,7 @@ class ManifoldProjection(ForwardingSolver):
     """
 
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
-    manifold: Manifold
+    manifold: Manifold = eqx.field(converter=_or_nothing)
     projection: AbstractProjection = option(SimplifiedNewton())
     max_correction: RealScalarLike | None = option(None)
     every: int = option(1, static=True)
@@ -118,8 +128,9 @@ class ManifoldProjection(ForwardingSolver):
                 "`diffrax.Tsit5()`, or of a network its solver, such as `DeepONetSolver(network)`."
             )
         check_nested(self.solver)
-        check_manifold(self.manifold)
         check_projection(self.projection)
+        free = isinstance(self.manifold, Constraint) and self.manifold.fn is _nothing
+        check_manifold(() if free and not has_bounds(self.projection) else self.manifold)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
         check_counts(every=self.every)
@@ -282,7 +293,8 @@ class ManifoldProjection(ForwardingSolver):
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 
 - `solver`: the solver to wrap, any `diffrax.AbstractSolver`.
-- `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s.
+- `manifold`: a PyTree (one, a tuple, a list, a dictionary) of `FirstIntegral`s and `Constraint`s;
+    `()` if only the bounds of the projection are kept.
 - `projection`: a `SimplifiedNewton`, `Newton`, `AlongLine`, `ClosedForm`, `Staged`, or your own.
 - `max_correction`: a projection fails if its correction is longer than this share of its step, both
     in the metric of the projection. A component that hardly moves counts as moving by

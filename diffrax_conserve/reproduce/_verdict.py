@@ -8,7 +8,7 @@ import jax
 import jax.random as jr
 
 from .._diagnostics.compare import compare
-from .._solver.rk4 import RK4
+from .._solver.unrolled import RK4
 from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
 from ..systems._chemistry import AbstractChemistry

@@ -4,6 +4,7 @@ What is exact is computed here in numpy, by Kepler's equation or in closed form.
 """
 
 import functools
+from types import SimpleNamespace
 
 import diffrax as dfx
 import jax
@@ -13,6 +14,8 @@ import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._solver.state import State
+from diffrax_conserve._tree import ravel
 
 from ..problems import RIGID_BODY, rigid_body
 from ..thinned import some_of
@@ -238,3 +241,21 @@ def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype)
     assert max(np.max(np.abs(x)) for x in jax.tree.leaves(drift)) < 100 * eps
     plain, projected = (np.max(np.abs(x - exact) / np.max(np.abs(exact), axis=0)) for x in found)
     assert projected <= max(plain, 100 * eps)
+
+
+def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another():
+    """By the sizes and the changes of a step: `sqrt(4 · 1)` and `sqrt(2 · 0.02)`."""
+    place, speed = jnp.array([[0.0, 4.0], [3.0, 0.0]]), jnp.array([2.0, 0.0])
+    moved = (place - jnp.array([[1.0, 0.0], [0.0, 0.0]]), speed - jnp.array([0.02, 0.0]))
+
+    def units(start, end):
+        zero = jax.tree.map(jnp.zeros_like, start)
+        state = SimpleNamespace(motion=ravel(zero))
+        return State.motion_after(state, jnp.abs(ravel(end) - ravel(start)), end)
+
+    eps = np.finfo(float).eps
+    of_leaves = units(moved, (place, speed))
+    np.testing.assert_allclose(of_leaves, [2, 2, *[3 * eps**0.5] * 2, 0.2, 0.2])
+    of_array = units(ravel(moved), ravel((place, speed)))
+    np.testing.assert_allclose(of_array[[1, 2, 4]], [4 * eps**0.5, 3 * eps**0.5, 0.2])
+    assert of_array[5] == 0

@@ -197,3 +197,18 @@ def test_saved_states_are_within_the_bounds_and_one_that_cannot_be_projected_is_
     wrong = jnp.abs(jnp.sum(ys, axis=1) - wanted(ts, jnp.array(False))) > 1e-6
     assert jnp.any(wrong)
     assert jnp.array_equal(wrong, off)
+
+
+def test_bounds_may_be_kept_alone():
+    """Euler's method overshoots zero; what is not beyond a bound is the solver's own."""
+    field = lambda t, y, args: jnp.stack([-30 * y[0], 30 * y[0] - y[1]])  # noqa: E731
+
+    def end(solver, dt0):
+        saveat = dfx.SaveAt(ts=jnp.linspace(0, 1, 21))
+        return one_solve(field, solver, jnp.array([1.0, 0.0]), dt0=dt0, saveat=saveat).ys
+
+    kept = dfc.ManifoldProjection(dfx.Euler(), (), projection=dfc.SimplifiedNewton(lower=0.0))
+    assert jnp.min(end(kept, 0.05)) == 0
+    np.testing.assert_array_equal(end(kept, 0.02), end(dfx.Euler(), 0.02))
+    with pytest.raises(ValueError, match=r"nothing to conserve.*lower"):
+        dfc.ManifoldProjection(dfx.Euler(), ())
