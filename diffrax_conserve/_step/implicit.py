@@ -71,11 +71,16 @@ class Along(AbstractSystem):
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
     The unknowns are `y` and `λ`, and the equations `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
+
+    The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
+    times a tangent that is not finite would be NaN. So where nothing was found we differentiate at
+    the `fallback`, by default the candidate, where the functions should be finite.
     """
 
     equations: Equations
     candidate: Float[Array, " n"]
     directions: Jacobian | None = None
+    fallback: Float[Array, " n"] | None = eqx.field(default=None, kw_only=True)
     iteration: Callable[..., Solved] = eqx.field(default=nearby, static=True, kw_only=True)
     max_steps: int = eqx.field(static=True, kw_only=True)
 
@@ -83,32 +88,35 @@ class Along(AbstractSystem):
         given = self.equations, self.candidate, self.directions
         return self.iteration(*given, max_steps=self.max_steps)
 
-    def _along(self) -> Jacobian:
+    def _start(self, ok: Array) -> Float[Array, " n"]:
+        """The candidate, or the fallback if nothing was found."""
+        if self.fallback is None:
+            return self.candidate
+        return jnp.where(ok, self.candidate, self.fallback)
+
+    def _along(self, start: Array) -> Jacobian:
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
-        return self.equations.in_units(self.equations.linearise(self.candidate)[1])
+        return self.equations.in_units(self.equations.linearise(start)[1])
 
-    def _state(self, solved: Solved) -> Float[Array, " n"]:
-        """The result of a failed projection is discarded. In reverse mode its cotangent is zero,
-        but zero times a tangent that is not finite would be NaN. So we differentiate at the
-        candidate there."""
-        return jnp.where(solved.ok, solved.y, self.candidate)
+    def unknowns(self, solved: Solved) -> tuple[Array, Array]:
+        """Whether a state was found, and the multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, from
+        which the state follows."""
+        start = self._start(solved.ok)
+        sizes, rows = scaled_rows(self._along(start))
+        change = measured(jnp.where(solved.ok, solved.y, start) - start, self.equations.units)
+        return solved.ok, solve(gram_matrix(rows, rows), times(rows, change)) / sizes
 
-    def unknowns(self, solved: Solved) -> Array:
-        """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`; the state follows from them."""
-        sizes, rows = scaled_rows(self._along())
-        change = measured(self._state(solved) - self.candidate, self.equations.units)
-        return solve(gram_matrix(rows, rows), times(rows, change)) / sizes
-
-    def defect(self, unknowns: Array) -> tuple[Array, Array]:
-        multiplier = unknowns
+    def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
+        ok, multiplier = unknowns
+        start = self._start(ok)
         if self.directions is not None:
             change = combined(multiplier, self.directions)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
-            _, vjp = jax.vjp(self.equations.residual, self.candidate)
+            _, vjp = jax.vjp(self.equations.residual, start)
             change = self.equations.in_units(vjp(multiplier)[0])
-        end = self.candidate + self.equations.change(change)
+        end = start + self.equations.change(change)
         # The second equation at the end of the correction, so that its tangent contains the first.
         return end, self.equations.residual(end)
 
@@ -116,9 +124,10 @@ class Along(AbstractSystem):
         """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
         t_y, t_g = (-x for x in right)
-        equations, y = self.equations, self._state(solved)
+        equations, start = self.equations, self._start(solved.ok)
+        y = jnp.where(solved.ok, solved.y, start)
         heights, rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))
-        along = scaled_rows(self._along())[1]
+        along = scaled_rows(self._along(start))[1]
         t_y = t_y - equations.change(corrected(rows, along, t_g / heights))
         # `more` tells whether the state is of the form above.
         is_known = solved.more & well_conditioned(equations, y, rows, along)

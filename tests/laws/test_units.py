@@ -257,5 +257,5 @@ def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another(
     of_leaves = units(moved, (place, speed))
     np.testing.assert_allclose(of_leaves, [2, 2, *[3 * eps**0.5] * 2, 0.2, 0.2])
     of_array = units(ravel(moved), ravel((place, speed)))
-    np.testing.assert_allclose(of_array[[1, 2, 4]], [4 * eps**0.5, 3 * eps**0.5, 0.2])
+    np.testing.assert_allclose(of_array[np.array([1, 2, 4])], [4 * eps**0.5, 3 * eps**0.5, 0.2])
     assert of_array[5] == 0

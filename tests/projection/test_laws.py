@@ -96,27 +96,6 @@ def test_linear_constraints_agree_with_weighted_least_squares(y, matrix, b, weig
         np.testing.assert_allclose(projected, expected, rtol=0, atol=1e-9)
 
 
-def test_what_was_projected_to_zero_can_be_projected_again():
-    """Three constraints determine three numbers, all zero, so that no term is left. Where the
-    matrix is nearly singular the first projection may fail; nothing is lost by a second."""
-    rng = np.random.default_rng(0)
-    rows = range(3)
-
-    def row(i):
-        return dfc.Constraint(lambda t, y, matrix: sum(matrix[i, k] * y[k] for k in rows))
-
-    def twice(y, matrix):
-        y, first = dfc.project(manifold, y, args=matrix, projection=dfc.SimplifiedNewton())
-        _, second = dfc.project(manifold, y, args=matrix, projection=dfc.SimplifiedNewton())
-        return first.ok, second.ok
-
-    manifold = tuple(map(row, rows))
-    ys, matrices = rng.normal(size=(300, 3)), rng.normal(size=(300, 3, 3))
-    first, second = jax.jit(jax.vmap(twice))(ys, matrices)
-    assert np.mean(first) > 0.95
-    assert np.all(second[first])
-
-
 @given(y=near, weights=vectors(3, 2.0))
 def test_newton_finds_the_nearest_point(y, weights):
     """On a curve: the weighted correction is orthogonal to the tangent, and no point found by

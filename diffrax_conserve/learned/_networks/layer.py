@@ -1,6 +1,6 @@
 """The conservative layer: a projection to the manifold, as the last layer of a network."""
 
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -77,8 +77,10 @@ class ConservativeLayer(eqx.Module):
         `steps` the move of an iteration is at most the norm of `scale`."""
         equations, vector = self.equations(candidate, t, start)
         if self.steps is None:
-            along = Along(equations, vector, iteration=damped_along, max_steps=MAX_STEPS)
-            projected = solution(along)
+            # The start is on the manifold, so the functions are finite there.
+            known = ravel(start[1]).astype(vector.dtype)
+            options: Any = dict(iteration=damped_along, max_steps=MAX_STEPS)
+            projected = solution(Along(equations, vector, fallback=known, **options))
             y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)
