@@ -15,6 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 
 from .._balance import integrated_rates
+from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry, named_entries
 from .._printing import is_traced, names_at, printed
@@ -269,8 +270,9 @@ class Target(eqx.Module):
 
         A balance comes to rest, for example when friction has stopped a pendulum. The integral of
         its rate then keeps a rest of roundoff, say an energy of -1e-17, which no state has: all
-        later projections would fail. So where the residual at the start of a step is more than half
-        of the tolerance, though within it, the value follows the state until it is half of it.
+        later projections would fail. So where the residual at the start of a step is within the
+        tolerance, but more than half of what counts as noise, the value follows the state until it
+        is that.
         """
         if self.gained is None:
             return self
@@ -278,7 +280,8 @@ class Target(eqx.Module):
         off, jacobian = equations.linearise(y)
         limit = equations.tolerance(equations.scale(jacobian, y))
         within = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
-        follow = jnp.where(within, off - jnp.clip(off, -limit / 2, limit / 2), 0)
+        noise = NOISE / ROUNDOFF * limit / 2
+        follow = jnp.where(within, off - jnp.clip(off, -noise, noise), 0)
         # The second row is subtracted from what is added next, so this adds `follow`.
         return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
 
