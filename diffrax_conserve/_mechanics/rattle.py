@@ -91,7 +91,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
     as the steps are short enough for the forces.
 
     The terms are those of `diffrax.SemiImplicitEuler`: for the state `(q, v)` the pair of
-    `ODETerm(lambda t, v, args: v)` and `ODETerm(lambda t, q, args: force(q) / masses)`.
+    `ODETerm(lambda t, v, args: v)` and `ODETerm(lambda t, q, args: force(q) / masses)`. The second
+    is the acceleration: a force in its place is a solve with other masses, which no check can tell.
     With momenta $p$ in the place of $v$, the terms are $p/m$ and $F$, and `masses` is 1.
 
     Steps are fixed. A state at a saved time comes from a shorter step. Derivatives follow from the

@@ -33,9 +33,6 @@ Algebraic = Callable[[RealScalarLike, Any, Any, Args], Values]
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
 # lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
 _MAX_STEPS = 500
-# At this share of a correction we give up. In float64 a correction that is as large as the unknown
-# then still changes half of its digits, so that the functions could show an effect.
-_LEAST_SHARE = 1e-9
 
 
 @final
@@ -326,7 +323,8 @@ def _algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"])
         # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
         # helping. Whether it is, we ask once, at the end.
         stuck = ~better & (before <= eps**0.5)
-        going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > _LEAST_SHARE))
+        # A share of the root of roundoff still changes half of the digits of the unknown.
+        going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > eps**0.5))
         z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(share / SHORTER, 1), share * SHORTER)
         return keep_done(counter, (z, share), now), after_step(settled, going, counter)
