@@ -130,7 +130,7 @@ COSTS := core forms overhead gradients work_precision scaling balance dae learne
   random_features
 TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
   defaults hard_cases
-STUDIES := claims long_run symmetric units verdict
+STUDIES := claims long_run metric symmetric units verdict
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
