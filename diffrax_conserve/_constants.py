@@ -6,11 +6,10 @@
 # else is compared with roundoff, such as the pivot of a constraint that depends on others, is
 # compared with this many units of it.
 ROUNDOFF = 16
-# A residual of this many units is noise: rounding the state and evaluating the function contribute
-# about one unit each, to the conserved value and now. An iteration can reduce it by chance only, so
-# it is not corrected. With other tolerances the share of the tolerance is the same. With 2 in the
-# place of 4 one of a thousand lanes usually needs one more step, and all wait for it.
-NOISE = 4
+# A residual of this many units is noise: rounding the state and evaluating the residual contribute
+# about one unit each. An iteration can reduce it by chance only, so it is not corrected. With other
+# tolerances the share of the tolerance is the same.
+NOISE = 2
 # An iteration has at most this many steps, unless the user says otherwise. In a solve two are
 # usual. The rest is for steps of the solver that are much too long.
 MAX_STEPS = 50
