@@ -59,7 +59,7 @@ class _Explicit(dfx.AbstractSolver[None]):
 
         def advanced(y0: Y) -> tuple[Y, Y | None, list[Y]]:
             """The next state, the error estimate and the stages."""
-            stages, y = [stage(0, y0)], y0
+            stages, y = [stage(0.0, y0)], y0
             for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
                 y = _displaced(y0, row, stages)
                 stages.append(stage(float(fraction), y))
@@ -77,7 +77,7 @@ class _Explicit(dfx.AbstractSolver[None]):
         chain = all(np.count_nonzero(row[:-1]) == 0 for row in tableau.a_lower)
         ends = lambda y0: advanced(y0)[:2]  # noqa: E731
         y1, error = written_out(ends, y0) if chain else ends(y0)
-        dense_info = dict(y0=y0, y1=y1, k0=stage(0, y0), k1=stage(1, y1))
+        dense_info = dict(y0=y0, y1=y1, k0=stage(0.0, y0), k1=stage(1.0, y1))
         return y1, error, dense_info, None, dfx.RESULTS.successful
 
 

@@ -118,7 +118,8 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     gained = float(solution.solver_state.gained[0, 0])
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, manifold=None, **PRECISE)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))
-    assert gained == pytest.approx(lost, rel=1e-2)
+    # The value follows a state that is off by roundoff, see `Target.following`.
+    assert gained == pytest.approx(lost, rel=3e-2)
 
 
 @some_of("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"], period=2)
