@@ -304,9 +304,9 @@ def bounded(
         sizes, rows = scaled_rows(equations.in_units(jacobian))
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
-        gram, right = gram_matrix(rows, directions), g / sizes
-        change = equations.change(combined(solve(gram, right), directions))
-        share = _share(equations, z, solve(gram, right), change)
+        multiplier = solve(gram_matrix(rows, directions), g / sizes)
+        change = equations.change(combined(multiplier, directions))
+        share = _share(equations, z, multiplier, change)
         return keep_done(counter, z - share * change, z), counter
 
     return iterate(advance, start, max_steps=max_steps)._replace(more=jnp.asarray(True))
