@@ -93,11 +93,14 @@ class AlongLine(AbstractProjection):
                 "one integral, or pass `projection=SimplifiedNewton()`."
             )
         # The iteration moves along `s Uᵀ λ`, for units `s` and a row `U` that are given. With
-        # `s = |w|`, and the signs of `w` as the row, this is `w λ`.
+        # `s = |w|` and the row `w / s` this is `w λ`, and the units of the user cancel. Where a
+        # component of `w` is zero, its unit must not be, because its derivative is not, but so
+        # small that the component counts for nothing.
         line = self._line(problem, candidate)
-        equations = dataclasses.replace(problem.equations, units=jnp.abs(line))
-        signs = lax.stop_gradient(jnp.sign(line))[None]
-        y, ok, count, _ = solution(Along(equations, candidate, signs, max_steps=self.max_steps))
+        least = float(jnp.finfo(line.dtype).tiny) ** 0.5
+        units = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
+        equations, row = dataclasses.replace(problem.equations, units=units), (line / units)[None]
+        y, ok, count, _ = solution(Along(equations, candidate, row, max_steps=self.max_steps))
         if self.direction == "step":
             ok = ok & _is_no_return(problem, candidate, y)
         return y, problem.report(candidate, y, count, ok=ok)

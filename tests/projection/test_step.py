@@ -71,6 +71,33 @@ def test_derivatives_of_relaxation_agree_with_differences():
     np.testing.assert_allclose(gradient, np.subtract(ends[:2], ends[2:]) / 2e-5, rtol=1e-7)
 
 
+@pytest.mark.parametrize("direction", ["error", "step"])
+def test_derivatives_by_a_component_that_rests_agree_with_differences(direction):
+    """Its component of the line is zero, but has a derivative. Whatever its unit is."""
+    square = dfc.FirstIntegral(lambda t, y, unit: jnp.sum((y / unit) ** 2))
+    solver = dfc.ManifoldProjection(
+        dfx.Bosh3(), square, projection=dfc.AlongLine(direction=direction)
+    )
+
+    def field(t, y, unit):
+        x = y / unit
+        rate = 1 + 0.3 * x[0] ** 2 + x[2]
+        return unit * rate * jnp.array([x[1], -x[0], x[3], -x[2]])
+
+    @jax.jit
+    def end(start, unit):
+        unit = jnp.array([1.0, 1.0, unit, 1.0])
+        y0 = unit * jnp.array([1.0, 0.0, 0.0, 0.0]).at[2].set(start)
+        options = dict(args=unit, max_steps=1)
+        return dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 0.4, 0.4, y0, **options).ys[-1]
+
+    differences = (end(1e-5, 1.0) - end(-1e-5, 1.0)) / 2e-5
+    for unit in (1.0, 1e-20, 1e20):
+        derivative = jax.jit(jax.jacrev(end))(0.0, unit)
+        scaled = derivative / jnp.array([1.0, 1.0, unit, 1.0])
+        np.testing.assert_allclose(scaled, differences, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("inner", "friction"), [(dfx.Euler(), 0.0), (dfx.Heun(), 0.3)], ids=["tangent", "not conserved"]
 )
