@@ -9,6 +9,7 @@ multipliers of the positions in the next step are found by an iteration for whic
 good enough, because that is where the step starts. So the matrix is factored once in a step.
 """
 
+import dataclasses
 import functools as ft
 from typing import Any, ClassVar, final
 
@@ -25,13 +26,11 @@ from .._interpolation import PackedTarget
 from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._options import check_counts, check_number
-from .._projection.base import Target
 from .._projection.options import check_state, option
-from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._step.equations import Equations, Jacobian, length, shown_terms
+from .._step.equations import Equations, Jacobian, equations_of, length, shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done
 from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
@@ -205,7 +204,6 @@ class RATTLE(dfx.AbstractSolver[Any]):
                 f"The positions have the shapes {tree_shapes(q)}, the velocities "
                 f"{tree_shapes(v)}. `RATTLE` needs a state `(q, v)` of two parts that are alike."
             )
-        spread("masses", self.masses, q)
         direction = time_direction(terms, t0)
         values = conserved_values(self.constraint, t0 * direction, q, args)
         values, hidden = started(values, self.constraint, t0 * direction, q, args)
@@ -245,6 +243,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         slope = lax.cond(
             jnp.asarray(made_jump), lambda: terms[1].vf(t0, q0, args), lambda: state.slope
         )
+        state = dataclasses.replace(state, slope=slope)  # dense output needs it too
 
         equations = self._equations(t1, q0, args, state.hidden, direction)
         kicked = _once(v + h / 2 * ravel(slope))
@@ -283,10 +282,10 @@ class RATTLE(dfx.AbstractSolver[Any]):
     def _equations(
         self, t: RealScalarLike, q: Y, args: Args, hidden: Array, direction: Array
     ) -> Equations:
-        projection = SimplifiedNewton(metric=jax.tree.map(jnp.asarray, self.masses))
-        values = jnp.zeros_like(hidden)
-        target = Target(projection, self.constraint, values, hidden, None, None, args, direction)
-        return target.equations(t, q)
+        values, t = jnp.zeros_like(hidden), t * direction
+        equations = equations_of(self.constraint, values, t, q, args, hidden)
+        units = lax.rsqrt(spread("masses", self.masses, q))
+        return dataclasses.replace(equations, units=units)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
         """The function from velocities `v`, or momenta, to `q'`, both as vectors."""

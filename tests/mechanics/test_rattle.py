@@ -187,6 +187,23 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     assert difference(slope, v) < 0.01
 
 
+def test_dense_output_meets_the_state_after_a_jump_of_the_force():
+    save = dfx.SaveAt(t1=True, solver_state=True, dense=True)
+    options = dict(saveat=save, adjoint=dfx.ForwardMode(), max_steps=1)
+    there = dfx.diffeqsolve(TERMS, THREE, 0.0, 0.1, 0.1, chain(3), **options)
+    pair = terms(lambda t, q, args: -20 * springs(t, q, args), MASSES)
+    state = dict(solver_state=there.solver_state, made_jump=True)
+    after = dfx.diffeqsolve(pair, THREE, 0.1, 0.2, 0.1, final(there), **options, **state)
+    assert difference(after.evaluate(0.2), final(after)) < 1e-14
+
+
+def test_masses_that_are_traced_call_nothing_on_the_host(errors_raise):
+    def end(masses):
+        return solve(terms(springs), dfc.RATTLE(dfc.Constraint(rods), masses), chain(3), 0, 1, 0.1)
+
+    assert "callback" not in str(jax.make_jaxpr(lambda masses: end(masses).ys)(MASSES))
+
+
 def test_derivatives_in_both_modes_against_finite_differences():
     """Of a closed loop, whose multipliers are not unique."""
     y0 = jnp.array([[1.0, 0.0], [1.0, 1.0]]), jnp.array([[0.0, 0.3], [-0.3, 0.3]])
