@@ -1,13 +1,13 @@
 """Damped Newton's method for the nearest point of a manifold, for candidates far away.
 
 The nearest point is a stationary point of the distance under the constraints, where the Lagrange
-conditions `y - ŷ - M⁻¹ G(y)ᵀ λ = 0` and `g(y) = 0` hold. These are equations for the pair `(y, λ)`.
-So they are solved by the same damped iteration as `g(y) = 0` alone, and the derivative follows from
-the implicit function theorem for them.
+conditions `S⁻¹ (y - ŷ) = (G(y) S)ᵀ λ` and `g(y) = 0` hold. These are as many equations as unknowns,
+`S⁻¹ y` and `λ`. So they are solved by the same damped iteration as `g(y) = 0` alone, whose steps
+are then those of Newton's method, and the derivative follows from the implicit function theorem.
 """
 
 import dataclasses
-from typing import final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -16,19 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_STEPS, NEAREST
+from .._constants import MAX_STEPS, NEAREST, ROUNDOFF
 from .._step.equations import Equations, measured
-from .._step.implicit import AbstractSystem, known_if, solution, well_conditioned
+from .._step.implicit import Along, certain, root, solution, well_conditioned
 from .._step.iterate import Solved, damped
-from .._step.linear import (
-    combined,
-    gram_matrix,
-    scaled_rows,
-    solve,
-    solve_large,
-    times,
-)
-from .._step.metric import MatrixUnits
+from .._step.linear import equilibrated, gram_matrix, scaled_rows, solve, times
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS, option
@@ -80,130 +72,118 @@ class Newton(AbstractNewton):
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
         equations, bounds = problem.equations, self.bounds(problem.like)
-        system = _Nearest(equations, candidate, bounds, max_steps=self.max_steps)
-        (y, _), _, num_steps, _ = solution(system)
-        return y, problem.report(candidate, y, num_steps)
+        given = _Given(equations.dense(), candidate, bounds)
+        # First phase: some point of the manifold.
+        if bounds is None:
+            along = Along(equations, candidate, iteration=damped, max_steps=self.max_steps)
+            first = solution(along)
+        else:
+            first = project_within(bounds, equations, candidate, max_steps=self.max_steps)
+        if candidate.size + equations.magnitude.size > NEAREST:
+            y, count = certain(given.clip(first.y), False), first.num_steps
+        else:
+            y, count = _nearest(given, lax.stop_gradient(first.y), self.max_steps)
+            count = first.num_steps + count
+        return y, problem.report(candidate, y, count)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS
 
 
-class _Optimality(eqx.Module):
-    """The Lagrange conditions: `y - clip(ŷ + M⁻¹ G(y)ᵀ λ)` and `g(y)`, as functions of `y` and
-    `sizes * λ` in one vector. The `sizes` are those of the gradients, so that all unknowns have
-    comparable units. Without bounds `clip` is the identity."""
+class _Given(eqx.Module):
+    """What is given: the equations, the candidate and the bounds."""
 
     equations: Equations
     candidate: Float[Array, " n"]
     bounds: Bounds | None
-    sizes: Float[Array, " m"]
+
+    def clip(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+        return z if self.bounds is None else self.bounds.clip(z)
+
+
+class _Conditions(eqx.Module):
+    """The Lagrange conditions as functions of one vector: the change `u` from a `base`, with
+    `y = base + S u`, and the multipliers times the lengths of the gradients there. So no unknown
+    has a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
+    vector without bounds, which `clip` maps to the state."""
+
+    given: _Given
+    base: Float[Array, " n"]
+    lengths: Float[Array, " m"]
+
+    def state(self, unknowns: Float[Array, " N"]) -> Float[Array, " n"]:
+        # The base is only a place to start from. It moves with the candidate, and with nothing
+        # else, so that a component that is never moved has the derivative of the candidate.
+        candidate, change = self.given.candidate, unknowns[: self.base.size]
+        base = self.base + (candidate - lax.stop_gradient(candidate))
+        return self.given.clip(base + self.given.equations.change(change))
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
-        y, multiplier = jnp.split(unknowns, [self.candidate.size])
+        equations, away = self.given.equations, self.base - lax.stop_gradient(self.given.candidate)
+        change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
-        g, vjp = jax.vjp(self.equations.residual, y)
-        gradient = self.equations.in_units(vjp(multiplier / self.sizes)[0])
-        z = self.candidate + self.equations.change(gradient)
-        return jnp.concatenate([y - (z if self.bounds is None else self.bounds.clip(z)), g])
+        g, vjp = jax.vjp(equations.residual, self.state(unknowns))
+        gradient = equations.in_units(vjp(multiplier / self.lengths)[0])
+        return jnp.concatenate([measured(away, equations.units) + change - gradient, g])
 
 
-class _Nearest(AbstractSystem):
-    """The nearest point to the candidate. The unknowns are the state and its multipliers times the
-    sizes of the gradients. The multipliers are NaN if only a point of the manifold was found."""
+def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Equations]:
+    """The conditions around a base; the unknowns there, with the multipliers that fit best; and the
+    conditions as equations with their scales and tolerances."""
+    equations, y = given.equations, given.clip(base)
+    jacobian = equations.linearise(y)[1]
+    sizes, rows = scaled_rows(equations.in_units(jacobian))
+    gram = gram_matrix(rows, rows)
+    lengths = jnp.sqrt(jnp.diagonal(gram))
+    lengths = jnp.where(lengths > 0, lengths, 1)
+    conditions = _Conditions(given, base, sizes * lengths)
+    places = [measured(x, equations.units) for x in (base, given.candidate)]
+    fits = solve(gram, times(rows, measured(base - given.candidate, equations.units))) * lengths
+    scale = equations.scale(jacobian, y)
+    eps = float(jnp.finfo(y.dtype).eps)
 
-    equations: Equations
-    candidate: Float[Array, " n"]
-    bounds: Bounds | None
-    max_steps: int = eqx.field(static=True, kw_only=True)
+    def tolerance(mine: float, of_user: Any) -> Array:
+        """The tolerances of the user are for the constraints. The point is nearest to roundoff."""
+        of_user = jnp.broadcast_to(mine if of_user is None else of_user, scale.shape)
+        return jnp.concatenate([jnp.full_like(y, mine), of_user.astype(y.dtype)])
 
-    def found(self) -> Solved:
-        equations, candidate, bounds = self.equations, self.candidate, self.bounds
-        # First phase: some point of the manifold.
-        if bounds is None:
-            first = damped(equations, candidate, max_steps=self.max_steps)
-        else:
-            first = project_within(bounds, equations, candidate, max_steps=self.max_steps)
-        y, nothing = first.y, jnp.full_like(equations.magnitude, jnp.nan)
-        if not self._is_sought():
-            return first._replace(y=(y, nothing))
-        # Second phase: the nearest point. It starts from the multipliers that fit `y - ŷ` best. The
-        # Lagrange conditions take the place of the constraints. There are as many as unknowns, so
-        # the steps of the damped iteration are those of Newton's method.
-        equations, sizes, units, start = self._at(y)
-        conditions = dataclasses.replace(
-            equations,
-            parts=(_Optimality(equations, candidate, bounds, sizes),),
-            magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
-            hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-            motion=None,
-            units=units,
-        )
-        end, nearest, more, _ = damped(conditions, start, max_steps=self.max_steps, polish=True)
-        end, multiplier = jnp.split(end, [y.size])
-        if bounds is not None:
-            end = bounds.clip(end)
-        nearest = nearest & equations.holds(end)
-        both = jnp.where(nearest, end, y), jnp.where(nearest, multiplier, nothing)
-        return Solved(both, nearest | first.ok, first.num_steps + more)
+    tested = dataclasses.replace(
+        equations,
+        parts=(conditions,),
+        magnitude=jnp.concatenate([sum(map(jnp.abs, places)), scale]),
+        hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
+        motion=None,
+        units=None,
+        rtol=tolerance(ROUNDOFF * eps, equations.rtol),
+        atol=tolerance(0.0, equations.atol),
+    )
+    return conditions, jnp.concatenate([jnp.zeros_like(y), fits]), tested
 
-    def _is_sought(self) -> bool:
-        return self.candidate.size + self.equations.magnitude.size <= NEAREST
 
-    def _at(self, y: Array) -> tuple[Equations, Array, Array, Array]:
-        """The equations, dense; the sizes of the rows of `G S` at a state; units for the state and
-        for the multipliers, with which no condition number depends on the units of the user; and
-        the state with the multipliers that fit best."""
-        equations = self.equations.dense()
-        sizes, rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))
-        gram = gram_matrix(rows, rows)
-        lengths = jnp.diagonal(gram)
-        own = equations.units
-        own = (
-            own.sizes if isinstance(own, MatrixUnits) else jnp.ones_like(y) if own is None else own
-        )
-        units = jnp.concatenate([own, lax.rsqrt(jnp.where(lengths > 0, lengths, 1))])
-        fits = solve(gram, times(rows, measured(y - self.candidate, equations.units)))
-        return equations, sizes, units, jnp.concatenate([y, fits])
+def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:
+    """Second phase: the nearest point, and the number of steps. If there is none, or with it no
+    derivative that has digits, the derivative is NaN. The result of a failed projection is
+    discarded, and its derivative must stay finite."""
+    still = tree_stop_gradient(given)
 
-    def _conditions(self, y: Array) -> tuple[_Optimality, Array, Array]:
-        """The Lagrange conditions, with the `sizes` and `units` of a state. These are no
-        parameters: they only say in which units the unknowns are."""
-        _, sizes, units, _ = tree_stop_gradient(self._at(y))
-        equations = self.equations.dense()
-        return _Optimality(equations, self.candidate, self.bounds, sizes), sizes, units
+    def approach(now: Any) -> Any:
+        base, _, count, left = now
+        _, start, tested = _conditions(still, base)
+        found = damped(tested, start, max_steps=max_steps, polish=True)
+        end = base + still.equations.change(found.y[: base.size])
+        left = jnp.where(found.ok, left - 1, 0)
+        return jnp.where(found.ok, end, base), found.ok, count + found.num_steps, left
 
-    def unknowns(self, solved: Solved) -> tuple[Array, Array]:
-        return solved.y
-
-    def defect(self, unknowns: tuple[Array, Array]) -> Array:
-        y, multiplier = unknowns
-        if not self._is_sought():
-            return jnp.concatenate([self.candidate, multiplier])
-        conditions, _, _ = self._conditions(y)
-        known = jnp.where(jnp.isfinite(multiplier), multiplier, 0)
-        return conditions(jnp.concatenate([y, known]))
-
-    def linear_solution(self, solved: Solved, right: Array) -> tuple[Array, Array]:
-        """Rows and columns of the Jacobian are scaled by the units. Only the nearest point has a
-        derivative, so it is NaN where only the first phase succeeded. The result of a failed
-        projection is discarded, and its derivative must stay finite."""
-        y, multiplier = solved.y
-        if not self._is_sought():
-            tangent = jnp.full_like(right, jnp.nan)
-            return tangent[: y.size], tangent[y.size :]
-        conditions, sizes, units = self._conditions(y)
-        known = jnp.where(jnp.isfinite(multiplier), multiplier, 0)
-        matrix = jax.jacfwd(conditions)(jnp.concatenate([y, known]))
-        # A component that is never moved has no unit, but its tangent is known: that of the
-        # candidate.
-        fixed = jnp.where(units == 0, right, 0)
-        right = right - combined(fixed, matrix.T)
-        rows = jnp.concatenate([jnp.where(units == 0, 1, units)[: y.size], sizes / units[y.size :]])
-        rows = lax.stop_gradient(rows)
-        tangent = fixed + units * solve_large(matrix / rows[:, None] * units, right / rows)
-        gradients = self.equations.dense()
-        gradients = scaled_rows(gradients.in_units(gradients.linearise(y)[1]))[1]
-        is_known = well_conditioned(self.equations, y, gradients, gradients)
-        is_known = is_known & jnp.all(jnp.isfinite(multiplier)) | ~self.equations.holds(y)
-        tangent = known_if(is_known, tangent)
-        return tangent[: y.size], tangent[y.size :]
+    # The change from the first base may be so large that its roundoff is that of another state.
+    # So we start once more, from the result: now the change is roundoff.
+    begin = first, jnp.asarray(False), jnp.asarray(0), jnp.asarray(2)
+    base, ok, count, _ = lax.while_loop(lambda now: now[-1] > 0, approach, begin)
+    ok = ok & still.equations.holds(still.clip(base))
+    conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
+    conditions = dataclasses.replace(conditions, given=given)
+    found = root(conditions, lambda x: Solved(x, ok, count), start, equilibrated)
+    y = conditions.state(found.y)
+    equations, there = still.equations, lax.stop_gradient(y)
+    gradients = scaled_rows(equations.in_units(equations.linearise(there)[1]))[1]
+    is_known = ok & well_conditioned(equations, there, gradients, gradients)
+    return certain(y, is_known | ~equations.holds(there)), count

@@ -62,7 +62,8 @@ class SimplifiedNewton(AbstractNewton):
         if bounds is None:
             y, ok, count, _ = solution(Along(equations, candidate, max_steps=self.max_steps))
         else:
-            y, ok, count, _ = project_within(bounds, equations, candidate, max_steps=self.max_steps)
+            z, ok, count, _ = project_within(bounds, equations, candidate, max_steps=self.max_steps)
+            y = bounds.clip(z)
         return y, problem.report(candidate, y, count, ok=ok)
 
 

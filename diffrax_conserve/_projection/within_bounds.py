@@ -57,18 +57,16 @@ def _clipped(bounds: Bounds, part: Callable[[Array], Array], z: Array) -> Array:
 def project_within(
     bounds: Bounds, equations: Equations, candidate: Float[Array, " n"], *, max_steps: int
 ) -> Solved:
-    """The projection along the gradients at the candidate, within bounds.
+    """The projection along the gradients at the candidate, within bounds: the vector `z`, whose
+    `clip` is the state.
 
     The candidate may be beyond the bounds, and so may `z`. The gradients are those at the candidate
     without the clip. A component that reaches its bound costs a step, so there may be twice as many
     of them.
     """
     rows = equations.in_units(equations.linearise(candidate)[1])
-    within = Along(
-        bounds.compose(equations), candidate, rows, iteration=bounded, max_steps=2 * max_steps
-    )
-    z, ok, count, _ = solution(within)
-    return Solved(bounds.clip(z), ok, count)
+    within = bounds.compose(equations)
+    return solution(Along(within, candidate, rows, iteration=bounded, max_steps=2 * max_steps))
 
 
 class AbstractNewton(AbstractProjection):

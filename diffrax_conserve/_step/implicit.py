@@ -166,6 +166,18 @@ def known_if(is_known: Any, tangent: Array) -> Array:
     return lax.stop_gradient(jnp.where(is_known, 1, jnp.nan)).astype(tangent.dtype) * tangent
 
 
+@jax.custom_jvp
+def certain(y: Array, is_known: Any) -> Array:
+    """`y`, whose derivative is NaN where it is not known."""
+    del is_known
+    return y
+
+
+@certain.defjvp
+def _certain_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    return primals[0], known_if(primals[1], tangents[0])
+
+
 @final
 class General(AbstractSystem):
     """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that
@@ -188,13 +200,8 @@ class General(AbstractSystem):
         return self.residual(unknowns)
 
     def linear_solution(self, solved: Solved, right: Any) -> Any:
-        flat = _flat(right)
-
-        def linear(x: Array) -> Array:
-            return jax.jvp(self.residual, (solved.y,), (unflatten(x, solved.y),))[1]
-
-        matrix = jax.jacfwd(lambda x: _flat(linear(x)))(jnp.zeros_like(flat))
-        return unflatten(self.solve(matrix, flat), solved.y)
+        matrix = jax.jacfwd(lambda x: _flat(self.residual(unflatten(x, solved.y))))
+        return unflatten(self.solve(matrix(_flat(solved.y)), _flat(right)), solved.y)
 
 
 def root(

@@ -245,7 +245,7 @@ def damped(
     """A state on the manifold, which is near the start if that is near the manifold.
 
     The steps are along the given `directions`, or along the gradients at each state. In the second
-    case the result depends on the path, so that its derivative is unknown.
+    case the result depends on the path, so that its derivative is unknown, as `more` tells.
     """
 
     def advance(now: _Descent, counter: Array) -> tuple[_Descent, Array]:
@@ -270,7 +270,7 @@ def damped(
 
     begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), equations.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
-    return found._replace(y=found.y.y)
+    return found._replace(y=found.y.y, more=jnp.asarray(directions is not None))
 
 
 def damped_along(
@@ -279,8 +279,7 @@ def damped_along(
     """As `nearby`, by the damped iteration."""
     del directions
     rows = equations.in_units(equations.linearise(candidate)[1])
-    found = damped(equations, candidate, rows, max_steps=max_steps)
-    return found._replace(more=jnp.asarray(True))
+    return damped(equations, candidate, rows, max_steps=max_steps)
 
 
 # ---- Within bounds ----

@@ -82,6 +82,13 @@ def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Arr
     return refined(factors, lambda x: combined(x, matrix.T), b)
 
 
+def equilibrated(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`solve_large` in units of the rows in which their largest elements are one."""
+    rows = lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1))
+    rows = jnp.where(rows > 0, rows, 1)
+    return solve_large(matrix / rows[:, None], b / rows)
+
+
 class Factors(eqx.Module):
     """The inverses of the two factors of a matrix, so that a solve is two products with a matrix.
     These are faster than two substitutions, in a batch above all. Their product is not formed:

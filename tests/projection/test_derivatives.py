@@ -125,3 +125,37 @@ def test_derivatives_are_linear_or_nan():
     on_it = np.zeros(21)
     on_it[1] = 1
     assert all(np.all(np.isnan(x)) for x in both_modes(on_it, v))
+
+
+ELLIPSE = dfc.FirstIntegral(lambda t, y, args: jnp.sum((y / jnp.array([2.0, 1.0])) ** 2))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_the_nearest_point_is_one_to_roundoff_whatever_the_tolerance(dtype):
+    """A tolerance is for the residuals. The units make it larger than the distances."""
+
+    def nearest(y, unit, **tolerances):
+        ellipse = dfc.FirstIntegral(lambda t, y, args: ELLIPSE.fn(t, y / unit, args), value=1.0)
+        return dfc.project(ellipse, y * unit, projection=dfc.Newton(**tolerances))[0] / unit
+
+    y = jnp.asarray([3.0, 2.0], dtype)
+    # The line from the candidate to a nearest point is along the gradient there.
+    found = nearest(y, 1e-9, rtol=1e-6, atol=1e-6)
+    (dx, dy), (gx, gy) = y - found, found / jnp.array([4.0, 1.0])
+    eps = float(jnp.finfo(dtype).eps)
+    assert abs(dx * gy - dy * gx) < 16 * eps
+    got = jax.jacrev(lambda y: nearest(y, 1e-9, rtol=1e-6, atol=1e-6))(y)
+    # For the distance `d` and the curvature `k` there, tangents are multiplied by `1 / (1 + k d)`.
+    across = np.array([-gy, gx]) / np.hypot(gx, gy)
+    curvature = 1 / (4 * np.hypot(gx, gy) ** 3)
+    share = 1 / (1 + np.hypot(dx, dy) * curvature)
+    np.testing.assert_allclose(got, share * np.outer(across, across), atol=256 * eps)
+
+
+def test_beyond_the_largest_system_the_derivative_is_nan_in_everything():
+    def moved(y, value):
+        return dfc.project(many, y, value=value, projection=dfc.Newton())[0][3]
+
+    many = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.arange(1.0, 601.0) * y**2))
+    for gradient in jax.jit(jax.grad(moved, (0, 1)))(jnp.linspace(0.1, 0.9, 600), 1.0):
+        assert np.all(np.isnan(gradient))
