@@ -41,8 +41,14 @@ Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
 class Solved(NamedTuple):
-    """The unknowns, of a projection the state; whether they solve the equations; the number of
-    steps; and what else was found, which has no derivative."""
+    """What an iteration has found.
+
+    - `y`: the unknowns. In a projection they are the state.
+    - `ok`: whether they solve the equations.
+    - `num_steps`: the number of steps.
+    - `more`: what else was found, without a derivative. In a projection along directions it is
+      whether the state is of the form `ŷ + S Uᵀ λ`, as its derivative needs.
+    """
 
     y: Any
     ok: Bool[Array, ""]
@@ -65,9 +71,10 @@ class _Now(NamedTuple):
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
     """Advances the unknowns until the counter says that they are done.
 
-    The counter is the number of tests that are left. A test of the unknowns comes before each step
-    and after the last, so there is one more test than steps. In the end the counter is zero if the
-    last test was passed, otherwise -1. `after_test` computes it.
+    The counter is the number of tests that are left. The unknowns are tested before each step and
+    after the last one, so that there is one more test than there are steps. When the iteration
+    ends, the counter is zero if the unknowns passed their last test, and -1 if they did not.
+    `after_test` computes it.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
     are done, for which the counter is not positive, as they are.
@@ -157,7 +164,6 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     equations, candidate, directions = given
-    last_frozen = max_steps + 1 - FROZEN_STEPS
 
     def first_rows(y: Any) -> Any:
         """The gradients at the candidate, which the steps share."""
@@ -170,10 +176,13 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
         level, wrong = equations.level(g, equations.scale(jacobian, y))
-        counter = after_test(level, counter)
         sizes, rows = scaled_rows(equations.in_units(jacobian))
-        fresh = directions is None and last_frozen > 1
-        along = jnp.where(counter >= last_frozen, first, rows) if fresh else first
+        fresh = directions is None and max_steps > FROZEN_STEPS
+        # By the counter before the test, which goes down by one in each step. The test leaves one
+        # for the last step, whenever that is.
+        frozen = counter > max_steps + 1 - FROZEN_STEPS
+        along = jnp.where(frozen, first, rows) if fresh else first
+        counter = after_test(level, counter)
         moved = y - equations.change(corrected(rows, along, wrong / sizes))
         return keep_done(counter, moved, y), counter
 
@@ -305,13 +314,15 @@ def bounded(
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = solve(gram_matrix(rows, directions), g / sizes)
         change = equations.change(combined(multiplier, directions))
-        share = _share(equations, z, multiplier, change)
+        share = _share(equations, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 
     return iterate(advance, start, max_steps=max_steps)._replace(more=jnp.asarray(True))
 
 
-def _share(equations: Equations, z: Array, multiplier: Array, change: Array) -> Array:
+def _share(
+    equations: Equations, z: Array, multiplier: Array, change: Array, goes_on: Array
+) -> Array:
     """The share of a step at which the convex function is least, by bisection of its slope along
     the step, which is the product of the residuals with the step of the multipliers."""
 
@@ -323,8 +334,10 @@ def _share(equations: Equations, z: Array, multiplier: Array, change: Array) -> 
         further = slope(middle) >= 0
         return jnp.where(further, middle, ends[0]), jnp.where(further, ends[1], middle)
 
-    # If a component at its bound is what a step would move, the step is too long by one over
-    # `AT_BOUND`. A step in full is kept if it goes hardly past the minimum.
-    one = jnp.ones((), z.dtype)
-    _, end = lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, (0 * one, one))
-    return jnp.where(slope(1.0) >= -(AT_BOUND**0.5) * slope(0.0), one, end)
+    # A step in full is kept if it goes hardly past the minimum. If a component at its bound is what
+    # a step would move, the step is too long by one over `AT_BOUND`.
+    ends = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
+    in_full = (slope(1.0) >= -(AT_BOUND**0.5) * slope(0.0)) | ~goes_on
+    bisected = lambda: lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, ends)[1]  # noqa: E731
+    share = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
+    return jnp.where(in_full, ends[1], share)

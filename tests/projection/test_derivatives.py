@@ -159,3 +159,18 @@ def test_beyond_the_largest_system_the_derivative_is_nan_in_everything():
     many = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.arange(1.0, 601.0) * y**2))
     for gradient in jax.jit(jax.grad(moved, (0, 1)))(jnp.linspace(0.1, 0.9, 600), 1.0):
         assert np.all(np.isnan(gradient))
+
+
+def test_the_correction_is_along_the_gradients_at_the_candidate_in_the_last_step_too():
+    """So that the derivative is that of what is returned, whatever the tolerance."""
+    candidates = jnp.array([[1.5, 1.0], [0.5, 1.5], [2.5, -0.3]])
+    projection = dfc.SimplifiedNewton(rtol=1e-2)
+
+    def off(y):
+        found, info = dfc.project(ELLIPSE, y, value=1.0, projection=projection)
+        (dx, dy), (gx, gy) = found - y, jax.grad(lambda y: ELLIPSE.fn(0, y, None))(y)
+        return dx * gy - dy * gx, info.num_steps
+
+    for found, steps in (jax.jit(jax.vmap(off))(candidates), jax.jit(off)(candidates[0])):
+        assert jnp.all(steps > 1)
+        assert jnp.max(jnp.abs(found)) < 1e-15
