@@ -21,19 +21,18 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from ._constants import MAX_STEPS
 from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.base import has_bounds
-from ._projection.within_bounds import AbstractNewton, nearest_within
+from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
 from ._step.equations import length
+from ._step.implicit import certain
 from ._step.iterate import any_lane, damped
-from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
+from ._tree import ravel, tree_all_finite, tree_stop_gradient, tree_sub, tree_tangents
 
 
 @final
-class PackedTarget(eqx.Module):
+class Packed(eqx.Module):
     """A `Target`, or another module, in the form in which `dense_info` can store it. diffrax copies
     the leaves of `dense_info` into arrays over the steps, so that only arrays may be leaves."""
 
@@ -55,10 +54,11 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     The interpolant `u` of the wrapped solver ends at the candidate `ŷ₁`. It is moved so that it
     meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
-    a step is. Where that fails, damped steps with fresh gradients are tried from the same state.
-    Where they fail too, or lead further away than the step is long and than its start is away, the
-    value is the moved interpolant itself, which is off the manifold by the error of the
-    interpolation. With bounds it is the nearest value within them.
+    a step is. If that fails, damped steps with fresh gradients are tried from the same state. An
+    attempt has failed too if its correction is longer than the step, and also longer than the way
+    from the start of the step. If both fail, the value is the moved interpolant itself, which is
+    off the manifold by the error of the interpolation. With bounds there is one attempt, and the
+    value is the nearest one within the bounds.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
 
@@ -77,7 +77,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     shift: Y
     limit: Float[Array, ""]
     error: Y | None
-    target: PackedTarget
+    target: Packed
     due: Bool[Array, ""] | None
 
     @eqx.filter_jit  # traced once for all saved times
@@ -111,36 +111,37 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
         candidate = self.moved(t, left)
         target = self.target.unpack().advanced(self.t0, t, self.inner.evaluate)
-        start = lambda: self.inner.evaluate(self.t0)  # noqa: E731
-        step = target.step(self.t0, self.t1, start, self.error)
+        first = lambda: self.inner.evaluate(self.t0)  # noqa: E731
+        step = target.step(self.t0, self.t1, first, self.error)
         problem = target.problem(t, candidate, step)
         units = problem.equations.units
-        away = length(ravel(tree_sub(candidate, start())), units)
+        away = length(ravel(tree_sub(candidate, first())), units)
         limit = lax.stop_gradient(jnp.maximum(self.limit, away))
 
-        def near(candidate: Array, y: Array, ok: Array) -> tuple[Array, Array]:
-            """`y`, and whether it succeeded without leading too far away."""
-            return y, ok & (length(y - candidate, units) <= limit)
+        def near(y: Array, ok: Array) -> Array:
+            """Whether a projection succeeded without leading too far away."""
+            return ok & (length(y - vector, units) <= limit)
 
-        def project(candidate: Array) -> tuple[Array, Array]:
-            y, info = target.projection.solve(problem, candidate)
-            return near(candidate, y, info.ok)
-
-        def fresh(candidate: Array) -> tuple[Array, Array]:
-            y, ok, _, _ = damped(problem.equations, candidate, max_steps=MAX_STEPS)
-            return near(candidate, y, ok)
-
-        vector = ravel(candidate)
+        y, info = target.projection.solve(problem, vector := ravel(candidate))
+        ok = near(y, info.ok)
+        y = jnp.where(ok, y, vector)
+        bounded = bounded_parts(target.projection)
+        for part in bounded:
+            y = Bounds.of(part.lower, part.upper, problem.like).clip(y)
         # A second attempt by damped steps makes sense only if the projection follows gradients too.
         # The rule of another projection, such as a line, leads elsewhere. And bounds would be lost.
-        bounded = has_bounds(target.projection)
-        by_gradients = isinstance(target.projection, AbstractNewton) and not bounded
-        attempts = [project, fresh] if by_gradients else [project]
-        # `_first_of` has a derivative rule too, so its functions are converted likewise.
-        attempts = [eqx.filter_closure_convert(attempt, vector) for attempt in attempts]
-        y, _ = _first_of(attempts, vector)
-        if bounded:
-            y = nearest_within(target.projection, problem.like, y)
+        if isinstance(target.projection, AbstractNewton) and not bounded:
+            equations, start = tree_stop_gradient((problem.equations, vector))
+
+            def again() -> tuple[Array, Array]:
+                found = damped(equations, start, max_steps=target.projection.max_steps)
+                return found.y, near(found.y, found.ok)
+
+            # A condition that is the same for all lanes of a batch remains a branch, which is
+            # skipped if no lane needs it.
+            found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
+            better = better & ~ok
+            y = certain(jnp.where(better, found, y), ~better, y)
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
 
@@ -168,40 +169,6 @@ def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
         slope = jtu.tree_map(ft.partial(jnp.where, certain), slope, other)
         t_y = jtu.tree_map(lambda x, s: x + s * t_t.astype(s.real.dtype), t_y, slope)
     return y, t_y
-
-
-@eqx.filter_custom_jvp
-def _first_of(
-    attempts: list[Callable[..., Any]], candidate: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """The state of the first attempt that succeeds, or the candidate; and the number of attempts
-    that failed."""
-    project, *others = attempts
-    y, ok = project(candidate)
-    failed = jnp.where(ok, 0, 1)
-    for attempt in others:
-        # A condition that is the same for all lanes of a batch remains a branch, which is skipped
-        # if no lane needs it.
-        found, better = lax.cond(
-            any_lane(~ok), lambda fn=attempt: fn(candidate), lambda y=y: (y, ~ok)
-        )
-        y, failed = jnp.where(ok, y, found), failed + jnp.where(ok | better, 0, 1)
-    return jnp.where(failed < len(attempts), y, candidate), failed
-
-
-@_first_of.def_jvp
-def _first_of_jvp(primals: Any, tangents: Any) -> Any:
-    """The derivative of the first attempt, a projection, is its own. The state of a later one
-    depends on a path of damped steps, so that its derivative is unknown, and NaN. If all failed,
-    the state is the candidate, with the derivative of the candidate."""
-    attempts, candidate = primals
-    y, failed = _first_of(*primals)
-    given = (attempts[0], candidate), (tangents[0][0], tangents[1])
-    _, t_y = eqx.filter_jvp(lambda project, candidate: project(candidate)[0], *given)
-    t_candidate = tree_tangents(candidate, tangents[1])
-    t_y = jnp.where(failed == 0, tree_tangents(y, t_y), t_candidate)
-    by_damped_steps = (failed > 0) & (failed < len(attempts))
-    return (y, failed), (jnp.where(by_damped_steps, jnp.nan, 1) * t_y, None)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._constants import MAX_STEPS, WRITTEN_OUT
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
-from .._interpolation import PackedTarget
+from .._interpolation import Packed
 from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._options import check_counts, check_number
@@ -275,7 +275,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         y1 = y1, unravel(v1, v0)
         y1 = jax.tree.map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         result = dfx.RESULTS.where(failed == 0, dfx.RESULTS.successful, member(FIRST - 1 + failed))
-        dense_info = dict(y0=y0, step=PackedTarget(StepOf(self, terms, args, state)))
+        dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
         multiplier = 2 * displacement * per_step**2
         return y1, None, dense_info, _State(at, slope, multiplier, state.hidden, state.off), result
 

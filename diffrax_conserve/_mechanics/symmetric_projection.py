@@ -10,10 +10,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._constants import MAX_STEPS, NOISE, ROUNDOFF, WRITTEN_OUT
+from .._balance import refuse_rates
+from .._constants import MAX_STEPS, NOISE, ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
-from .._interpolation import PackedTarget
-from .._manifold import check_manifold, conserved_values, named_entries, rate_of
+from .._interpolation import Packed
+from .._manifold import check_manifold, conserved_values
 from .._projection.base import Target
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
@@ -22,9 +23,9 @@ from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, start
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
-from .._step.implicit import known_if, root
+from .._step.implicit import certain, root, well_conditioned
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._step.linear import combined, gram_matrix, pivots, scaled_rows, solve, times
+from .._step.linear import combined, equilibrated, gram_matrix, scaled_rows, solve, times
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -116,12 +117,7 @@ class SymmetricProjection(ForwardingSolver):
         _check_symmetric(solver)
         check_nested(self)
         check_manifold(manifold)
-        for name, entry in named_entries(manifold):
-            if rate_of(entry) is not None:
-                raise ValueError(
-                    f"`{name}` has a `rate`: what gains or loses is not reversible. Keep balances "
-                    "by `ManifoldProjection`."
-                )
+        refuse_rates(manifold, "a `SymmetricProjection`")
 
     def init(
         self,
@@ -158,16 +154,8 @@ class SymmetricProjection(ForwardingSolver):
         del made_jump
         state, vector = solver_state, ravel(y0)
         direction = time_direction(terms, t0)
-        target = Target(
-            self.projection,
-            self.manifold,
-            state.values,
-            state.hidden,
-            None,
-            None,
-            args,
-            direction,
-        )
+        values, hidden = state.values, state.hidden
+        target = Target(self.projection, self.manifold, values, hidden, args, direction)
         start, end = (target.equations(t, y0).dense() for t in (t0, t1))
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
@@ -186,8 +174,11 @@ class SymmetricProjection(ForwardingSolver):
             residual,
             ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
             (vector, state.multiplier),
-            ft.partial(_tangent, vector.size),
+            equilibrated,
         )
+        # Half of the digits of its derivative are right, or it is NaN.
+        rows = scaled_rows(end.in_units(end.linearise(y1)[1]))[1]
+        y1 = certain(y1, well_conditioned(end, y1, rows, rows) | ~ok, y1)
         info = target.problem(t1, y0).report(candidate, y1, num_steps, ok=ok)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
         failed = cause_of_failure(info.ok, off, (vector, candidate, y1), None, None)
@@ -196,7 +187,7 @@ class SymmetricProjection(ForwardingSolver):
         result = dfx.RESULTS.where(
             (failed == 0) | (inner_failed & ~off), result, member(FIRST - 1 + failed)
         )
-        dense_info = dict(y0=y0, step=PackedTarget(StepOf(self, terms, args, state)))
+        dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
         statistics = state.statistics.add(info, None, None)
         state = _State(state.inner, state.values, state.hidden, multiplier, statistics)
         return y1, None, dense_info, state, result
@@ -276,23 +267,6 @@ def _solved(
     found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
     y, multiplier, candidate, result = found.y
     return Solved((y, multiplier), found.ok, found.num_steps + 1, (candidate, result))
-
-
-def _tangent(size: int, matrix: Float[Array, "N N"], right: Float[Array, " N"]) -> Array:
-    """Solves the linear system for the tangents of the state, of the given size, and of the
-    multiplier, by eliminating the state. Only the rest, the Schur complement, may be singular, if
-    constraints depend on each other."""
-    (a, b), (c, d) = (jnp.split(rows, [size], axis=1) for rows in jnp.split(matrix, [size]))
-    above, below = jnp.split(right, [size])
-    along, at = jnp.linalg.solve(a, b), jnp.linalg.solve(a, above)
-    gram = d - c @ along
-    multiplier = solve(gram, below - c @ at)
-    tangent = jnp.concatenate([at - along @ multiplier, multiplier])
-    if len(gram) > WRITTEN_OUT:
-        return tangent
-    # Half of the digits are right, or the constraint depends on others; see `well_conditioned`.
-    eps, found = float(jnp.finfo(gram.dtype).eps), pivots(gram, jnp.abs(jnp.diagonal(gram)))
-    return known_if(jnp.all((found >= eps**0.5) | (found <= ROUNDOFF * eps)), tangent)
 
 
 def _check_symmetric(solver: Any) -> None:

@@ -34,7 +34,7 @@ class Step(eqx.Module):
     **Attributes:**
 
     - `t0`, `t1`: the ends of the step; in a solve backwards in time `t1 < t0`.
-    - `y0`: the state $y_n$ at `t0`, which lies on the manifold.
+    - `y0`: the state $y_n$ at `t0`, on the manifold unless only every few steps are projected.
     - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
     """
 
@@ -205,16 +205,6 @@ def adapted(
     return dataclasses.replace(equations, **changed)
 
 
-def has_bounds(projection: AbstractProjection) -> bool:
-    """Whether the projection has bounds, or one of its stages."""
-
-    def takes_bounds(x: Any) -> bool:
-        return isinstance(x, AbstractProjection) and hasattr(x, "lower")
-
-    parts = filter(takes_bounds, jtu.tree_leaves(projection, is_leaf=takes_bounds))
-    return any(getattr(x, name, None) is not None for x in parts for name in ("lower", "upper"))
-
-
 def check_projection(projection: Any) -> None:
     if not isinstance(projection, AbstractProjection):
         name = getattr(projection, "__name__", "SimplifiedNewton")
@@ -229,7 +219,8 @@ class Target(eqx.Module):
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
-    - `motion`: how far each component may be moved; see `Equations`.
+    - `motion`: the unit of each component (see `State.motion_after`). It enlarges the scale and is
+      the default metric. It limits nothing.
     - `units`: those of the components where the projection has no metric of its own; `None` if they
       are one, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
@@ -242,10 +233,10 @@ class Target(eqx.Module):
     manifold: Manifold
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    motion: Float[Array, " n"] | None
-    units: Float[Array, " n"] | None
     args: Args
     direction: Real[Array, ""]
+    motion: Float[Array, " n"] | None = None
+    units: Float[Array, " n"] | None = None
     gained: Float[Array, "2 m"] | None = None
 
     def advanced(
@@ -282,7 +273,7 @@ class Target(eqx.Module):
         within = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
         noise = NOISE / ROUNDOFF * limit / 2
         follow = jnp.where(within, off - jnp.clip(off, -noise, noise), 0)
-        # The second row is subtracted from what is added next, so this adds `follow`.
+        # The next integral is added minus the second row, so that it is larger by `follow`.
         return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
 
     @property

@@ -11,9 +11,9 @@ from jaxtyping import ArrayLike, PyTree
 from .._custom_types import VF, Args, RealScalarLike, Y
 from .._manifold import check_vector_field
 from .._options import check_numbers
-from .._step.metric import spread
 from .._tree import ravel, unravel
 from .options import check_state
+from .within_bounds import Bounds
 
 
 def clipped(
@@ -92,11 +92,5 @@ class _Clipped(eqx.Module):
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> VF:
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`clipped`", jnp.inexact)
-        x = ravel(y)
-        lower = spread("lower", -jnp.inf if self.lower is None else self.lower, y)
-        upper = spread("upper", jnp.inf if self.upper is None else self.upper, y)
-        # A component exactly at its bound keeps its derivative, that from inside, which `jnp.clip`
-        # would change. A component that is NaN stays NaN.
-        x = jnp.where(x < lower, lower, jnp.where(x > upper, upper, x))
-        x = jnp.where(lower <= upper, x, jnp.nan)
+        x = Bounds.of(self.lower, self.upper, y).clip(ravel(y), slope=0.0)
         return self.vector_field(t, unravel(x, y), args)

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_STEPS, NEAREST, ROUNDOFF
+from .._constants import NEAREST, ROUNDOFF
 from .._step.equations import Equations, measured
 from .._step.implicit import Along, certain, root, solution, well_conditioned
 from .._step.iterate import Solved, damped
 from .._step.linear import equilibrated, gram_matrix, scaled_rows, solve, times
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
-from .options import NEWTON_OPTIONS, option
+from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, Bounds, project_within
 
 
@@ -60,8 +60,6 @@ class Newton(AbstractNewton):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, IV.4, (4.3).
     """
 
-    max_steps: int = option(MAX_STEPS, static=True)
-
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
@@ -75,12 +73,13 @@ class Newton(AbstractNewton):
         given = _Given(equations.dense(), candidate, bounds)
         # First phase: some point of the manifold.
         if bounds is None:
-            along = Along(equations, candidate, iteration=damped, max_steps=self.max_steps)
-            first = solution(along)
+            options: Any = dict(iteration=damped, max_steps=self.max_steps)
+            first = solution(Along(equations, candidate, **options))
         else:
             first = project_within(bounds, equations, candidate, max_steps=self.max_steps)
         if candidate.size + equations.magnitude.size > NEAREST:
-            y, count = certain(given.clip(first.y), False), first.num_steps
+            y, count = given.clip(first.y), first.num_steps
+            y = certain(y, False, y)
         else:
             y, count = _nearest(given, lax.stop_gradient(first.y), self.max_steps)
             count = first.num_steps + count
@@ -137,7 +136,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     lengths = jnp.sqrt(jnp.diagonal(gram))
     lengths = jnp.where(lengths > 0, lengths, 1)
     conditions = _Conditions(given, base, sizes * lengths)
-    places = [measured(x, equations.units) for x in (base, given.candidate)]
+    sizes_of = [jnp.abs(measured(x, equations.units)) for x in (base, given.candidate)]
     fits = solve(gram, times(rows, measured(base - given.candidate, equations.units))) * lengths
     scale = equations.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
@@ -150,7 +149,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     tested = dataclasses.replace(
         equations,
         parts=(conditions,),
-        magnitude=jnp.concatenate([sum(map(jnp.abs, places)), scale]),
+        magnitude=jnp.concatenate([sizes_of[0] + sizes_of[1], scale]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
         motion=None,
         units=None,
@@ -186,4 +185,4 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     equations, there = still.equations, lax.stop_gradient(y)
     gradients = scaled_rows(equations.in_units(equations.linearise(there)[1]))[1]
     is_known = ok & well_conditioned(equations, there, gradients, gradients)
-    return certain(y, is_known | ~equations.holds(there)), count
+    return certain(y, is_known | ~equations.holds(there), y), count

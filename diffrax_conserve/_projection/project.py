@@ -3,15 +3,15 @@
 import dataclasses
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import optimistix as optx
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
 from .._step.equations import shown_terms
 from .._step.roundoff import hidden_scale
-from .._tree import ravel
+from .._tree import ravel, tree_stop_gradient
 from .base import AbstractProjection, ProjectionInfo, Target, check_projection
 from .newton import Newton
 from .options import check_state
@@ -69,7 +69,7 @@ def project(
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
     hidden, direction = jnp.zeros_like(values), jnp.asarray(1)
-    target = Target(projection, manifold, values, hidden, None, None, args, direction)
+    target = Target(projection, manifold, values, hidden, args, direction)
     return _projected(target, t, y)
 
 
@@ -84,15 +84,12 @@ def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, Proj
     usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
     value, jacobian, hidden = hidden_scale(target.manifold, t, usable, target.args)
     there = dataclasses.replace(target, hidden=hidden).problem(t, candidate)
-    judged = there.report(ravel(candidate), ravel(y), info.num_steps)
-    # The projection may have its own tolerances, and then its own verdict counts, unless it assumed
-    # more roundoff than there is.
+    # A projection may have tolerances of its own. If it reports a success, we believe it, unless
+    # there is less than half of the roundoff that it assumed.
     shown = jnp.abs(value) + shown_terms(jacobian, jnp.abs(ravel(usable)))
-    ok = judged.ok | info.ok & jnp.all(target.hidden <= 2 * (shown + hidden))
-    kinds = optx.RESULTS
-    missed = kinds.where(info.ok, kinds.nonlinear_max_steps_reached, info.result)
-    result = kinds.where(ok, kinds.successful, missed)
-    return y, dataclasses.replace(judged, ok=ok, result=result)
+    ok = tree_stop_gradient(there.equations).holds(lax.stop_gradient(ravel(y)))
+    ok = ok | info.ok & jnp.all(target.hidden <= 2 * (shown + hidden))
+    return y, there.report(ravel(candidate), ravel(y), info.num_steps, ok=ok)
 
 
 def given_values(

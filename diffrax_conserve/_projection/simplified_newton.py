@@ -7,10 +7,9 @@ from typing import final
 
 from jaxtyping import Array, Float
 
-from .._constants import MAX_STEPS
 from .._step.implicit import Along, solution
 from .base import Problem, ProjectionInfo
-from .options import NEWTON_OPTIONS, option
+from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, project_within
 
 
@@ -52,8 +51,6 @@ class SimplifiedNewton(AbstractNewton):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, Section IV.4,
         equations (4.4) to (4.6).
     """
-
-    max_steps: int = option(MAX_STEPS, static=True)
 
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]

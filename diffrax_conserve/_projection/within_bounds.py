@@ -20,13 +20,13 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._constants import AT_BOUND
+from .._constants import AT_BOUND, MAX_STEPS
 from .._printing import is_traced
 from .._step.equations import Equations
 from .._step.implicit import Along, solution
 from .._step.iterate import Solved, bounded
 from .._step.metric import positive_weights, spread
-from .base import AbstractProjection, has_bounds
+from .base import AbstractProjection
 from .options import check_options, option
 
 
@@ -36,11 +36,20 @@ class Bounds(eqx.Module):
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
 
-    def clip(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
-        # A component exactly at its bound has the derivative one, that from inside. The derivative
-        # of `jnp.clip` there is another.
-        nothing = z - jax.lax.stop_gradient(z)  # zero, but with the derivative one
-        lower, upper = (x + AT_BOUND * nothing for x in (self.lower, self.upper))
+    @classmethod
+    def of(cls, lower: Any, upper: Any, like: Any) -> "Bounds":
+        """The bounds of a state of given shapes, of which `None` is none."""
+        low = -np.inf if lower is None else lower
+        high = np.inf if upper is None else upper
+        return cls(spread("lower", low, like), spread("upper", high, like))
+
+    def clip(self, z: Float[Array, " n"], *, slope: float = AT_BOUND) -> Float[Array, " n"]:
+        """`z` within the bounds, with the derivative `slope` where it is beyond them. A component
+        exactly at its bound has the derivative one, that from inside, unlike in `jnp.clip`."""
+        lower, upper = self.lower, self.upper
+        if slope:
+            nothing = z - jax.lax.stop_gradient(z)  # zero, but with the derivative one
+            lower, upper = lower + slope * nothing, upper + slope * nothing
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
         return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
@@ -74,6 +83,7 @@ class AbstractNewton(AbstractProjection):
 
     rtol: float | Array | None = option(None)
     atol: float | Array | None = option(None)
+    max_steps: int = option(MAX_STEPS, static=True)
     metric: PyTree[Any] | None = option(None, converter=positive_weights)
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
@@ -85,22 +95,14 @@ class AbstractNewton(AbstractProjection):
 
     def bounds(self, like: Any) -> Bounds | None:
         """The bounds for a state of given shapes, `None` if there are none."""
-        if not has_bounds(self):
-            return None
-        low = -np.inf if self.lower is None else self.lower
-        high = np.inf if self.upper is None else self.upper
-        return Bounds(spread("lower", low, like), spread("upper", high, like))
+        return Bounds.of(self.lower, self.upper, like) if bounded_parts(self) else None
 
 
-def nearest_within(
-    projection: AbstractProjection, like: Any, y: Float[Array, " n"]
-) -> Float[Array, " n"]:
-    """The nearest vector to `y` within the bounds of a projection, or of all of its stages."""
-    parts = jtu.tree_leaves(projection, is_leaf=lambda x: isinstance(x, AbstractNewton))
-    for part in parts:
-        bounds = part.bounds(like) if isinstance(part, AbstractNewton) else None
-        y = y if bounds is None else bounds.clip(y)
-    return y
+def bounded_parts(projection: AbstractProjection) -> list[AbstractNewton]:
+    """The projection and its stages, as far as they have bounds."""
+    is_newton = lambda x: isinstance(x, AbstractNewton)  # noqa: E731
+    parts = filter(is_newton, jtu.tree_leaves(projection, is_leaf=is_newton))
+    return [x for x in parts if x.lower is not None or x.upper is not None]
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

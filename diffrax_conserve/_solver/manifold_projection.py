@@ -12,12 +12,13 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._balance import has_rates
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
-from .._interpolation import MakeManifoldInterpolation, PackedTarget
+from .._interpolation import MakeManifoldInterpolation, Packed
 from .._manifold import Constraint, check_manifold, conserved_values, named_entries
 from .._options import check_counts, check_number
-from .._projection.base import AbstractProjection, Target, check_projection, has_bounds
+from .._projection.base import AbstractProjection, Target, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
+from .._projection.within_bounds import bounded_parts
 from .._step.equations import length, reach
 from .._step.iterate import any_lane
 from .._tree import ravel, tree_sub
@@ -69,10 +70,11 @@ class ManifoldProjection(ForwardingSolver):
     If the state has several leaves, each vector along the last axis of a leaf is one quantity, such
     as the place of a body, and $|\cdot|$ is its largest component: put quantities with unlike units
     into leaves of their own. If the state is one array, each component is a quantity. So the result
-    does not depend on the units of the leaves, or of the components of a single array, and a
-    quantity that never moves, such as a parameter, is never corrected. For a field in a single
-    array, all of whose components have one unit, pass `projection=SimplifiedNewton(metric=1.0)`,
-    which is the Euclidean metric: a travelling wave with all of its integrals kept needs it.
+    does not depend on the units of the leaves, or of the components of a single array. A quantity
+    that never moves, such as a parameter, counts as changing by $\varepsilon$ of itself, so that it
+    is hardly corrected if another can be. For a field in a single array, all of whose components
+    have one unit, pass `projection=SimplifiedNewton(metric=1.0)`, which is the Euclidean metric: a
+    travelling wave with all of its integrals kept needs it.
     Stochastic equations have the Euclidean metric in the numbers of the state, because there the
     metric decides which equation is solved: for mixed units pass
     `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`.
@@ -130,11 +132,11 @@ class ManifoldProjection(ForwardingSolver):
         check_nested(self.solver)
         check_projection(self.projection)
         free = isinstance(self.manifold, Constraint) and self.manifold.fn is _nothing
-        check_manifold(() if free and not has_bounds(self.projection) else self.manifold)
+        check_manifold(() if free and not bounded_parts(self.projection) else self.manifold)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
         check_counts(every=self.every)
-        if has_bounds(self.projection) and self.every > 1:
+        if bounded_parts(self.projection) and self.every > 1:
             raise ValueError(
                 "`projection` has bounds, which a step that is not projected does not keep: leave "
                 "out `every`, or `lower` and `upper`."
@@ -230,7 +232,7 @@ class ManifoldProjection(ForwardingSolver):
             shift=tree_sub(y1, candidate),
             limit=reach(ravel(y0), ravel(y1), units),
             error=None if step is None else error,
-            target=PackedTarget(start),
+            target=Packed(start),
             due=due,
         )
         # diffrax looks at the result of a step only if the step is accepted. So a failed step
@@ -262,11 +264,11 @@ class ManifoldProjection(ForwardingSolver):
             self.manifold,
             state.values,
             state.hidden,
-            motion,
-            motion if is_ode(terms) else None,
             args,
             time_direction(terms, t),
-            state.gained,
+            motion=motion,
+            units=motion if is_ode(terms) else None,
+            gained=state.gained,
         )
 
     def _cannot_start(

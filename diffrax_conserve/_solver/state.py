@@ -28,7 +28,7 @@ from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
 
-_SMALLER = (
+_ADVICE = (
     "Take smaller steps, or pass `projection=diffrax_conserve.Newton()` to a `ManifoldProjection`, "
     "which copes with far candidates. Check by `check_invariance` that the quantity is conserved "
     "at all. "
@@ -45,12 +45,12 @@ FIRST = register(
     "the solve there, `project`, and go on. " + _ENTRY,
     "the projection of a step failed: the state that the wrapped solver proposed is not finite, or "
     "a function of the manifold there, or the iteration diverged. Check the vector field and `fn`. "
-    + _SMALLER
+    + _ADVICE
     + _ENTRY,
     "the projection of a step failed: the correction is a larger share of the step than "
     "`max_correction` allows. Check by `check_invariance` that the quantity is conserved at all, "
     "take smaller steps, or pass another `max_correction`.",
-    "the projection of a step failed: the manifold was not reached. " + _SMALLER + "If it is, the "
+    "the projection of a step failed: the manifold was not reached. " + _ADVICE + "If it is, the "
     "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
     "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
 )

@@ -20,7 +20,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._constants import ROUNDOFF, WRITTEN_OUT
-from .._large.sparse import SparseRows
 from .._tree import tree_tangents, unflatten, without_pattern
 from .equations import Equations, Jacobian, measured
 from .iterate import Solved, nearby
@@ -139,13 +138,13 @@ def well_conditioned(
 ) -> Bool[Array, ""]:
     """Whether a derivative at the state `y` that is solved for with `rows alongᵀ` has digits.
 
-    Its error is one unit of roundoff over the pivot of a constraint. So half of the digits are
-    right if no pivot is below the root of roundoff. A constraint that depends on others everywhere
-    does no harm. To tell it from one whose gradient is nearly parallel only here, we look at
-    another state, each component of which has the same sign and another size. More than four
-    constraints are not tested.
+    The error of the derivative is one unit of roundoff over the pivot of a constraint. So half of
+    its digits are right if no pivot is below the root of roundoff. A constraint that depends on
+    others everywhere does no harm. To tell it from one whose gradient is nearly parallel only here,
+    we look at another state, each component of which has the same sign and another size. More than
+    four constraints are not tested.
     """
-    if len(rows) > WRITTEN_OUT or isinstance(rows, SparseRows) or isinstance(along, SparseRows):
+    if len(rows) > WRITTEN_OUT:
         return jnp.asarray(True)
     eps = float(jnp.finfo(y.dtype).eps)
     determined = _pivots(rows, along) >= eps**0.5
@@ -156,7 +155,7 @@ def well_conditioned(
     return jnp.all(determined | (_pivots(beside, beside) <= ROUNDOFF * eps))
 
 
-def _pivots(rows: Array, along: Array) -> Float[Array, " m"]:
+def _pivots(rows: Any, along: Any) -> Float[Array, " m"]:
     lengths = jnp.linalg.norm(rows, axis=1) * jnp.linalg.norm(along, axis=1)
     return jnp.where(lengths > 0, pivots(gram_matrix(rows, along), lengths), 1)
 
@@ -167,19 +166,20 @@ def known_if(is_known: Any, tangent: Array) -> Array:
 
 
 @jax.custom_jvp
-def certain(y: Array, is_known: Any) -> Array:
-    """`y`, whose derivative is NaN where it is not known."""
-    del is_known
+def certain(y: Array, is_known: Any, like: Array) -> Array:
+    """`y`, with the derivative of `like` where it is known, and NaN elsewhere."""
+    del is_known, like
     return y
 
 
 @certain.defjvp
 def _certain_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return primals[0], known_if(primals[1], tangents[0])
+    y, is_known, _ = primals
+    return y, known_if(is_known, tangents[2])
 
 
 @final
-class General(AbstractSystem):
+class SquareSystem(AbstractSystem):
     """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that
     solves them from a guess. The linear systems have their dense Jacobian."""
 
@@ -215,7 +215,7 @@ def root(
     systems. The arrays over which the functions close, such as parameters, have their derivatives
     too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
-    return solution(General(residual, iterate, guess, solve))
+    return solution(SquareSystem(residual, iterate, guess, solve))
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:

@@ -56,10 +56,11 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 def corrected(rows: Any, along: Any, b: Float[Array, " m"]) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
 
-    Up to four constraints we do not multiply by the multipliers. If gradients are nearly parallel,
-    these are large and cancel in the sum. XLA may evaluate `b` once for each of them, with another
-    rounding each time, and then they do not cancel. So the elimination is applied to the rows too,
-    `(R⁻ᵀ along)ᵀ (L⁻¹ b)` for `rows alongᵀ = L R`: differences are taken before anything is large.
+    If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
+    the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
+    then they do not cancel. So up to four constraints we do not form the multipliers. With the
+    factors `rows alongᵀ = L R` we compute `(R⁻ᵀ along)ᵀ (L⁻¹ b)`: the elimination takes the
+    differences of nearly parallel rows before anything is large.
     """
     gram = gram_matrix(rows, along)
     if _is_large(gram):

@@ -220,10 +220,6 @@ def test_what_is_admissible():
     gains = dfc.FirstIntegral(lambda t, y, args: y[0], rate=lambda t, y, args: 0 * y[0])
     with pytest.raises(ValueError, match="rate"):
         dfc.SymmetricProjection(dfc.ImplicitMidpoint(), gains)
-    with pytest.raises(ValueError, match="tolerances"):
-        dfc.ImplicitMidpoint(root_finder=dfx.with_stepsize_controller_tols(dfx.VeryChord)())
-    with pytest.raises(TypeError, match="root_finder"):
-        dfc.ImplicitMidpoint(root_finder=1e-8)
     trapezoidal = dfc.SymmetricProjection(Trapezoidal(), RIGID_BODY)
     there = solve(rigid_body, trapezoidal, W0, 0.0, 2.0, 0.1)
     assert dfx.is_okay(there.result)
