@@ -3,7 +3,6 @@
 from typing import Any, ClassVar, final
 
 import diffrax as dfx
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -22,8 +21,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
     $$y_{n+1} = y_n + h f(t_n + \tfrac{h}{2}, \tfrac{1}{2} (y_n + y_{n+1}))$$
 
     is of second order, symmetric (a step backwards undoes a step) and symplectic, and it keeps
-    every quadratic first integral. All this holds as far as the equation is solved. By default that
-    is to roundoff, by a chord iteration whose Jacobian is that at the start of the step.
+    every quadratic first integral. The equation is solved to 16 units of roundoff of
+    $|y_n| + |h f|$, by a chord iteration whose Jacobian is that at the start of the step.
 
     It has no error estimate, because a step size that follows the error is not symmetric. Dense
     output is the cubic Hermite polynomial through both ends.
@@ -47,7 +46,6 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
         Hairer, Lubich and Wanner, *Geometric Numerical Integration*, Springer 2006, II.1 and V.2.
     """
 
-    root_finder: optx.AbstractRootFinder | None = option(None)
     root_find_max_steps: int = option(MAX_STEPS, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
@@ -55,19 +53,6 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 
     def __check_init__(self):
         check_counts(root_find_max_steps=self.root_find_max_steps)
-        if self.root_finder is None:
-            return
-        if not isinstance(self.root_finder, optx.AbstractRootFinder):
-            raise TypeError(
-                f"`root_finder` is {self.root_finder!r}, which is not a root finder of "
-                "optimistix or diffrax. Leave it out, or pass for example "
-                "`optimistix.Newton(rtol=0, atol=4e-15)`."
-            )
-        if not eqx.is_array_like(getattr(self.root_finder, "rtol", 0.0)):
-            raise ValueError(
-                "`root_finder` takes its tolerances from a step size controller, but steps of "
-                "`ImplicitMidpoint` are fixed. Leave it out, or give it `rtol` and `atol`."
-            )
 
     def order(self, terms: dfx.AbstractTerm) -> int:
         del terms
@@ -105,10 +90,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
             new = slope(y)
             return jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units)
 
-        finder = self.root_finder
-        if finder is None:
-            eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(units))).eps)
-            finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
+        eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(units))).eps)
+        finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
         guess = jtu.tree_map(lambda k, unit: k / unit, k0, units)
         solved = optx.root_find(
             relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
@@ -124,15 +107,8 @@ class ImplicitMidpoint(dfx.AbstractSolver[None]):
 
 ImplicitMidpoint.__init__.__doc__ = """**Arguments:**
 
-- `root_finder`: a root finder of optimistix or diffrax with tolerances of its own. Its unknown is
-    the increment $h f$, each component divided by $|y_n| + |h f|$, so that both tolerances are
-    relative to the state. Default: `optimistix.Chord` with 16 units of roundoff.
-- `root_find_max_steps`: the largest number of its iterations. If they are not enough, the solve
-    ends, and its `result` says so.
-
-**Raises:**
-
-`TypeError` if `root_finder` is none; `ValueError` if it has no tolerances of its own.
+- `root_find_max_steps`: the largest number of iterations. If they are not enough, the solve ends,
+    and its `result` says so.
 """
 
 
