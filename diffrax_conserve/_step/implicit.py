@@ -23,7 +23,7 @@ from .._constants import ROUNDOFF, WRITTEN_OUT
 from .._tree import tree_tangents, unflatten, without_pattern
 from .equations import Equations, Jacobian, measured
 from .iterate import Solved, nearby
-from .linear import combined, corrected, gram_matrix, pivots, scaled_rows, solve, times
+from .linear import combined, corrected, eliminated, gram_matrix, scaled_rows, solve, times
 
 
 class AbstractSystem(eqx.Module):
@@ -157,7 +157,8 @@ def well_conditioned(
 
 def _pivots(rows: Any, along: Any) -> Float[Array, " m"]:
     lengths = jnp.linalg.norm(rows, axis=1) * jnp.linalg.norm(along, axis=1)
-    return jnp.where(lengths > 0, pivots(gram_matrix(rows, along), lengths), 1)
+    pivots = eliminated(gram_matrix(rows, along), lengths, rows)[2]
+    return jnp.where(lengths > 0, jnp.abs(pivots) / jnp.where(lengths > 0, lengths, 1), 1)
 
 
 def known_if(is_known: Any, tangent: Array) -> Array:

@@ -65,7 +65,7 @@ def corrected(rows: Any, along: Any, b: Float[Array, " m"]) -> Float[Array, " n"
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b), along)
-    return combined(*eliminated(gram, b, along))
+    return combined(*eliminated(gram, b, along)[:2])
 
 
 def solve(gram: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -74,7 +74,7 @@ def solve(gram: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
         return refined(gram.factored(), gram.times, b)
     if _is_large(gram):
         return refined(factored(gram), lambda x: combined(x, gram.T), b)
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype)))
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype))[:2])
 
 
 def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -118,7 +118,7 @@ def factored(gram: Any) -> Solve:
     matrix = gram * unit[:, None] * unit
     if not _is_large(gram):
         one = jnp.eye(len(gram), dtype=gram.dtype)
-        below, above = eliminated(matrix, one, one)
+        below, above, _ = eliminated(matrix, one, one)
         return Factors(below, above.T, unit)
     return _large_factors(matrix, unit)
 
@@ -149,9 +149,11 @@ def refined(
 
 def eliminated(
     gram: Float[Array, "m m"], b: Array, rows: Array
-) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+) -> tuple[Array, Array, Float[Array, " m"]]:
     """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
-    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`."""
+    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`. Also the
+    pivots. Relative to the squares of the lengths of rows they are the squares of the sines of the
+    angles between the gradient of each constraint and those before it."""
     m, least = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
@@ -165,19 +167,7 @@ def eliminated(
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         b[k] = b[k] / pivot
-    return jnp.stack(b), jnp.stack(rows)
-
-
-def pivots(gram: Float[Array, "m m"], sizes: Float[Array, " m"]) -> Float[Array, " m"]:
-    """The pivots of a small matrix `U Vᵀ` relative to `sizes`, the lengths of the rows of `U` times
-    those of `V`. They are the squares of the sines of the angles between the gradient of each
-    constraint and those before it, so that they are roundoff where it depends on these."""
-    sizes = jnp.where(sizes > 0, sizes, 1)
-    for k in range(len(gram)):
-        regular = jnp.abs(gram[k, k]) > ROUNDOFF * float(jnp.finfo(gram.dtype).eps) * sizes[k]
-        share = gram[:, k] / jnp.where(regular, gram[k, k], jnp.inf)
-        gram = gram - jnp.where(np.arange(len(gram)) > k, share, 0)[:, None] * gram[None, k]
-    return jnp.abs(jnp.diagonal(gram)) / sizes
+    return jnp.stack(b), jnp.stack(rows), jnp.stack([matrix[k][k] for k in range(m)])
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
