@@ -221,7 +221,7 @@ NAMES = [
 ]
 
 
-@some_of("name", NAMES, ids=NAMES, period=5)
+@some_of("name", NAMES, ids=NAMES, period=15)
 def test_every_pretrained_network_errs_as_noted(name):
     network, file = dfc.load_pretrained(name), pretrained_path(name)
     info = read_info(file)["info"]

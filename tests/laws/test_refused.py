@@ -263,7 +263,7 @@ SOLVED = [(name, dtype) for name, (*_, dtypes) in CASES.items() for dtype in dty
 
 
 @some_of(
-    "name, dtype", SOLVED, ids=[f"{name}-{dtype.__name__}" for name, dtype in SOLVED], period=4
+    "name, dtype", SOLVED, ids=[f"{name}-{dtype.__name__}" for name, dtype in SOLVED], period=10
 )
 def test_right_solves_succeed(name, dtype):
     make, options, seed, _ = CASES[name]
@@ -272,13 +272,8 @@ def test_right_solves_succeed(name, dtype):
     assert len(found) <= case.allowed, jax.tree.map(lambda x: x[found[:5]], case.y0)
 
 
-@pytest.mark.parametrize(
-    "dtype",
-    [
-        np.float64,
-        *(pytest.param(x, marks=pytest.mark.slow) for x in (np.float64, np.float32)),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_almost_circular_orbits_in_a_batch_are_solved(dtype):
     """By the flags of `make slow`, but not by those of the tests, XLA evaluates the residuals once
     for each multiplier."""
@@ -292,7 +287,7 @@ def to_values(fn, candidate, value):
     return y, info.ok
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@some_of("dtype", [np.float64, np.float32], ids=["float64", "float32"], period=2)
 def test_far_candidates_reach_a_pendulum_near_rest(dtype):
     """The terms that cancel at the result are not those at the candidate."""
     rng = np.random.default_rng(1)
@@ -346,6 +341,7 @@ def toda(t, y, args):
     return jnp.stack([y[1], jnp.roll(force, 1) - force])
 
 
+@pytest.mark.slow
 def test_small_vibrations_are_moved_by_little():
     """The energy has only roundoff, which is not corrected where the momentum is."""
     amplitude = 10 ** np.random.default_rng(2).uniform(-12, -5, (100, 1, 1))
@@ -387,7 +383,8 @@ def test_an_energy_of_many_pairs_needs_no_memory_for_all_of_them():
     assert needed.temp_size_in_bytes < 100 * q.nbytes, needed  # one array for all pairs is 333
 
 
-@some_of("dtype", [np.float64, np.float32], ids=["float64", "float32"], period=2)
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_amounts_may_be_spent(dtype):
     """Of an enzyme: near rest a step overshoots zero by its error."""
 
@@ -414,7 +411,9 @@ def test_amounts_may_be_spent(dtype):
     assert np.all(results), [np.flatnonzero(~x)[:9] for x in np.asarray(results)]
 
 
-@pytest.mark.parametrize("projection", [dfc.SimplifiedNewton(), dfc.Newton()])
+@some_of(
+    "projection", [dfc.SimplifiedNewton(), dfc.Newton()], ids=["simplified", "newton"], period=2
+)
 def test_products_of_matrices_have_all_digits(projection):
     """By default those in float32 have three on a GPU: a right network was refused there."""
     matrix = jnp.linspace(-1.0, 1.0, 48, dtype=jnp.float32).reshape(6, 8)

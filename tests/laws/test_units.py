@@ -158,6 +158,7 @@ SEVEN = {
 }
 
 
+@pytest.mark.slow
 def test_the_seven_integrals_of_an_orbit_in_space_of_which_five_are_independent():
     a, e, turns = 7.078e6, np.array([0.0, 1e-8, 1e-4, 1e-2, 0.3]), 5
     rate, size = np.sqrt(EARTH / a**3), np.repeat([a, np.sqrt(EARTH / a)], 3)
@@ -183,6 +184,7 @@ def test_the_seven_integrals_of_an_orbit_in_space_of_which_five_are_independent(
         assert np.all(iterations <= 12)
 
 
+@pytest.mark.slow
 def test_newton_finds_perigees_on_circles_in_what_closes_over_a_traced_value():
     a, phases = 4.2164e7, np.linspace(0.3, 6.0, 8)
     rate = np.sqrt(EARTH / a**3)
@@ -221,7 +223,7 @@ PEOPLES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("proton", float), ("electron", np.float32)])
+@some_of("name, dtype", [("proton", float), ("electron", np.float32)], ids=PEOPLES, period=2)
 def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype):
     field, manifold, rate, state = PEOPLES[name]
     phases, eps = np.linspace(0, 16 * np.pi, 161), np.finfo(dtype).eps
