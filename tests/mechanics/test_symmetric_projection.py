@@ -43,7 +43,8 @@ def final(sol):
 
 
 def difference(a, b):
-    return max(largest(x - y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return max(largest(np.subtract(x, y)) for x, y in pairs)
 
 
 def drift(y, y0):

@@ -179,7 +179,7 @@ def saved_in_a_long_step(projection, within):
     return solution.ts, solution.ys, dfc.off_manifold(solution, TOTAL, within)
 
 
-@pytest.mark.parametrize(
+@some_of(
     "projection",
     [
         dfc.SimplifiedNewton(lower=0.0),
@@ -187,6 +187,7 @@ def saved_in_a_long_step(projection, within):
         dfc.Staged(("total", dfc.SimplifiedNewton(lower=0.0))),
     ],
     ids=["simplified", "newton", "staged"],
+    period=3,
 )
 def test_saved_states_are_within_the_bounds_and_one_that_cannot_be_projected_is_told(projection):
     _, ys, off = saved_in_a_long_step(projection, jnp.array(True))

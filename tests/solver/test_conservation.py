@@ -57,6 +57,7 @@ def test_drift_does_not_grow_over_many_steps():
 ORBIT = dfc.systems.Kepler()
 
 
+@pytest.mark.slow
 @settings(max_examples=2)
 @given(packing=dct.restructurings(ORBIT.y0))
 def test_any_pytree_is_a_state(packing):
@@ -108,7 +109,11 @@ def test_published_error_of_rk4(num_steps, error):
 
 @pytest.mark.parametrize(
     ("manifold", "error"),
-    [(None, 1.46), (KEPLER[0], 3.48e-2), (KEPLER, 8.69e-3)],
+    [
+        (None, 1.46),
+        pytest.param(KEPLER[0], 3.48e-2, marks=pytest.mark.slow),
+        (KEPLER, 8.69e-3),
+    ],
     ids=["plain", "energy", "energy and momentum"],
 )
 def test_published_error_of_kepler(manifold, error):
@@ -170,6 +175,7 @@ def test_same_steps_and_dense_output(solver):
     assert_same_steps(adaptive(dfc.Unrolled(solver)), adaptive(solver))
 
 
+@pytest.mark.slow
 def test_same_steps_by_a_tableau_alone():
     unrolled, again = (dfc.Unrolled(dfx.Tsit5().tableau) for _ in range(2))
     assert unrolled == again

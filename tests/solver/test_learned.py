@@ -144,7 +144,11 @@ ADAPTIVE = [name for name, case in CASES.items() if case[0] is not FOLLOW and na
 
 
 @pytest.mark.parametrize(
-    ("name", "adaptive"), [*((name, False) for name in CASES), *((name, True) for name in ADAPTIVE)]
+    ("name", "adaptive"),
+    [
+        *((name, False) for name in CASES),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in ADAPTIVE),
+    ],
 )
 def test_nothing_raises_in_a_batch(name, adaptive, errors_raise):
     """Every lane ends by itself, with its own result: an exception would end all of them."""
@@ -169,10 +173,10 @@ def test_nothing_raises_in_a_batch(name, adaptive, errors_raise):
 def test_each_leaf_of_the_start_is_compared_in_its_own_unit():
     y0 = {"position": jnp.array(1.5e11), "velocity": jnp.array(3e4)}
     solver = dfc.PINNSolver(dfc.PINN(y0, 0.0, 1.0, key=jr.key(0)))
+    field = lambda t, y, args: y  # noqa: E731
     for factor, right in ((1.0, True), (1.01, False)):
         other = y0 | {"velocity": factor * y0["velocity"]}
-        term = dfx.ODETerm(lambda t, y, args: y)
-        sol = dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.5, other, throw=False)
+        sol = problems.solve(field, solver, other, dt0=0.5, throw=False)
         assert (sol.result == dfx.RESULTS.successful) == right
 
 
