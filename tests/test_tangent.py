@@ -116,6 +116,7 @@ def test_all_constraints_make_the_same_field_as_that_of_the_velocity():
     assert dfc.check_invariance(ROD, ROD_MANIFOLD, STATES).ok
 
 
+@pytest.mark.slow
 def test_a_gain_lets_the_residual_decay():
     """`g' = -gain g`, also for an integral with a value and a constraint that moves with time."""
     manifold = (

@@ -223,7 +223,8 @@ PEOPLES = {
 }  # fmt: skip
 
 
-@some_of("name, dtype", [("proton", float), ("electron", np.float32)], ids=PEOPLES, period=2)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "dtype"), [("proton", float), ("electron", np.float32)])
 def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype):
     field, manifold, rate, state = PEOPLES[name]
     phases, eps = np.linspace(0, 16 * np.pi, 161), np.finfo(dtype).eps

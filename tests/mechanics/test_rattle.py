@@ -193,6 +193,7 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     assert difference(slope, v) < 0.01
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_against_finite_differences():
     """Of a closed loop, whose multipliers are not unique."""
     y0 = jnp.array([[1.0, 0.0], [1.0, 1.0]]), jnp.array([[0.0, 0.3], [-0.3, 0.3]])
@@ -228,7 +229,7 @@ def test_constraints_given_several_times_change_nothing(beads, times):
     assert difference(*found) < 1e-13
 
 
-@pytest.mark.parametrize("squares", [7, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("squares", [1, pytest.param(7, marks=pytest.mark.slow)])
 def test_one_brace_too_many_changes_nothing(squares):
     """The second diagonal of a rigid square says nothing new on the constraint, but contradicts the
     other rods a little off it. In a dense matrix, and in blocks."""

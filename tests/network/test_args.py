@@ -75,7 +75,7 @@ def test_its_polynomial_has_the_args_of_the_call():
 
 def test_a_repeated_flow_map_hands_args_on():
     outer = dfc.learned.Repeated(family(), 2)
-    inner, twice = jax.jit(outer.flow_map), jax.jit(outer)
+    inner, twice = eqx.filter_jit(outer.flow_map), eqx.filter_jit(outer)
     expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
     np.testing.assert_allclose(twice(Y0, ARGS, 0.4), expected, rtol=1e-13)
     y = Y0

@@ -79,7 +79,7 @@ def test_the_manifold_is_functionally_independent(system):
     assert np.linalg.svd(rows, compute_uv=False).min() > 1e-4
 
 
-@every_system
+@some_systems
 def test_samples_differ_and_are_like_y0(system):
     ys = samples(system.name)
     for x, x0 in zip(jtu.tree_leaves(ys), jtu.tree_leaves(system.y0), strict=True):
@@ -142,7 +142,7 @@ def test_the_solution_returns_after_a_period(system):
         np.testing.assert_allclose(ys, np.stack([ravel_pytree(y)[0]] * 5), atol=1e-12)
 
 
-@every_system
+@some_systems
 def test_what_is_drawn_and_said_of_a_system(system):
     curves = system.trajectories(samples(system.name))
     assert curves
