@@ -109,6 +109,7 @@ def test_a_mechanism_agrees_with_angles():
     assert distance(found, end) < 1e-8
 
 
+@pytest.mark.slow
 def test_all_constraints_make_the_same_field_as_that_of_the_velocity():
     both = dfc.tangent(FALLING, ROD_MANIFOLD, metric=(jnp.inf, jnp.ones(2)))
     one, two = jax.jit(jax.vmap(lambda y: [f(0.0, y, None) for f in (ROD, both)]))(STATES)

@@ -18,7 +18,6 @@ from diffrax_conserve._solver.state import State
 from diffrax_conserve._tree import ravel
 
 from ..problems import RIGID_BODY, rigid_body
-from ..thinned import some_of
 
 
 def kepler(t, y, mu):
@@ -83,7 +82,10 @@ def natural(field, manifold, y0, solver, projection):
     )
 
 
-@some_of("name", SYSTEMS, period=3)
+@pytest.mark.parametrize(
+    "name",
+    ["rigid body", *(pytest.param(x, marks=pytest.mark.slow) for x in ("Kepler", "pendulum"))],
+)
 def test_powers_of_two_as_units_change_nothing(name):
     _, manifold, y0, *_ = SYSTEMS[name]
     run, shapes = natural(*SYSTEMS[name]), (len(y0), (), len(manifold))

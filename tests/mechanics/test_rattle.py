@@ -144,6 +144,7 @@ def test_second_order_against_the_equations_of_motion():
     assert difference(*forces(exact)) < 1e-12
 
 
+@pytest.mark.slow
 def test_momenta_in_the_place_of_velocities():
     pair = dfx.ODETerm(lambda t, p, args: p / MASSES), dfx.ODETerm(springs)
     momenta = dfc.RATTLE(dfc.Constraint(rods), 1.0)
@@ -213,10 +214,8 @@ def test_derivatives_in_both_modes_against_finite_differences():
     assert abs(reverse - forward(at)[1]) < 1e-11
 
 
-@pytest.mark.parametrize(
-    ("beads", "times"),
-    [(3, 2), *(pytest.param(*x, marks=pytest.mark.slow) for x in [(12, 4), (20, 2)])],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("beads", "times"), [(3, 2), (12, 4), (20, 2)])
 def test_constraints_given_several_times_change_nothing(beads, times):
     """In a dense matrix, and in blocks."""
     angles = 0.3 * jnp.arange(1.0, beads + 1)
@@ -270,6 +269,7 @@ def test_a_lane_is_that_lane_alone_and_float32_works():
     assert difference(final(sol), jax.tree.map(lambda y: y[0], together)) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_moving_constraint_a_frozen_bead_and_a_plane():
     """A pendulum whose pivot goes up and down; a wall; `z = 0` has no scale of its own."""
 

@@ -160,6 +160,7 @@ def test_a_lane_is_that_lane_alone_and_float32_works():
     assert difference(sol.ys[-1], together[0]) < 1e-5
 
 
+@pytest.mark.slow
 def test_time_dependent_constraint_and_a_repeated_one_backwards_in_time():
     """`|y| = 1 + t / 2` along `y' = y / (2 + t)`, turned."""
 

@@ -124,6 +124,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     assert gained == pytest.approx(lost, rel=3e-2)
 
 
+@pytest.mark.slow
 @some_of("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"], period=2)
 def test_a_damped_system_comes_to_rest(dtype):
     """The roundoff of a long sum would keep the energy from its least value."""

@@ -98,6 +98,7 @@ def test_leaving_the_domain_fails_at_a_time(errors_raise):
     assert solve(solver, t1=2.0).result == dfx.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
     solver = unchecked(BARE, outside="fail", max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
@@ -114,6 +115,7 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
     assert found.number == 0
 
 
+@pytest.mark.slow
 def test_another_solver_takes_all_steps_outside_and_none_inside():
     solver = dfx.Dopri5()
     sol = solve(unchecked(KNOWS, outside=solver), saveat=STATE)

@@ -13,6 +13,7 @@ import diffrax_conserve as dfc
 
 from .. import problems
 from ..learned import LORENZ, flow_map, solution, unchecked
+from ..thinned import some_of
 
 # Random weights; the path of the other core changes too fast for the dense output.
 DEEPONET, PINN = flow_map(core="concatenated"), solution()
@@ -46,7 +47,7 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@SOLVERS
+@some_of("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"], period=2)
 def test_events(solver):
     # The component that changes most in the step from 0.5 to 0.75 crosses the mean of its ends.
     ends = path(solver, 0.5), path(solver, 0.75)

@@ -272,6 +272,7 @@ def test_an_unknown_that_is_zero():
         assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
 
 
+@pytest.mark.slow
 def test_a_solve_that_comes_to_rest():
     """All that a gradient shows of `c exp(z) - c - x` vanishes there, and its roundoff does not."""
     dae = dfc.SemiExplicitDAE(lambda t, x, z, c: -x, lambda t, x, z, c: c * jnp.exp(z) - c - x)

@@ -69,6 +69,7 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
 
 
+@pytest.mark.slow
 def test_dense_output_goes_through_the_corrected_path():
     ts = jnp.array([0.07, 0.4, 0.93])
     reference = LORENZ.reference(ts)
