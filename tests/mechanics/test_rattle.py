@@ -249,6 +249,7 @@ def test_one_brace_too_many_changes_nothing(squares):
     assert difference(end(sides + diagonals), end(sides + diagonals[:1])) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_lane_is_that_lane_alone_and_float32_works():
     speeds = jnp.array([0.0, 0.5, -1.0])
 

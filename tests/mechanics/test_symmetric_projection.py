@@ -146,6 +146,7 @@ def test_derivatives_in_both_modes_against_finite_differences():
     assert difference(forward(W0, one)[1], by_scale) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_lane_is_that_lane_alone_and_float32_works():
     lanes = jnp.stack([W0, 2 * W0, W0[::-1]])
 

@@ -84,6 +84,7 @@ def test_a_repeated_flow_map_hands_args_on():
     np.testing.assert_allclose(solve(outer, ARGS).ys[0], y, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_by_args_are_those_of_differences():
     dct.assert_gradients(lambda a: solve(family(), a).ys[0], ARGS, rtol=1e-7, forward=False)
 

@@ -65,6 +65,7 @@ def explosive(t, y, args):
     return y**2
 
 
+@pytest.mark.slow
 def test_trajectories_are_solutions():
     ts, ys = dfc.learned.trajectories(oscillator, Y0S[:4], TS[:4], rtol=1e-10)
     np.testing.assert_array_equal(ts, TS[:4])
