@@ -102,6 +102,7 @@ def test_projecting_the_free_field_is_not_enough():
     assert all(distance(final(FALLING, solver, PENDULUM.y0, n), end) > 0.1 for n in (200, 400))
 
 
+@pytest.mark.slow
 def test_a_mechanism_agrees_with_angles():
     solver = dfc.ManifoldProjection(dfc.RK4(), DOUBLE_MANIFOLD)
     end = cartesian(*final(in_angles, dfc.RK4(), ANGLES))

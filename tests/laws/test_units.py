@@ -131,6 +131,7 @@ def orbit(ts, y0, mu, size):
     return [solve(solver, *times, y0, mu) for solver in (dfx.Dopri8(), projected)]
 
 
+@pytest.mark.slow
 def test_orbits_beat_plain_and_no_saved_state_is_of_another_time():
     mu, a, e = np.transpose(LANES)[:, :, None]
     rate = np.sqrt(mu / a**3)

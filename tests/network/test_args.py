@@ -98,6 +98,7 @@ def test_draws_are_in_the_box_and_everywhere():
         np.testing.assert_allclose(jnp.mean(leaf, axis=0), 0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_args_outside_their_domain_are_steps_outside():
     network, state = family(), dfx.SaveAt(t1=True, solver_state=True)
 

@@ -162,6 +162,7 @@ def test_its_step_against_keplers_equation():
     assert np.max(error) < 2e-5
 
 
+@pytest.mark.slow
 def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
     """Small orbits can start inside and be too fast a quarter later."""
     size = np.geomspace(0.05, 20, 8000)

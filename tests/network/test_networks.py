@@ -131,6 +131,7 @@ def test_untrained_it_has_the_order_of_its_polynomial(core, order):
     np.testing.assert_allclose(slopes, -(order + 1), atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_solve_across_windows():
     pinn = dfc.PINN(EAST, 0.0, 4.0, windows=2, width=8, depth=1, slope=2.0, key=jr.key(0))
     end = pinn.window(0)(2.0)

@@ -48,7 +48,7 @@ def values(manifold, y):
     return {name: entry.fn(0.0, y, None) for name, entry in manifold.items()}
 
 
-@some_of("system", SYSTEMS.values(), ids=SYSTEMS, period=3)
+@some_systems
 def test_invariants_are_conserved_by_the_equations(system):
     report = check_invariance(system.vector_field, system.manifold, samples(system.name))
     assert report.ok, str(report)

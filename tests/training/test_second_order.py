@@ -142,6 +142,7 @@ def test_the_recipe_goes_by_size():
     assert dfc.learned.second_order(flow_map()).optimiser == "spring"
 
 
+@pytest.mark.slow
 def test_reachable_states_are_on_the_solutions():
     angles = jr.uniform(jr.key(1), (30,)) * 6
     y0s = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1) * 2
