@@ -183,6 +183,7 @@ def test_same_steps_by_a_tableau_alone():
     assert_same_steps(adaptive(unrolled, (1.5,), error_order=5), adaptive(dfx.Tsit5(), (1.5,)))
 
 
+@pytest.mark.slow
 def test_rk4_is_its_tableau_and_has_no_error_estimate():
     rk4 = dfc.RK4()
     assert not isinstance(rk4, dfx.AbstractAdaptiveSolver)
