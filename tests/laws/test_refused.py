@@ -76,11 +76,13 @@ def slow_bodies(rng, tol):
 
 
 def vibrations(rng, centre, rests):
-    """Small, far from the origin: first steps are much too long, but short beside the state."""
+    """Small, in numbers far from zero, the velocity too: first steps are much too long, but short
+    beside the state."""
     amplitude = max(abs(centre), 1) * 10 ** rng.uniform(-10, 0, 200)
-    y0 = np.stack([centre + amplitude, 0 * amplitude, rests + 0 * amplitude], axis=1)
-    field = lambda t, y, args: jnp.stack([y[1], -10 * (y[0] - centre), 0 * y[2]])  # noqa: E731
-    energy = lambda t, y, args: y[1] ** 2 / 2 + 5 * (y[0] - centre) ** 2  # noqa: E731
+    y0 = np.stack([centre + amplitude, centre + 0 * amplitude, rests + 0 * amplitude], axis=1)
+    moved = lambda y: (y[0] - centre, y[1] - centre)  # noqa: E731
+    field = lambda t, y, args: jnp.stack([moved(y)[1], -10 * moved(y)[0], 0 * y[2]])  # noqa: E731
+    energy = lambda t, y, args: moved(y)[1] ** 2 / 2 + 5 * moved(y)[0] ** 2  # noqa: E731
     return Case(field, energy, y0, (60.0, 0.01), controller=dfx.PIDController(1e-2, 1e-2))
 
 
