@@ -122,6 +122,7 @@ def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
     assert difference(slope, rigid_body(0.0, between, None)) < 0.05
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_against_finite_differences():
     def end(y0, scale, adjoint):
         def field(t, w, args):
