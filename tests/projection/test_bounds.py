@@ -68,6 +68,7 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
+@pytest.mark.slow
 @ONE_OF_BOTH
 def test_units_of_constraints_do_not_matter_in_single_precision(kind):
     atoms, values, candidates = (

@@ -181,6 +181,7 @@ def test_each_leaf_of_the_start_is_compared_in_its_own_unit():
         assert (sol.result == dfx.RESULTS.successful) == right
 
 
+@pytest.mark.slow
 def test_roundoff_in_the_times_is_not_refused():
     sol = solve(FLOW, t0=1e6, t1=1e6 + 1.0, saveat=dfx.SaveAt(t1=True))
     np.testing.assert_allclose(sol.ys[0], path(FLOW, 1.0), atol=1e-8)

@@ -137,6 +137,7 @@ def test_a_step_decays_where_the_solution_does():
     np.testing.assert_allclose(moduli[:40], 1, atol=1e-7)  # purely imaginary
 
 
+@pytest.mark.slow
 def test_dense_output_and_saved_times_are_as_accurate_as_the_steps():
     ts = jnp.linspace(0, 10, 101)
     subs = dict(ts=dfx.SubSaveAt(ts=ts), steps=dfx.SubSaveAt(steps=True))
