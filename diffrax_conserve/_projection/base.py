@@ -19,8 +19,8 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry, named_entries
 from .._printing import is_traced, names_at, printed
-from .._step.equations import ON, Equations, equations_of, length, relative
-from .._step.metric import MatrixUnits, Units, units_of
+from .._step.equations import ON, Equations, equations_of, relative
+from .._step.metric import MatrixUnits, PreferredUnits, Units, length, units_of
 from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 
 
@@ -236,6 +236,8 @@ class Target(eqx.Module):
       backwards in time, otherwise 1.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
       second what rounding has added to them; `None` if no entry has a rate.
+    - `moves`: changes of the state in this step and the last one, if corrections are to stay in
+      their span; see `PreferredUnits`.
     """
 
     projection: AbstractProjection
@@ -247,6 +249,7 @@ class Target(eqx.Module):
     args: Args
     direction: Real[Array, ""]
     gained: Float[Array, "2 m"] | None = None
+    moves: Float[Array, "k n"] | None = None
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
@@ -300,7 +303,11 @@ class Target(eqx.Module):
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
         equations = dataclasses.replace(equations, units=self.units, motion=self.motion)
-        return adapted(equations, self.projection, t, y, self.args)
+        equations = adapted(equations, self.projection, t, y, self.args)
+        if self.moves is None:
+            return equations
+        units = PreferredUnits.along(equations.units, self.moves)
+        return dataclasses.replace(equations, units=units, pattern=None)  # their products are dense
 
     def metric(self, t: RealScalarLike, y: Y) -> Units:
         """The units of the components in the metric of the projection, at a time of the solver."""

@@ -31,7 +31,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, SparseRows, pattern_of
 from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
-from .metric import MatrixUnits, Units
+from .metric import Units, in_state, length, times_units
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
@@ -136,35 +136,11 @@ class Equations(eqx.Module):
 
     def in_units(self, rows: Any) -> Any:
         """`G S` for the rows of a Jacobian, or for one gradient."""
-        if self.units is None:
-            return rows
-        if isinstance(self.units, MatrixUnits):
-            return self.units.of_rows(rows)
-        if isinstance(rows, SparseRows):
-            return rows.times_columns(self.units)
-        return rows * jnp.broadcast_to(self.units, rows.shape)
+        return times_units(rows, self.units)
 
     def change(self, u: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S u`, the change of the state that is `u` when it is measured in the units."""
-        if isinstance(self.units, MatrixUnits):
-            return self.units.of_change(u)
-        return u if self.units is None else u * self.units
-
-
-def measured(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
-    """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
-    such a component is never moved."""
-    if units is None:
-        return change
-    if isinstance(units, MatrixUnits):
-        return units.measured(measured(change, units.diagonal))
-    moves = units != 0
-    return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
-
-
-def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
-    """The length of a change of the state in the metric."""
-    return jnp.linalg.norm(measured(change, units))
+        return in_state(u, self.units)
 
 
 def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:
