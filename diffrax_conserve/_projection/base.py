@@ -229,7 +229,7 @@ class Target(eqx.Module):
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
-    - `motion`: how far each component may be moved; see `Equations`.
+    - `moved`: how far each component moves in the step; `None` outside a solve.
     - `units`: those of the components where the projection has no metric of its own; `None` if they
       are one, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
@@ -244,7 +244,7 @@ class Target(eqx.Module):
     manifold: Manifold
     values: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    motion: Float[Array, " n"] | None
+    moved: Float[Array, " n"] | None
     units: Float[Array, " n"] | None
     args: Args
     direction: Real[Array, ""]
@@ -302,7 +302,7 @@ class Target(eqx.Module):
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
-        equations = dataclasses.replace(equations, units=self.units, motion=self.motion)
+        equations = dataclasses.replace(equations, units=self.units, moved=self.moved)
         equations = adapted(equations, self.projection, t, y, self.args)
         if self.moves is None:
             return equations

@@ -135,7 +135,7 @@ class _Nearest(AbstractSystem):
             parts=(_Optimality(equations, candidate, bounds, sizes),),
             magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
             hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-            motion=None,
+            moved=None,
             units=units,
         )
         end, nearest, more, _ = damped(conditions, start, max_steps=self.max_steps, polish=True)

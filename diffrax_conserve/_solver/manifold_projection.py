@@ -97,8 +97,8 @@ class ManifoldProjection(ForwardingSolver):
     the next step is evaluated again at the projected state; implicit methods keep it.
 
     Success means that each residual is within 16 units of roundoff of
-    $|I_0| + \sum_k (|y_k| + s_k) |\partial_k I|$ and the terms that cancel inside `fn`, such as the
-    1 of `1 - cos(q)`, unless the projection has other tolerances.
+    $|I_0| + \sum_k (|y_k| + |\hat y_k - y_{n, k}|)\, |\partial_k I|$ and the terms that cancel
+    inside `fn`, such as the 1 of `1 - cos(q)`, unless the projection has other tolerances.
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
@@ -232,7 +232,7 @@ class ManifoldProjection(ForwardingSolver):
         # The dense output of the step is rarely needed, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         moves = moves_along(path(), t0, t1, y0) if self.keep_linear else None
-        start = self._target(terms, t1, state, motion, moves, args).following(t0, y0)
+        start = self._target(terms, t1, state, change, motion, moves, args).following(t0, y0)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
@@ -278,6 +278,7 @@ class ManifoldProjection(ForwardingSolver):
         terms: PyTree[dfx.AbstractTerm],
         t: RealScalarLike,
         state: State,
+        change: Float[Array, " n"],
         motion: Float[Array, " n"],
         moves: Float[Array, "k n"] | None,
         args: Args,
@@ -289,7 +290,7 @@ class ManifoldProjection(ForwardingSolver):
             self.manifold,
             state.values,
             state.hidden,
-            motion,
+            change,
             motion if is_ode(terms) else None,
             args,
             time_direction(terms, t),

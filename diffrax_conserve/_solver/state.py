@@ -256,7 +256,7 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     as those of `q · v = 0` where a component of a pendulum passes zero.
     """
     g, jacobian = equations.linearise(y)
-    sizes = jnp.abs(y) if equations.motion is None else jnp.abs(y) + equations.motion
+    sizes = jnp.abs(y) if equations.moved is None else jnp.abs(y) + equations.moved
     limit = shown_terms(jacobian, sizes) + equations.hidden
     limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * limit
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
