@@ -27,8 +27,8 @@ from ._constants import MAX_STEPS
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.base import has_bounds
 from ._projection.within_bounds import AbstractNewton, nearest_within
-from ._step.equations import length
 from ._step.iterate import any_lane, damped
+from ._step.metric import length
 from ._tree import ravel, tree_all_finite, tree_sub, tree_tangents
 
 

@@ -31,7 +31,7 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._step.equations import Equations, Jacobian, length, shown_terms
+from .._step.equations import Equations, Jacobian, shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done
 from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times

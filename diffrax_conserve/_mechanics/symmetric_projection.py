@@ -21,7 +21,7 @@ from .._solver.diffrax_private import member
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
-from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
+from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations
 from .._step.implicit import known_if, root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
 from .._step.linear import combined, gram_matrix, pivots, scaled_rows, solve, times

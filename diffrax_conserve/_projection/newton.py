@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_STEPS, NEAREST
-from .._step.equations import Equations, measured
+from .._step.equations import Equations
 from .._step.implicit import AbstractSystem, known_if, solution, well_conditioned
 from .._step.iterate import Solved, damped
 from .._step.linear import (
@@ -28,7 +28,7 @@ from .._step.linear import (
     solve_large,
     times,
 )
-from .._step.metric import MatrixUnits
+from .._step.metric import MatrixUnits, PreferredUnits, measured
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS, option
@@ -135,7 +135,7 @@ class _Nearest(AbstractSystem):
             parts=(_Optimality(equations, candidate, bounds, sizes),),
             magnitude=jnp.concatenate([jnp.abs(candidate), equations.magnitude]),
             hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-            motion=None,
+            moved=None,
             units=units,
         )
         end, nearest, more, _ = damped(conditions, start, max_steps=self.max_steps, polish=True)
@@ -158,6 +158,7 @@ class _Nearest(AbstractSystem):
         gram = gram_matrix(rows, rows)
         lengths = jnp.diagonal(gram)
         own = equations.units
+        own = own.own if isinstance(own, PreferredUnits) else own
         own = (
             own.sizes if isinstance(own, MatrixUnits) else jnp.ones_like(y) if own is None else own
         )

@@ -22,9 +22,10 @@ from jaxtyping import Array, Bool, Float
 from .._constants import ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import SparseRows
 from .._tree import tree_tangents, unflatten, without_pattern
-from .equations import Equations, Jacobian, measured
+from .equations import Equations, Jacobian
 from .iterate import Solved, nearby
 from .linear import combined, corrected, gram_matrix, pivots, scaled_rows, solve, times
+from .metric import measured
 
 
 class AbstractSystem(eqx.Module):
