@@ -83,8 +83,9 @@ lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of j
 
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
-slow: $(TEST) ## run the slow tests
+slow: $(TEST) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
+	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
 
 # Some projections, solves, systems and networks.
 CHECKED := tests/laws/test_projection.py tests/solver/test_options.py tests/systems/test_paper.py \
@@ -122,8 +123,8 @@ docs: $(DOCS) ## build the documentation into site/, and look at it
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.
 examples: export EQX_ON_ERROR ?= raise
-examples: $(TEST) ## execute the code blocks of the README, the docs and the docstrings
-	$(BIN)/python -m pytest $(SHARED) -qq -m examples tests/test_docs.py
+examples: $(TEST) ## execute the code blocks of the README, the first pages and the docstrings
+	$(BIN)/python -m pytest $(SHARED) -qq -m "examples and not slow" tests/test_docs.py
 	@echo "Every example ran."
 
 COSTS := core forms overhead gradients work_precision scaling balance dae learned_solvers sweeps \
@@ -144,15 +145,17 @@ bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and m
 bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
+SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
+  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases
+SMOKED ?= cost/core learned/defaults studies/claims
+
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
 # that the pages recommend.
 SMALL_LOOPS := xla_cpu_small_while_loop_byte_threshold=65536
 comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
-bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
-	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases \
-	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
+bench-smoke: $(TEST) ## one benchmark of each folder at toy sizes, to see that it runs; all in `make slow`
+	printf '%s\n' $(SMOKED) | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 
 # The environment of the check is new and its folder is not this one: only the wheel can be imported.

@@ -25,9 +25,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
-from ._step.equations import length
 from ._step.implicit import certain
 from ._step.iterate import any_lane, damped
+from ._step.metric import length
 from ._tree import ravel, tree_all_finite, tree_stop_gradient, tree_sub, tree_tangents
 
 

@@ -2,7 +2,7 @@
 
     python docs/notebooks.py out/notebooks
 
-`make docs` puts them on the site and links each from its page. `make examples` runs the cells in
+`make docs` puts them on the site and links each from its page. `make slow` runs the cells in
 the place of the blocks of the page: see `tests/test_docs.py`.
 """
 

@@ -14,8 +14,7 @@ from jaxtyping import install_import_hook
 
 # Most of the time goes into compilation, which takes a fifth as long with XLA's older emitters and
 # without LLVM's optimisations. A third of the rest goes into what XLA does to the loops of a solve,
-# and into pieces for several threads. Of the examples one page is compiled with optimisations (see
-# `test_docs.py`), and `make slow` compiles as users do.
+# and into pieces for several threads. `make slow` compiles as users do.
 QUICKLY_COMPILED = (Path(__file__).parent / "xla_flags.txt").read_text(encoding="utf-8").split()
 os.environ.setdefault("XLA_FLAGS", " ".join(QUICKLY_COMPILED))
 jax.config.update("jax_enable_x64", True)

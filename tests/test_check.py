@@ -15,7 +15,11 @@ from diffrax_conserve import check_invariance, systems
     [
         ("rigid-body", lambda t, w, args: (w[0] ** 2 + w[1] ** 2 + w[2] ** 3) / 2),
         # The sum from 0 to N has one term too many.
-        ("point-vortices", lambda t, y, args: jnp.sum(y[:, 0]) + y[-1, 0]),
+        pytest.param(
+            "point-vortices",
+            lambda t, y, args: jnp.sum(y[:, 0]) + y[-1, 0],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_it_finds_misprints_of_the_paper(name, printed):

@@ -116,6 +116,7 @@ def error_at_end(y, ts, y0):
     return float(jnp.max(jnp.stack(errors)))
 
 
+@pytest.mark.slow
 def test_errors_of_a_batch_are_those_of_the_solver_that_it_hands_out():
     """The programs differ: an entry that is left out is zero where many lists share one."""
     starts = jax.tree.map(lambda x: jnp.stack([x, 1.02 * x]), KEPLER0)

@@ -115,6 +115,7 @@ def answer(process):
     return json.loads(out.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_a_batch_over_eight_devices_is_the_batch_on_one():
     found = answer(start(8, "spread_over_eight_devices"))
     assert found == {"equal": True, "devices": 8, "all-reduces": 0}

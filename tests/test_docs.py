@@ -2,7 +2,6 @@
 
 import importlib
 import operator
-import os
 import re
 import runpy
 import shlex
@@ -16,12 +15,13 @@ import pytest
 
 from .pages import FIGURES, PACKAGE, PAGES, ROOT, Block, agree, blocks, example_pages, roundoff, run
 
-# Its trainings take longer to run unoptimised than to compile optimised.
-OPTIMISED, UNOPTIMISED = {"docs/training.md"}, "--xla_backend_optimization_level=0"
-# The longest first, so that nobody waits for it in the end.
-EXAMPLES = sorted(
-    (page for page in example_pages() if page.blocks), key=lambda page: page.name not in OPTIMISED
-)
+# What `make examples` runs; the other pages take minutes, and are run by `make slow`.
+FIRST = ("README.md", "docs/index.md", "docs/getting-started.md", "docs/api/", "diffrax_conserve/")
+EXAMPLES = [
+    pytest.param(page, marks=() if page.name.startswith(FIRST) else pytest.mark.slow, id=page.name)
+    for page in example_pages()
+    if page.blocks
+]
 NOTEBOOKS = runpy.run_path(str(ROOT / "docs" / "notebooks.py"))
 GALLERY = {f"docs/{name}" for name in NOTEBOOKS["NAMES"]}
 
@@ -47,16 +47,8 @@ def new_interpreter(tmp_path, monkeypatch):
 
 
 @pytest.mark.examples
-@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
-def test_python_examples_run_and_print_what_is_shown(page, new_interpreter, request):
-    flags = os.environ["XLA_FLAGS"].split()
-    if page.name in OPTIMISED and UNOPTIMISED in flags:
-        flags.remove(UNOPTIMISED)
-        command = [sys.executable, "-m", "pytest", "-q", f"{ROOT / request.node.nodeid}"]
-        environment = os.environ | {"XLA_FLAGS": " ".join(flags)}
-        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return
+@pytest.mark.parametrize("page", EXAMPLES)
+def test_python_examples_run_and_print_what_is_shown(page, new_interpreter):
     if page.name in GALLERY:
         page = from_notebook(page)
     write = f"`python -m tests.pages {page.file.relative_to(ROOT)}` writes it"

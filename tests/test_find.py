@@ -111,7 +111,7 @@ FOUND["Toda"] = (*FOUND["Toda"][:4], {k: toda.manifold[k] for k in ("linear mome
 NUM_STATES = {"Pollu": 1000}
 
 
-@some_of("name", FOUND, ids=FOUND, period=4)
+@some_of("name", FOUND, ids=FOUND, period=7)
 def test_all_that_is_known_is_found(name):
     field, sample, basis, count, known = FOUND[name]
     found = find_invariants(field, sample, basis=basis, num_states=NUM_STATES.get(name))
@@ -182,7 +182,7 @@ NOT = {
 }
 
 
-@some_of("name", NOT, ids=NOT, period=4)
+@some_of("name", NOT, ids=NOT, period=7)
 def test_where_nothing_is_conserved_nothing_is_found(name):
     field, size = NOT[name]
     assert find_invariants(field, normal(size), basis=3) == {}

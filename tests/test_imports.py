@@ -4,6 +4,7 @@ The imports are read from the source, so those inside functions and under `TYPE_
 """
 
 import ast
+import functools
 import graphlib
 import re
 import sys
@@ -80,17 +81,20 @@ def part(module: str) -> str:
     return module.split(".")[1] if "." in module else module
 
 
-def imports(file: Path) -> Iterator[str]:
+@functools.cache
+def imports(file: Path) -> tuple[str, ...]:
     """The absolute names of everything that `file` imports, `from a import b` being `a.b`."""
+    found = []
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 package = file.relative_to(ROOT.parent).parts[: -node.level]
                 base = ".".join([*package, *filter(None, [base])])
-            yield from (f"{base}.{alias.name}" for alias in node.names)
+            found += [f"{base}.{alias.name}" for alias in node.names]
+    return tuple(found)
 
 
 def internal_imports(module: str) -> set[str]:

@@ -192,3 +192,15 @@ def test_drift_without_the_args_of_the_solve_says_so():
     scaled = FirstIntegral(lambda t, y, args: args["scale"] * jnp.sum(y**2))
     with pytest.raises(ValueError, match="`args` of the solve"):
         dfc.drift(solve(rigid_body, wrap(ENERGY), OMEGA0, saveat=dfx.SaveAt(steps=True)), scaled)
+
+
+def test_the_components_of_a_vector_have_one_scale():
+    """The first component of this angular momentum is zero at the start, so that a scale of its own
+    would be zero, and its drift a number of square kilometres per second."""
+    momentum = dfc.FirstIntegral(lambda t, y, args: jnp.cross(*y))
+    y0 = jnp.array([7000.0, 0.0, 0.0]), jnp.array([0.0, 6.2, 5.0])
+    field = lambda t, y, args: (y[1], -398600.4418 * y[0] / jnp.sum(y[0] ** 2) ** 1.5)  # noqa: E731
+    solver = dfc.ManifoldProjection(dfc.RK4(), momentum)
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    sol = solve(field, solver, y0, t1=6000.0, dt0=20.0, saveat=saveat, max_steps=302)
+    assert jnp.max(jnp.abs(dfc.drift(sol, momentum))) < 16 * jnp.finfo(float).eps

@@ -180,7 +180,7 @@ def test_a_form_is_written_out(name):
         assert not [v for e in equations_in(closed.jaxpr) for v in e.outvars if v.aval.ndim]
 
 
-@some_of("name", FORMS, ids=FORMS, period=19)
+@some_of("name", FORMS, ids=FORMS, period=37)
 def test_a_form_that_is_written_out_keeps_its_values_and_derivatives(name):
     """In both precisions, alone and in a batch."""
     fn, _ = FORMS[name]
@@ -260,7 +260,7 @@ def projected_batch(field, manifold, y0):
 IN_ARRAYS = {"outer-solar-system", "rigid-body-attitude", "korteweg-de-vries"}
 
 
-@some_of("name", dfc.systems.names(), ids=dfc.systems.names(), period=4)
+@some_of("name", dfc.systems.names(), ids=dfc.systems.names(), period=7)
 def test_the_projections_of_the_catalogue_are_written_out_in_a_batch(name):
     """Scalars have the lanes as their only axis."""
     system = dfc.systems.get(name)

@@ -26,7 +26,6 @@ from .learned import (
     solution,
     states,
 )
-from .thinned import some_of
 
 VORTICES = dfc.systems.PointVortices()
 
@@ -221,7 +220,10 @@ NAMES = [
 ]
 
 
-@some_of("name", NAMES, ids=NAMES, period=5)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=() if x == "rigid-body-standard" else pytest.mark.slow) for x in NAMES],
+)
 def test_every_pretrained_network_errs_as_noted(name):
     network, file = dfc.load_pretrained(name), pretrained_path(name)
     info = read_info(file)["info"]

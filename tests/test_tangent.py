@@ -102,6 +102,7 @@ def test_projecting_the_free_field_is_not_enough():
     assert all(distance(final(FALLING, solver, PENDULUM.y0, n), end) > 0.1 for n in (200, 400))
 
 
+@pytest.mark.slow
 def test_a_mechanism_agrees_with_angles():
     solver = dfc.ManifoldProjection(dfc.RK4(), DOUBLE_MANIFOLD)
     end = cartesian(*final(in_angles, dfc.RK4(), ANGLES))
@@ -109,6 +110,7 @@ def test_a_mechanism_agrees_with_angles():
     assert distance(found, end) < 1e-8
 
 
+@pytest.mark.slow
 def test_all_constraints_make_the_same_field_as_that_of_the_velocity():
     both = dfc.tangent(FALLING, ROD_MANIFOLD, metric=(jnp.inf, jnp.ones(2)))
     one, two = jax.jit(jax.vmap(lambda y: [f(0.0, y, None) for f in (ROD, both)]))(STATES)
@@ -116,6 +118,7 @@ def test_all_constraints_make_the_same_field_as_that_of_the_velocity():
     assert dfc.check_invariance(ROD, ROD_MANIFOLD, STATES).ok
 
 
+@pytest.mark.slow
 def test_a_gain_lets_the_residual_decay():
     """`g' = -gain g`, also for an integral with a value and a constraint that moves with time."""
     manifold = (

@@ -36,7 +36,8 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$, to which roundoff is
-    proportional. Where all these terms are zero at the start, as of the momentum of bodies at rest,
+    proportional. All components of a vector have the largest scale among them, because a component
+    may be zero at the start, as those of an angular momentum in a plane. Where all these terms are zero at the start, as of the momentum of bodies at rest,
     the drift is absolute, in the units of the function. From the numerator the integral of a `rate`
     from $t_0$ to $t_k$ is subtracted, computed along the dense output, which the solution must then
     have.
@@ -80,6 +81,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     """
     ts, ys, values, residual = _residuals(sol, manifold, args, "drift")
     _, scale = measure(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
+    scale = jtu.tree_map(lambda s: jnp.broadcast_to(jnp.max(s, initial=0), s.shape), scale)
     return jax.vmap(lambda t, y: relative(residual(t, y), scale))(ts, ys)
 
 

@@ -30,11 +30,11 @@ from .._projection.options import check_state, option
 from .._solver.diffrax_private import member
 from .._solver.state import FIRST, cause_of_failure, started, violated
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._step.equations import Equations, Jacobian, equations_of, length, shown_terms
+from .._step.equations import Equations, Jacobian, equations_of, shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done
 from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
-from .._step.metric import spread
+from .._step.metric import length, spread
 from .._tree import ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
 

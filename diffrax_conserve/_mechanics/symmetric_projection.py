@@ -22,10 +22,11 @@ from .._solver.diffrax_private import member
 from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
-from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations, length
+from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations
 from .._step.implicit import certain, root, well_conditioned
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
 from .._step.linear import combined, equilibrated, gram_matrix, scaled_rows, solve, times
+from .._step.metric import length
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 

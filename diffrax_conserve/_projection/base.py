@@ -19,8 +19,8 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import evaluate, is_entry, named_entries
 from .._printing import is_traced, names_at, printed
-from .._step.equations import ON, Equations, equations_of, length, relative
-from .._step.metric import MatrixUnits, Units, units_of
+from .._step.equations import ON, Equations, equations_of, relative
+from .._step.metric import MatrixUnits, PreferredUnits, Units, length, units_of
 from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 
 
@@ -219,14 +219,15 @@ class Target(eqx.Module):
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
-    - `motion`: the unit of each component (see `State.motion_after`). It enlarges the scale and is
-      the default metric. It limits nothing.
+    - `moved`: how far each component moves in the step; `None` outside a solve.
     - `units`: those of the components where the projection has no metric of its own; `None` if they
       are one, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
       backwards in time, otherwise 1.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
       second what rounding has added to them; `None` if no entry has a rate.
+    - `moves`: changes of the state in this step and the last one, if corrections are to stay in
+      their span; see `PreferredUnits`.
     """
 
     projection: AbstractProjection
@@ -235,9 +236,10 @@ class Target(eqx.Module):
     hidden: Float[Array, " m"]
     args: Args
     direction: Real[Array, ""]
-    motion: Float[Array, " n"] | None = None
+    moved: Float[Array, " n"] | None = None
     units: Float[Array, " n"] | None = None
     gained: Float[Array, "2 m"] | None = None
+    moves: Float[Array, "k n"] | None = None
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
@@ -290,8 +292,12 @@ class Target(eqx.Module):
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
-        equations = dataclasses.replace(equations, units=self.units, motion=self.motion)
-        return adapted(equations, self.projection, t, y, self.args)
+        equations = dataclasses.replace(equations, units=self.units, moved=self.moved)
+        equations = adapted(equations, self.projection, t, y, self.args)
+        if self.moves is None:
+            return equations
+        units = PreferredUnits.along(equations.units, self.moves)
+        return dataclasses.replace(equations, units=units, pattern=None)  # their products are dense
 
     def metric(self, t: RealScalarLike, y: Y) -> Units:
         """The units of the components in the metric of the projection, at a time of the solver."""

@@ -17,10 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import NEAREST, ROUNDOFF
-from .._step.equations import Equations, measured
+from .._step.equations import Equations
 from .._step.implicit import Along, certain, root, solution, well_conditioned
 from .._step.iterate import Solved, damped
 from .._step.linear import equilibrated, gram_matrix, scaled_rows, solve, times
+from .._step.metric import measured
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS
@@ -151,7 +152,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         parts=(conditions,),
         magnitude=jnp.concatenate([sizes_of[0] + sizes_of[1], scale]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-        motion=None,
+        moved=None,
         units=None,
         rtol=tolerance(ROUNDOFF * eps, equations.rtol),
         atol=tolerance(0.0, equations.atol),

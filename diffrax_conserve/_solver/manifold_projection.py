@@ -19,8 +19,9 @@ from .._projection.base import AbstractProjection, Target, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.within_bounds import bounded_parts
-from .._step.equations import length, reach
+from .._step.equations import reach
 from .._step.iterate import any_lane
+from .._step.metric import length
 from .._tree import ravel, tree_sub
 from .diffrax_private import member
 from .state import (
@@ -35,6 +36,20 @@ from .state import (
 )
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 from .wrapper import ForwardingSolver
+
+# The dense output of common solvers is a polynomial of at most this degree, so that as many changes
+# of the state span the directions in which it moves.
+_MOVES = 4
+
+
+def moves_along(
+    path: dfx.AbstractLocalInterpolation, t0: RealScalarLike, t1: RealScalarLike, y0: Y
+) -> Float[Array, "k n"]:
+    """The changes of the state from the start of a step, in the dense output of the wrapped solver,
+    after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
+    that they are orthogonal to each `c` with `c · f = 0`."""
+    shares = (k / _MOVES for k in range(1, _MOVES + 1))
+    return jnp.stack([ravel(path.evaluate(t0 + share * (t1 - t0))) - ravel(y0) for share in shares])
 
 
 def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
@@ -84,8 +99,8 @@ class ManifoldProjection(ForwardingSolver):
     the next step is evaluated again at the projected state; implicit methods keep it.
 
     Success means that each residual is within 16 units of roundoff of
-    $|I_0| + \sum_k (|y_k| + s_k) |\partial_k I|$ and the terms that cancel inside `fn`, such as the
-    1 of `1 - cos(q)`, unless the projection has other tolerances.
+    $|I_0| + \sum_k (|y_k| + |\hat y_k - y_{n, k}|)\, |\partial_k I|$ and the terms that cancel
+    inside `fn`, such as the 1 of `1 - cos(q)`, unless the projection has other tolerances.
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
@@ -121,6 +136,7 @@ class ManifoldProjection(ForwardingSolver):
     projection: AbstractProjection = option(SimplifiedNewton())
     max_correction: RealScalarLike | None = option(None)
     every: int = option(1, static=True)
+    keep_linear: bool = option(False, static=True)
 
     def __check_init__(self):
         if not isinstance(self.solver, dfx.AbstractSolver):
@@ -170,6 +186,12 @@ class ManifoldProjection(ForwardingSolver):
         check_state(y0, kind=jnp.inexact)
         values = conserved_values(self.manifold, t, y0, args)
         values, hidden = started(values, self.manifold, t, y0, args)
+        if self.keep_linear and values.size > 2 * _MOVES:
+            raise ValueError(
+                f"`keep_linear` has {2 * _MOVES} directions, but `manifold` has {values.size} "
+                "scalar constraints. Leave it out, and add the linear invariants to `manifold`: "
+                "`diffrax_conserve.compare` tells which there are."
+            )
         return State(
             inner=self.solver.init(terms, t0, t1, y0, args),
             values=values,
@@ -179,6 +201,7 @@ class ManifoldProjection(ForwardingSolver):
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
             statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
+            moves=jnp.zeros((_MOVES, ravel(y0).size), values.dtype) if self.keep_linear else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -208,9 +231,10 @@ class ManifoldProjection(ForwardingSolver):
         # which dense output integrates them to any time in the step; `target` is that at the end.
         change = distances(y0, candidate)
         motion = state.motion_after(change, candidate)
-        start = self._target(terms, t1, state, motion, args).following(t0, y0)
-        # The dense output of the step is needed only for balances, so it is made when it is called.
+        # The dense output of the step is rarely needed, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
+        moves = moves_along(path(), t0, t1, y0) if self.keep_linear else None
+        start = self._target(terms, t1, state, change, motion, moves, args).following(t0, y0)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
@@ -246,7 +270,9 @@ class ManifoldProjection(ForwardingSolver):
         result = dfx.RESULTS.where(
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
-        state = state.next(inner=inner, gained=target.gained, motion=motion, statistics=statistics)
+        state = state.next(
+            inner=inner, gained=target.gained, motion=motion, statistics=statistics, moves=moves
+        )
         return y1, error, dense_info, state, result
 
     def _target(
@@ -254,7 +280,9 @@ class ManifoldProjection(ForwardingSolver):
         terms: PyTree[dfx.AbstractTerm],
         t: RealScalarLike,
         state: State,
+        change: Float[Array, " n"],
         motion: Float[Array, " n"],
+        moves: Float[Array, "k n"] | None,
         args: Args,
     ) -> Target:
         """The target of a step. Noise has no metric of motion: with noise the metric decides which
@@ -266,9 +294,10 @@ class ManifoldProjection(ForwardingSolver):
             state.hidden,
             args,
             time_direction(terms, t),
-            motion=motion,
+            moved=change,
             units=motion if is_ode(terms) else None,
             gained=state.gained,
+            moves=None if moves is None else jnp.concatenate([moves, state.moves]),
         )
 
     def _cannot_start(
@@ -303,6 +332,15 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
     manifold; whether a quantity is conserved at all is told by
     [`diffrax_conserve.check_invariance`][]. Default: no limit.
+- `keep_linear`: whether linear functions of the state that the wrapped solver keeps, such as the
+    momentum, the mass or the charge, stay conserved although `manifold` does not contain them.
+    Every Runge-Kutta method keeps $c \cdot y$ for each $c$ with $c \cdot f = 0$, because its steps
+    are combinations of slopes. Then a correction is one too: it leaves the span of the changes of
+    the state in the dense output of this step and the one before only where nothing within reaches
+    the manifold. Linear entries of `manifold` are kept as without it. These are up to eight
+    directions, for a few constraints: more than eight are refused. It costs eight vectors of the
+    size of the state in memory, in dense output for each step, and their products in time; a
+    sparse Jacobian is treated as dense. Active bounds, `AlongLine` and a `ClosedForm` ignore it.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 

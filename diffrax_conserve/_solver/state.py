@@ -22,8 +22,8 @@ from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
-from .._step.equations import Equations, length, reach, shown_terms
-from .._step.metric import Units
+from .._step.equations import Equations, reach, shown_terms
+from .._step.metric import Units, length
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
@@ -178,6 +178,7 @@ class State(eqx.Module):
       zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
+    - `moves`: the changes of the state within the last step, if linear invariants are kept.
     """
 
     inner: Any
@@ -188,6 +189,7 @@ class State(eqx.Module):
     first_step: RealScalarLike
     num_steps: Int[Array, ""] | None
     statistics: ProjectionStatistics
+    moves: Float[Array, "k n"] | None = None
 
     def motion_after(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
         """`motion` after a step to `end` that changed the components by `change`.
@@ -254,7 +256,7 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     as those of `q · v = 0` where a component of a pendulum passes zero.
     """
     g, jacobian = equations.linearise(y)
-    sizes = jnp.abs(y) if equations.motion is None else jnp.abs(y) + equations.motion
+    sizes = jnp.abs(y) if equations.moved is None else jnp.abs(y) + equations.moved
     limit = shown_terms(jacobian, sizes) + equations.hidden
     limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * limit
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)

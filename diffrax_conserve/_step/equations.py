@@ -7,10 +7,10 @@ as zero. The roundoff of a residual is proportional to the size of the terms tha
 *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
 in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
 no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
-measures them, and they are added as the *hidden* part of the scale. And a component that a
-correction has moved by `s_k` is known to roundoff of `s_k` only, which matters where the component
-itself vanishes, as on `q[0] = 0`. So in a solve, where we know how far it moves in a step, its size
-counts as `|y_k| + s_k`.
+measures them, and they are added as the *hidden* part of the scale. And a component that has moved
+by `c_k` is known to roundoff of `c_k` only, which matters where the component itself vanishes, as
+on `q[0] = 0`. So in the step of a solve its size counts as `|y_k| + c_k`, with its change in the
+step.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, SparseRows, pattern_of
 from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
-from .metric import MatrixUnits, Units
+from .metric import Units, in_state, length, times_units
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
@@ -54,8 +54,7 @@ class Equations(eqx.Module):
       algebra works with the product `G S`, in whose columns the units of the user have cancelled.
       So nothing is squared before it is scaled, which could overflow, and a change of units by
       powers of two changes no bit of the result.
-    - `motion`: the unit of each component in a solve, at least as large as its change in a step;
-      `None` outside a solve.
+    - `moved`: how far each component moves in the step of a solve; `None` outside a solve.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
       vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
@@ -66,7 +65,7 @@ class Equations(eqx.Module):
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
     units: Units = None
-    motion: Float[Array, " n"] | None = None
+    moved: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
@@ -101,7 +100,7 @@ class Equations(eqx.Module):
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         size = jnp.abs(y if self.clip is None else self.clip(y))
-        size = size if self.motion is None else size + self.motion
+        size = size if self.moved is None else size + self.moved
         return self.magnitude + shown_terms(jacobian, size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -136,35 +135,11 @@ class Equations(eqx.Module):
 
     def in_units(self, rows: Any) -> Any:
         """`G S` for the rows of a Jacobian, or for one gradient."""
-        if self.units is None:
-            return rows
-        if isinstance(self.units, MatrixUnits):
-            return self.units.of_rows(rows)
-        if isinstance(rows, SparseRows):
-            return rows.times_columns(self.units)
-        return rows * jnp.broadcast_to(self.units, rows.shape)
+        return times_units(rows, self.units)
 
     def change(self, u: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S u`, the change of the state that is `u` when it is measured in the units."""
-        if isinstance(self.units, MatrixUnits):
-            return self.units.of_change(u)
-        return u if self.units is None else u * self.units
-
-
-def measured(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
-    """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
-    such a component is never moved."""
-    if units is None:
-        return change
-    if isinstance(units, MatrixUnits):
-        return units.measured(measured(change, units.diagonal))
-    moves = units != 0
-    return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
-
-
-def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
-    """The length of a change of the state in the metric."""
-    return jnp.linalg.norm(measured(change, units))
+        return in_state(u, self.units)
 
 
 def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:

@@ -21,9 +21,10 @@ from jaxtyping import Array, Bool, Float
 
 from .._constants import ROUNDOFF, WRITTEN_OUT
 from .._tree import tree_tangents, unflatten, without_pattern
-from .equations import Equations, Jacobian, measured
+from .equations import Equations, Jacobian
 from .iterate import Solved, nearby
 from .linear import combined, corrected, eliminated, gram_matrix, scaled_rows, solve, times
+from .metric import measured
 
 
 class AbstractSystem(eqx.Module):

@@ -1,9 +1,12 @@
 """The metric `M` of a projection, in the form of a factor `S` of its inverse, `M⁻¹ = S Sᵀ`.
 
 Projections never use `M` itself. For weights, `S` is the diagonal matrix of the units `1/√M_k` of
-the components. For parts of the state that have a matrix, it is made from a Cholesky factor.
+the components. For parts of the state that have a matrix, it is made from a Cholesky factor. And a
+metric may prefer the directions in which a step has moved, so that a correction keeps what these
+directions keep.
 """
 
+import functools as ft
 import math
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +21,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
+from .._constants import ADDED_POWER
 from .._custom_types import Args, RealScalarLike, Y
+from .._large.sparse import SparseRows
 from .._options import check_function, check_number
 from .._tree import ravel, real_view
 
@@ -47,15 +52,9 @@ class MatrixUnits(eqx.Module):
         return self._in_parts(solve, change * self.diagonal)
 
     def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S⁻¹ change` in the parts with a matrix, and `change` elsewhere."""
+        """`S⁻¹ change`."""
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
-        return self._in_parts(product, change)
-
-    @property
-    def sizes(self) -> Float[Array, " n"]:
-        """A unit of each component, `1/√M_kk`, as if the others did not move. The diagonal element
-        `M_kk` is the square of the length of row `k` of `L`."""
-        return self._in_parts(lambda lower, x: x / jnp.linalg.norm(lower, axis=1), self.diagonal)
+        return self._in_parts(product, measured(change, self.diagonal))
 
     def _in_parts(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
         """`x` with `fn(L, part)` in the place of each part with a matrix."""
@@ -65,9 +64,104 @@ class MatrixUnits(eqx.Module):
         return x
 
 
-# The metric as it is used: a unit for each component, or a factor with matrices, or `None` if all
-# units are one.
-Units = Float[Array, " n"] | MatrixUnits | None
+class PreferredUnits(eqx.Module):
+    """The factor `S (P + δ (1 - P))`, where `S` is the factor of another metric, the `own` one, and
+    `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, in the units of `S`.
+
+    In this metric a correction leaves the span only where nothing within it reaches the manifold,
+    because outside of the span it is longer by `1/δ`. The square of `δ`, its share in `M⁻¹`, is
+    what is added to the diagonal of a large matrix too, and for the same reason: so that a system
+    can be solved that the span alone leaves singular.
+    """
+
+    own: "Float[Array, ' n'] | MatrixUnits | None"
+    basis: Float[Array, "k n"]
+
+    @classmethod
+    def along(cls, own: Any, moves: Float[Array, "k n"]) -> "PreferredUnits":
+        """With the span of given `moves`, changes of the state. By the Gram-Schmidt process, where
+        each move is made orthogonal to the others twice, because once would leave roundoff in the
+        ratio of its length before and after. A move that is new in less than half of its digits
+        is left out."""
+        moves = jax.vmap(lambda x: measured(x, own))(moves)
+        sizes = jnp.max(jnp.abs(moves), axis=1, keepdims=True)
+        moves = moves / jnp.where(sizes > 0, sizes, 1)
+        eps = float(jnp.finfo(moves.dtype).eps)
+
+        def add(basis: Array, k: Array) -> tuple[Array, None]:
+            new = moves[k]
+            for _ in range(2):
+                new = new - (basis @ new) @ basis
+            square = jnp.sum(new**2)
+            is_new = square > eps * jnp.sum(moves[k] ** 2)
+            new = jnp.where(is_new, new * lax.rsqrt(jnp.where(is_new, square, 1)), 0)
+            return basis.at[k].set(new), None
+
+        return cls(own, lax.scan(add, jnp.zeros_like(moves), jnp.arange(len(moves)))[0])
+
+    def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        """`rows S (P + δ (1 - P))`."""
+        return self._shared(times_units(rows, self.own), _outside(rows.dtype))
+
+    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """`S (P + δ (1 - P)) change`."""
+        return in_state(self._shared(change, _outside(change.dtype)), self.own)
+
+    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """`(P + (1 - P) / δ) S⁻¹ change`."""
+        return self._shared(measured(change, self.own), 1 / _outside(change.dtype))
+
+    def _shared(self, x: Float[Array, "*m n"], outside: float) -> Float[Array, "*m n"]:
+        """`x (P + outside (1 - P))`."""
+        product = ft.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+        within = product(product(x, self.basis.T), self.basis)
+        return within + outside * (x - within)
+
+
+def _outside(dtype: Any) -> float:
+    """`δ` of `PreferredUnits`."""
+    return float(jnp.finfo(dtype).eps) ** (ADDED_POWER / 2)
+
+
+# The metric as it is used: a unit for each component, or a factor that is no diagonal matrix, or
+# `None` if all units are one.
+Units = Float[Array, " n"] | MatrixUnits | PreferredUnits | None
+
+
+def times_units(rows: Any, units: Units) -> Any:
+    """`rows S`, for the rows of a Jacobian or for one gradient."""
+    if units is None:
+        return rows
+    if isinstance(units, MatrixUnits | PreferredUnits):
+        return units.of_rows(rows)
+    if isinstance(rows, SparseRows):
+        return rows.times_columns(units)
+    return rows * jnp.broadcast_to(units, rows.shape)
+
+
+def in_state(u: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
+    """`S u`, the change of the state that is `u` when it is measured in the units."""
+    if isinstance(units, MatrixUnits | PreferredUnits):
+        return units.of_change(u)
+    return u if units is None else u * units
+
+
+def measured(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
+    """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
+    such a component is never moved."""
+    if units is None:
+        return change
+    if isinstance(units, MatrixUnits | PreferredUnits):
+        return units.measured(change)
+    moves = units != 0
+    return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
+
+
+def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
+    """The length of a change of the state in the metric. A preference says where a correction
+    leads, and not how long it is."""
+    units = units.own if isinstance(units, PreferredUnits) else units
+    return jnp.linalg.norm(measured(change, units))
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,6 +77,7 @@ def test_bad_lanes_of_an_adaptive_batch_change_no_other(solver, kinds, y0):
     assert int(rejected[kinds.index(REJECTED)]) > 0
 
 
+@pytest.mark.slow
 @given(kinds=st.permutations([GOOD, GOOD, NAN, FAILED]), turn=st.floats(0.5, 1.5))
 def test_bad_lanes_of_a_batch_of_fixed_steps_change_no_other(kinds, turn):
     y0 = jnp.asarray(turn) * jnp.array([[1.0, 1, 1], [1, 0.5, 1], [0.5, 1, 1], [1, 1, 0.5]])

@@ -94,7 +94,7 @@ def to_powers(projection, y, value, args):
     return y, info.ok
 
 
-@pytest.mark.parametrize("name", ["simplified", "newton"])
+@some_of("name", ["simplified", "newton"], period=2)
 def test_the_roundoff_that_counts_is_that_at_the_result(name):
     rng = np.random.default_rng(5)
     start = np.exp(rng.uniform(-1.6, 1.4, (2, 2000)))
@@ -141,7 +141,7 @@ def in_units(projection, y, t_y, value, factor):
     return jax.jvp(projected, (y,), (t_y,), has_aux=True)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@some_of("dtype", [np.float64, np.float32], ids=["float64", "float32"], period=2)
 @given(share=st.floats(0.01, 0.5), angle=st.floats(0, 6), off=st.floats(-0.1, 0.1))
 def test_what_underflows_is_no_success(dtype, share, angle, off):
     """Residuals of small values underflow long before the values do."""
@@ -205,6 +205,7 @@ def long_steps(e, dt):
     return solution.ys, dfx.is_okay(solution.result)
 
 
+@pytest.mark.slow
 def test_a_solve_that_succeeds_has_no_nan_at_saved_times():
     rng = np.random.default_rng(1)
     ys, okay = long_steps(rng.uniform(0, 0.8, 200), rng.uniform(0.05, 0.4, 200))
@@ -227,7 +228,7 @@ def test_saved_states_of_an_almost_circular_orbit_are_those_of_their_times():
     assert np.max(np.abs(q - np.stack([np.cos(times), np.sin(times)], axis=-1))) < 1e-2
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+@some_of("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"], period=2)
 def test_an_infinite_derivative_does_not_keep_newton_from_ending(dtype):
     """The soak found it: LAPACK's singular values never end for a matrix with an infinity."""
     fn = lambda t, y, args: jnp.exp(1.9 * jnp.log(y[0] ** 2)) + 2e-3 * y[1] ** 2  # noqa: E731

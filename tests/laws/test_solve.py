@@ -5,6 +5,7 @@ import equinox as eqx
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
+import pytest
 from hypothesis import given, settings
 from jax.flatten_util import ravel_pytree
 
@@ -142,6 +143,7 @@ def sensitivity(solver, y0, args):
     return jax.jacrev(end)(y0)
 
 
+@pytest.mark.slow
 @given(
     rate=st.floats(0.5, 2),
     angle=st.floats(-3, 3),

@@ -18,7 +18,6 @@ from diffrax_conserve._solver.state import State
 from diffrax_conserve._tree import ravel
 
 from ..problems import RIGID_BODY, rigid_body
-from ..thinned import some_of
 
 
 def kepler(t, y, mu):
@@ -83,7 +82,10 @@ def natural(field, manifold, y0, solver, projection):
     )
 
 
-@some_of("name", SYSTEMS, period=3)
+@pytest.mark.parametrize(
+    "name",
+    ["rigid body", *(pytest.param(x, marks=pytest.mark.slow) for x in ("Kepler", "pendulum"))],
+)
 def test_powers_of_two_as_units_change_nothing(name):
     _, manifold, y0, *_ = SYSTEMS[name]
     run, shapes = natural(*SYSTEMS[name]), (len(y0), (), len(manifold))
@@ -129,6 +131,7 @@ def orbit(ts, y0, mu, size):
     return [solve(solver, *times, y0, mu) for solver in (dfx.Dopri8(), projected)]
 
 
+@pytest.mark.slow
 def test_orbits_beat_plain_and_no_saved_state_is_of_another_time():
     mu, a, e = np.transpose(LANES)[:, :, None]
     rate = np.sqrt(mu / a**3)
@@ -158,6 +161,7 @@ SEVEN = {
 }
 
 
+@pytest.mark.slow
 def test_the_seven_integrals_of_an_orbit_in_space_of_which_five_are_independent():
     a, e, turns = 7.078e6, np.array([0.0, 1e-8, 1e-4, 1e-2, 0.3]), 5
     rate, size = np.sqrt(EARTH / a**3), np.repeat([a, np.sqrt(EARTH / a)], 3)
@@ -183,6 +187,7 @@ def test_the_seven_integrals_of_an_orbit_in_space_of_which_five_are_independent(
         assert np.all(iterations <= 12)
 
 
+@pytest.mark.slow
 def test_newton_finds_perigees_on_circles_in_what_closes_over_a_traced_value():
     a, phases = 4.2164e7, np.linspace(0.3, 6.0, 8)
     rate = np.sqrt(EARTH / a**3)
@@ -221,6 +226,7 @@ PEOPLES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dtype"), [("proton", float), ("electron", np.float32)])
 def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype):
     field, manifold, rate, state = PEOPLES[name]

@@ -1,6 +1,7 @@
 """Flow maps of a family of equations, which take `args` as inputs."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,6 +11,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..learned import CORES, Still
 
 BOX = dfc.learned.Box(
@@ -26,7 +28,7 @@ def spring(t, y, args):
     return jnp.stack([y[1], force])
 
 
-TERM = dfx.ODETerm(spring)
+TERM, END = dfx.ODETerm(spring), dfx.SaveAt(t1=True)
 
 
 def family(order=0, args_domain=BOX, **options):
@@ -43,37 +45,46 @@ def fit(**options):
     return dfc.fit(family(), spring, key=jr.key(0), **(dict(sample=sample) | options))
 
 
-def solve(flow_map, args, check_field=False, **options):
+@eqx.filter_jit
+def solve(flow_map, args, check_field=False, term=TERM, saveat=END, **options):
     solver = dfc.DeepONetSolver(flow_map, check_field=check_field, **options)
-    return dfx.diffeqsolve(TERM, solver, 0.0, 2.0, 0.5, Y0, args, max_steps=8, throw=False)
+    options = dict(saveat=saveat, max_steps=8, throw=False)
+    return dfx.diffeqsolve(term, solver, 0.0, 2.0, 0.5, Y0, args, **options)
 
 
 @pytest.mark.parametrize("order", [0, 1])
 @pytest.mark.parametrize("core", CORES)
 def test_it_starts_at_its_state_and_sees_all_args(core, order):
     flow_map = family(order, core=core)
-    np.testing.assert_array_equal(flow_map(Y0, ARGS, 0.0), Y0)
-    np.testing.assert_array_equal(flow_map(Y0, 0.3, args=ARGS), flow_map(Y0, ARGS, 0.3))
-    slopes = jax.jit(jax.jacfwd(lambda args: flow_map(Y0, args, 0.3)))(ARGS)
-    assert all(jnp.all(jnp.abs(leaf) > 0) for leaf in jax.tree.leaves(slopes))
+
+    @jax.jit
+    def found(h):
+        slopes = jax.jacfwd(lambda args: flow_map(Y0, args, h))(ARGS)
+        return flow_map(Y0, ARGS, h), flow_map(Y0, h, args=ARGS), slopes
+
+    np.testing.assert_array_equal(found(0.0)[0], Y0)
+    one, other, slopes = found(0.3)
+    np.testing.assert_array_equal(one, other)
+    assert all(np.all(np.abs(leaf) > 0) for leaf in jax.tree.leaves(slopes))
 
 
 def test_its_polynomial_has_the_args_of_the_call():
-    slope = jax.jacfwd(lambda h: family(1)(Y0, ARGS, h))(0.0)
+    slope = jax.jit(jax.jacfwd(lambda h: family(1)(Y0, ARGS, h)))(0.0)
     np.testing.assert_allclose(slope, spring(0.0, Y0, ARGS), rtol=1e-14)
 
 
 def test_a_repeated_flow_map_hands_args_on():
-    inner = family()
-    outer = dfc.learned.Repeated(inner, 2)
+    outer = dfc.learned.Repeated(family(), 2)
+    inner, twice = eqx.filter_jit(outer.flow_map), eqx.filter_jit(outer)
     expected = inner(inner(Y0, ARGS, 0.2), ARGS, 0.2)
-    np.testing.assert_allclose(outer(Y0, ARGS, 0.4), expected, rtol=1e-13)
+    np.testing.assert_allclose(twice(Y0, ARGS, 0.4), expected, rtol=1e-13)
     y = Y0
     for _ in range(4):
-        y = outer(y, ARGS, 0.5)
+        y = twice(y, ARGS, 0.5)
     np.testing.assert_allclose(solve(outer, ARGS).ys[0], y, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_by_args_are_those_of_differences():
     dct.assert_gradients(lambda a: solve(family(), a).ys[0], ARGS, rtol=1e-7, forward=False)
 
@@ -87,30 +98,27 @@ def test_draws_are_in_the_box_and_everywhere():
         np.testing.assert_allclose(jnp.mean(leaf, axis=0), 0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_args_outside_their_domain_are_steps_outside():
-    statistics = dfx.SaveAt(t1=True, solver_state=True)
+    network, state = family(), dfx.SaveAt(t1=True, solver_state=True)
 
     def run(args, outside):
-        solver = dfc.DeepONetSolver(family(), check_field=False, outside=outside)
-        return dfx.diffeqsolve(
-            TERM, solver, 0.0, 2.0, 0.5, Y0, args, saveat=statistics, throw=False
-        )
+        return solve(network, args, outside=outside, saveat=state)
 
     assert dfc.learned.steps_outside(run(ARGS, "count")).number < 4
     assert dfc.learned.steps_outside(run(OUTSIDE, "count")).number == 4
     refused = run(OUTSIDE, "fail")
     assert "starts outside the domain" in dfx.RESULTS[refused.result]
     replaced = run(OUTSIDE, dfx.Tsit5())
-    exact = dfx.diffeqsolve(TERM, dfx.Tsit5(), 0.0, 2.0, 0.5, Y0, OUTSIDE).ys
+    exact = problems.solve(spring, dfx.Tsit5(), Y0, t1=2.0, dt0=0.5, args=OUTSIDE).ys
     np.testing.assert_allclose(replaced.ys, exact, rtol=1e-12)
 
 
-def test_the_slope_is_compared_for_the_args_of_the_solve(errors_raise):
-    solve(family(1), ARGS, check_field=True)
+def test_the_slope_is_compared_for_the_args_of_the_solve():
+    assert dfx.is_okay(solve(family(1), ARGS, check_field=True).result)
     other = dfx.ODETerm(lambda t, y, args: 1.2 * spring(t, y, args))
-    solver = dfc.DeepONetSolver(family(1))
-    with pytest.raises(Exception, match="not trained for this vector field"):
-        jax.block_until_ready(dfx.diffeqsolve(other, solver, 0.0, 1.0, 0.5, Y0, ARGS).ys)
+    found = solve(family(1), ARGS, check_field=True, term=other)
+    assert "not trained for this vector field" in dfx.RESULTS[found.result]
 
 
 class Unbounded(Still):

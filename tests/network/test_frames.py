@@ -10,7 +10,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import LORENZ, SMALL, flow_map, states
+from ..learned import CORES, LORENZ, SMALL, flow_map, states
+from ..thinned import some_of
 
 VORTICES = dfc.systems.PointVortices()
 STEP = 0.125
@@ -29,7 +30,7 @@ def transformed(y, order=(1, 2, 0), angle=0.7, scale=1.3, shift=(0.3, -2.0)):
     return scale * (y[jnp.array(order)] @ turn.T + jnp.array(shift))
 
 
-@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+@some_of("core, order", [("product", 0), ("concatenated", 1), ("gated", 2)], ids=CORES, period=3)
 def test_untrained_it_commutes_with_the_symmetries(core, order):
     network = framed(order, core=core)
     y0s, h = states(10, VORTICES, seed=3), 0.05
@@ -117,7 +118,7 @@ def reflected(y, angle=0.7, scale=1.3, mirror=-1.0):
     return scale * q @ matrix.T, p @ matrix.T / jnp.sqrt(scale)
 
 
-@pytest.mark.parametrize(("core", "order"), [("product", 0), ("concatenated", 1), ("gated", 2)])
+@some_of("core, order", [("product", 0), ("concatenated", 1), ("gated", 2)], ids=CORES, period=3)
 def test_untrained_it_commutes_with_those_of_kepler(core, order):
     taylor = dfc.learned.Taylor(KEPLER.vector_field, order) if order else None
     network = dfc.DeepONet(
@@ -161,6 +162,7 @@ def test_its_step_against_keplers_equation():
     assert np.max(error) < 2e-5
 
 
+@pytest.mark.slow
 def test_a_step_is_outside_if_it_leaves_the_domain_between_its_quarters():
     """Small orbits can start inside and be too fast a quarter later."""
     size = np.geomspace(0.05, 20, 8000)

@@ -13,15 +13,15 @@ import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, flow_map, solution
 from ..problems import OMEGA0, RIGID_BODY
+from ..thinned import some_of
 
 ONE = jnp.ones(())
 
 
 def residual(layer, y, values):
     now = layer.values(0.0, y)
-    scale = jax.tree.map(lambda v: 1 + jnp.abs(v), values)
-    ratios = jax.tree.map(lambda a, b, s: jnp.abs(a - b) / s, now, values, scale)
-    return max(float(jnp.max(x)) for x in jax.tree.leaves(ratios))
+    ratios = jax.tree.map(lambda a, b: np.abs(np.subtract(a, b)) / (1 + np.abs(b)), now, values)
+    return max(float(np.max(x)) for x in jax.tree.leaves(ratios))
 
 
 @eqx.filter_jit
@@ -157,12 +157,10 @@ LOGARITHM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.log(y)))
 TOTAL = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
 
 
-@pytest.mark.parametrize("candidate", [[0.9, 0.5], [2.0, 1e-3], [3.0, -0.1], [0.0, 0.0]])
 @pytest.mark.parametrize("manifold", [LOGARITHM, (LOGARITHM, TOTAL)], ids=["one", "two"])
-def test_near_and_beyond_the_end_of_a_domain_all_derivatives_are_finite(candidate, manifold):
+def test_near_and_beyond_the_end_of_a_domain_all_derivatives_are_finite(manifold):
     """A result is on the manifold, or it is the candidate, with the derivative of the candidate."""
     layer, start = dfc.learned.ConservativeLayer(manifold), jnp.array([0.8, 0.7])
-    candidate = jnp.array(candidate)
 
     @jax.jit
     def derivatives(candidate):
@@ -170,15 +168,16 @@ def test_near_and_beyond_the_end_of_a_domain_all_derivatives_are_finite(candidat
         rate = lambda y: jax.jvp(to, (y,), (jnp.ones(2),))[1]  # noqa: E731
         return to(candidate), jax.jacrev(to)(candidate), jax.jacrev(rate)(candidate)
 
-    y, slopes, curvatures = derivatives(candidate)
-    assert bool(jnp.all(jnp.isfinite(curvatures)))
-    if bool(jnp.all(y == candidate)):
-        np.testing.assert_array_equal(slopes, jnp.eye(2))
-    else:
-        assert residual(layer, y, layer.values(0.0, start)) < 1e-14
+    for candidate in np.array([[0.9, 0.5], [2.0, 1e-3], [3.0, -0.1], [0.0, 0.0]]):
+        y, slopes, curvatures = derivatives(candidate)
+        assert np.all(np.isfinite(curvatures)), candidate
+        if np.all(y == candidate):
+            np.testing.assert_array_equal(slopes, np.eye(2))
+        else:
+            assert residual(layer, y, layer.values(0.0, start)) < 1e-14, candidate
 
 
-@pytest.mark.parametrize("steps", [None, 2])
+@some_of("steps", [None, 2], period=2)
 def test_second_derivatives_are_those_of_differences(steps):
     """Also of iterations that have not converged, as in the recipe of the paper."""
     layer = dfc.learned.ConservativeLayer(RIGID_BODY, steps=steps)

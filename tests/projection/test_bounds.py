@@ -68,6 +68,7 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
+@pytest.mark.slow
 @ONE_OF_BOTH
 def test_units_of_constraints_do_not_matter_in_single_precision(kind):
     atoms, values, candidates = (
@@ -179,7 +180,7 @@ def saved_in_a_long_step(projection, within):
     return solution.ts, solution.ys, dfc.off_manifold(solution, TOTAL, within)
 
 
-@pytest.mark.parametrize(
+@some_of(
     "projection",
     [
         dfc.SimplifiedNewton(lower=0.0),
@@ -187,6 +188,7 @@ def saved_in_a_long_step(projection, within):
         dfc.Staged(("total", dfc.SimplifiedNewton(lower=0.0))),
     ],
     ids=["simplified", "newton", "staged"],
+    period=3,
 )
 def test_saved_states_are_within_the_bounds_and_one_that_cannot_be_projected_is_told(projection):
     _, ys, off = saved_in_a_long_step(projection, jnp.array(True))

@@ -38,7 +38,7 @@ FORMULAS = {
 }
 
 
-@some_of("name", FORMULAS, ids=FORMULAS, period=2)
+@some_of("name", FORMULAS, ids=FORMULAS, period=4)
 def test_derivatives_agree_with_differences_where_eigenvalues_coincide_too(name):
     project, x = FORMULAS[name]
     v = matrices(jr.key(3), *x.shape, kind=complex if jnp.iscomplexobj(x) else float)

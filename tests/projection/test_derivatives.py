@@ -14,6 +14,7 @@ from ..thinned import some_of
 
 PROJECTIONS = {"simplified": dfc.SimplifiedNewton(), "newton": dfc.Newton()}
 each_projection = pytest.mark.parametrize("projection", list(PROJECTIONS.values()), ids=PROJECTIONS)
+one_projection = some_of("projection", PROJECTIONS.values(), ids=PROJECTIONS, period=2)
 
 
 class Energy(eqx.Module):
@@ -53,7 +54,7 @@ def loss(inputs, projection):
     return jnp.sum(jnp.array([1.0, -2.0, 0.5]) * projected(inputs, projection) ** 3)
 
 
-@some_of("projection", PROJECTIONS.values(), ids=PROJECTIONS, period=2)
+@one_projection
 def test_gradient_agrees_with_finite_differences(projection):
     """With respect to the state, time, args, conserved values, the metric and what is in `fn`."""
     dct.assert_gradients(lambda inputs: loss(inputs, projection), INPUTS, rtol=1e-7)
@@ -62,7 +63,7 @@ def test_gradient_agrees_with_finite_differences(projection):
         assert all(np.any(np.asarray(x) != 0) for x in jax.tree.leaves(part)), name
 
 
-@each_projection
+@one_projection
 def test_a_component_that_is_never_moved_may_have_any_unit(projection):
     """The state is radial, at the distance `sqrt(1 - k z)`."""
     projection = eqx.tree_at(
@@ -87,7 +88,7 @@ def test_second_derivatives(projection):
     dct.assert_gradients(lambda inputs: jax.grad(loss)(inputs, projection), INPUTS, rtol=1e-6)
 
 
-@each_projection
+@one_projection
 def test_a_lane_that_failed_spoils_no_other(projection):
     """In reverse mode as in forward mode, its derivative is NaN or unused, and nothing raises."""
 

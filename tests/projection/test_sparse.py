@@ -55,7 +55,7 @@ MOMENTUM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y, axis=0))
 CASES = [*((name, jnp.float64) for name in MANIFOLDS), ("triangles", jnp.float32)]
 
 
-@some_of("name, dtype", CASES, period=3)
+@some_of("name, dtype", CASES, period=7)
 def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: Any):
     """With an energy and a momentum beside the sparse rows, and in units of its own for each
     component, for a symmetric matrix and for one that is not."""
@@ -105,7 +105,7 @@ def _walk(name: str) -> tuple[Any, Array, Any]:
     return {"many": at(entry.fn), "z": at(ENERGY.fn)}, y, 1e-3 * jr.normal(key[1], y.shape)
 
 
-@pytest.mark.parametrize("name", ["spins", "lattice", pytest.param("ring", marks=pytest.mark.slow)])
+@some_of("name", ["spins", "lattice", "ring"], period=3)
 def test_derivatives_are_those_by_differences(name: str):
     """Of a projection, in both modes: blocks, coupled blocks, and an iteration."""
     manifold, y, change = _walk(name)

@@ -80,6 +80,7 @@ def test_saved_times_and_dense_output_are_on_both():
         np.testing.assert_allclose(jnp.sum(q * v, axis=1), 0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_agree_with_finite_differences():
     y = jnp.array([0.9, 0.5]), jnp.array([-0.4, 0.8])
     dct.assert_gradients(lambda *y: projected(y)[0], *y, rtol=1e-6)

@@ -19,6 +19,7 @@ from ..problems import (
     exponential,
     exponential_solution,
 )
+from ..thinned import some_of
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)
 STEP = dfc.AlongLine(direction="step")
@@ -43,7 +44,7 @@ def carrying(t, y, args):
     return {"y": exponential(t, y["y"], args), "time": jnp.ones(())}
 
 
-@pytest.mark.parametrize(("inner", "order"), [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"])
+@some_of("inner, order", [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"], period=2)
 def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(inner, order):
     kept = dfc.FirstIntegral(lambda t, y, args: ENERGY.fn(t, y["y"], args))
     solver = dfc.ManifoldProjection(inner, kept, projection=STEP)
@@ -60,6 +61,7 @@ def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(i
     np.testing.assert_allclose(np.log2(coarse / fine), [order - 1, order], atol=0.15)
 
 
+@pytest.mark.slow
 def test_derivatives_of_relaxation_agree_with_differences():
     def total(y0):
         return jnp.sum(jnp.sin(dfx.diffeqsolve(TERM, RELAXED, 0.0, 1.0, 0.1, y0).ys))
@@ -98,8 +100,11 @@ def test_derivatives_by_a_component_that_rests_agree_with_differences(direction)
         np.testing.assert_allclose(scaled, differences, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("inner", "friction"), [(dfx.Euler(), 0.0), (dfx.Heun(), 0.3)], ids=["tangent", "not conserved"]
+@some_of(
+    "inner, friction",
+    [(dfx.Euler(), 0.0), (dfx.Heun(), 0.3)],
+    ids=["tangent", "not conserved"],
+    period=2,
 )
 def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
     """There all is conserved, but time stands still."""

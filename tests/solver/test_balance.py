@@ -83,6 +83,7 @@ def test_derivatives_are_those_of_differences():
     dct.assert_gradients(end, Y0, ARGS, rtol=1e-6, forward=False)
 
 
+@pytest.mark.slow
 def test_a_manifold_of_balances_and_integrals():
     """Two oscillators that exchange energy, of which the second one is damped; next to an integral
     without a rate."""
@@ -110,6 +111,7 @@ def test_a_manifold_of_balances_and_integrals():
     assert dfc.check_invariance(field, manifold, jax.tree.map(lambda x: x[None], y0)).ok
 
 
+@pytest.mark.slow
 def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     """A friction that takes less than a unit of roundoff of the energy in each step."""
     y0, args = jax.tree.map(jnp.float32, (Y0, (1e-6, 0.0)))
@@ -122,6 +124,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     assert gained == pytest.approx(lost, rel=3e-2)
 
 
+@pytest.mark.slow
 @some_of("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"], period=2)
 def test_a_damped_system_comes_to_rest(dtype):
     """The roundoff of a long sum would keep the energy from its least value."""

@@ -92,11 +92,11 @@ def problem(kind):
     raise AssertionError(kind)
 
 
-# By default one solver of each kind, but none of additive noise and of Langevin's equations.
+# By default one solver of each kind that no other test has.
 FIRST_OF_ITS_KIND = {
     name
     for kind, name in {kind: name for name, kind in reversed(TABLE.items())}.items()
-    if kind not in (kinds.LANGEVIN, kinds.ADDITIVE)
+    if kind not in (kinds.LANGEVIN, kinds.ADDITIVE, kinds.EXPLICIT, kinds.IMEX)
 }
 every_solver = pytest.mark.parametrize(
     "name",

@@ -122,6 +122,7 @@ def test_failure_with_adaptive_steps_is_retried_with_smaller_ones():
     assert largest(drift_of(sol, RIGID_BODY)) <= 4e-15
 
 
+@pytest.mark.slow
 def test_transformations():
     """One inside the other: of a loop, of a batch, for less memory, compiled."""
 
@@ -151,6 +152,7 @@ def end_and_gradient(end):
     return jax.grad(loss, has_aux=True)(jnp.array([1.0, 0.3]))
 
 
+@pytest.mark.slow
 def test_strict_promotion_rank_promotion_and_nan_debugging():
     def final(y0):
         solver = dfc.ManifoldProjection(dfx.Euler(), RIGID_BODY)

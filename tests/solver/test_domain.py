@@ -77,6 +77,7 @@ def test_by_default_steps_outside_are_counted_and_the_first_time_is_known():
     assert dfc.learned.steps_outside(solve(solver, t1=1.0, saveat=STATE)).first_time == jnp.inf
 
 
+@pytest.mark.slow
 def test_rejected_steps_do_not_count():
     solver = unchecked(KNOWS, corrections=1)
     controller = dfx.PIDController(rtol=1e-4, atol=1e-4)
@@ -97,6 +98,7 @@ def test_leaving_the_domain_fails_at_a_time(errors_raise):
     assert solve(solver, t1=2.0).result == dfx.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
     solver = unchecked(BARE, outside="fail", max_error=3e-4)
     assert "is above `max_error`" in message(solve(solver, throw=False))
@@ -113,6 +115,7 @@ def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive
     assert found.number == 0
 
 
+@pytest.mark.slow
 def test_another_solver_takes_all_steps_outside_and_none_inside():
     solver = dfx.Dopri5()
     sol = solve(unchecked(KNOWS, outside=solver), saveat=STATE)
@@ -126,6 +129,7 @@ def test_another_solver_takes_all_steps_outside_and_none_inside():
     assert 0 < taken == dfc.learned.steps_outside(sol).number
 
 
+@pytest.mark.slow
 def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     solver = unchecked(KNOWS, outside=dfc.RK4())
     controller = dfx.PIDController(rtol=1e-2, atol=1e-2)
@@ -215,6 +219,7 @@ def test_one_lane_of_a_batch_is_refused_alone():
     assert MESSAGE in dfx.RESULTS[jax.tree.map(lambda x: x[2], found)]
 
 
+@pytest.mark.slow
 def test_it_is_not_differentiated():
     off = dfc.DeepONetSolver(TAYLOR, check_field=False)
     slope = jax.vmap(jax.grad(lambda solver, y0: jnp.sum(end(solver, LORENZ, y0)), 1), (None, 0))
@@ -241,7 +246,7 @@ NAMES = [
 ]
 
 
-@some_of("name", NAMES, ids=NAMES, period=4)
+@some_of("name", NAMES, ids=NAMES, period=9)
 def test_a_shipped_flow_map_is_for_its_own_system(name):
     """At every state of its domain, also those whose slope is learned."""
     system = dfc.systems.get(name.removesuffix("-standard"))
@@ -257,6 +262,7 @@ def test_a_stiff_field_is_not_compared_where_it_changes_within_a_step():
     assert refused("pollu", pollu, y0[None]) == 0
 
 
+@pytest.mark.slow
 def test_a_learned_slope_is_refused_where_it_is_nothing_like_the_field(errors_raise):
     solver = dfc.DeepONetSolver(dfc.load_pretrained("double-pendulum-standard"))
     end(solver, dfc.systems.DoublePendulum(), dfc.systems.DoublePendulum().y0)

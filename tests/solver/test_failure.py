@@ -10,6 +10,7 @@ import diffrax_conserve as dfc
 
 from .. import fresh
 from ..problems import solve
+from ..thinned import some_of
 
 Y0 = jnp.array([1.0, 0.0])
 
@@ -79,6 +80,7 @@ def test_what_cannot_start_ends_at_once(manifold, message):
     assert sol.stats["num_steps"] <= (HOPELESS if message == NOT_REACHED else 1)
 
 
+@pytest.mark.slow
 def test_what_a_vector_field_does_not_conserve_is_kept_and_the_statistics_tell():
     """Whether a quantity is conserved is the question of `check_invariance`, not of the solve."""
     adaptive = dict(stepsize_controller=dfx.PIDController(1e-6, 1e-6), t1=3.0)
@@ -121,7 +123,9 @@ def test_what_failed_is_nan_and_takes_no_iterations():
         assert info.num_steps <= 3, info
 
 
-@pytest.mark.parametrize(("late", "dtype"), [(1e13, jnp.float64), (2e4, jnp.float32)])
+@some_of(
+    "late, dtype", [(1e13, jnp.float64), (2e4, jnp.float32)], ids=["float64", "float32"], period=2
+)
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
     jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
@@ -153,7 +157,9 @@ def in_the_well(solver, controller, max_correction):
     return sol, ~jnp.any(sol.ys[:, 0] < 0)
 
 
-@pytest.mark.parametrize(("solver", "controller", "limit"), [FIXED, ADAPTIVE])
+@pytest.mark.parametrize(
+    ("solver", "controller", "limit"), [FIXED, pytest.param(*ADAPTIVE, marks=pytest.mark.slow)]
+)
 def test_max_correction_guards_against_another_component(solver, controller, limit):
     """Fixed steps fail, adaptive ones become smaller."""
     sol, right = in_the_well(solver, controller, jnp.array(1e9))
@@ -168,6 +174,7 @@ def test_max_correction_guards_against_another_component(solver, controller, lim
         assert sol.stats["num_rejected_steps"] > 0
 
 
+@pytest.mark.slow
 def test_a_constraint_that_jumps_is_told_at_a_declared_jump():
     """The rod becomes longer at t = 1/2: there a solve must end, be projected, and go on."""
 

@@ -13,6 +13,7 @@ import diffrax_conserve as dfc
 
 from .. import problems
 from ..learned import LORENZ, flow_map, solution, unchecked
+from ..thinned import some_of
 
 # Random weights; the path of the other core changes too fast for the dense output.
 DEEPONET, PINN = flow_map(core="concatenated"), solution()
@@ -46,7 +47,7 @@ def test_steps_saved_times_and_dense_output_follow_the_network(solver):
         np.testing.assert_allclose(y, path(solver, t), rtol=0, atol=1e-15)
 
 
-@SOLVERS
+@some_of("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"], period=2)
 def test_events(solver):
     # The component that changes most in the step from 0.5 to 0.75 crosses the mean of its ends.
     ends = path(solver, 0.5), path(solver, 0.75)
@@ -144,7 +145,11 @@ ADAPTIVE = [name for name, case in CASES.items() if case[0] is not FOLLOW and na
 
 
 @pytest.mark.parametrize(
-    ("name", "adaptive"), [*((name, False) for name in CASES), *((name, True) for name in ADAPTIVE)]
+    ("name", "adaptive"),
+    [
+        *((name, False) for name in CASES),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in ADAPTIVE),
+    ],
 )
 def test_nothing_raises_in_a_batch(name, adaptive, errors_raise):
     """Every lane ends by itself, with its own result: an exception would end all of them."""
@@ -169,13 +174,14 @@ def test_nothing_raises_in_a_batch(name, adaptive, errors_raise):
 def test_each_leaf_of_the_start_is_compared_in_its_own_unit():
     y0 = {"position": jnp.array(1.5e11), "velocity": jnp.array(3e4)}
     solver = dfc.PINNSolver(dfc.PINN(y0, 0.0, 1.0, key=jr.key(0)))
+    field = lambda t, y, args: y  # noqa: E731
     for factor, right in ((1.0, True), (1.01, False)):
         other = y0 | {"velocity": factor * y0["velocity"]}
-        term = dfx.ODETerm(lambda t, y, args: y)
-        sol = dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.5, other, throw=False)
+        sol = problems.solve(field, solver, other, dt0=0.5, throw=False)
         assert (sol.result == dfx.RESULTS.successful) == right
 
 
+@pytest.mark.slow
 def test_roundoff_in_the_times_is_not_refused():
     sol = solve(FLOW, t0=1e6, t1=1e6 + 1.0, saveat=dfx.SaveAt(t1=True))
     np.testing.assert_allclose(sol.ys[0], path(FLOW, 1.0), atol=1e-8)

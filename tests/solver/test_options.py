@@ -9,6 +9,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body, rotational_energy, solve
+from ..thinned import some_of
 
 STEPS = dfx.SaveAt(t0=True, steps=True, solver_state=True, dense=True)
 
@@ -115,13 +116,14 @@ def test_subs_and_functions_of_the_state():
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("controller", "times"),
+@some_of(
+    "controller, times",
     [
         (dfx.StepTo(ts=jnp.array([0.0, 0.13, 0.5, 1.0])), [0.13, 0.5]),
         (dfx.ClipStepSizeController(ADAPTIVE, [0.3], [0.51], store_rejected_steps=5), [0.3, 0.51]),
     ],
     ids=["step-to", "clip"],
+    period=2,
 )
 def test_every_controller_hits_its_times_on_the_manifold(controller, times):
     dt0 = None if isinstance(controller, dfx.StepTo) else 0.1
@@ -132,6 +134,7 @@ def test_every_controller_hits_its_times_on_the_manifold(controller, times):
         assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_steady_state_by_the_implicit_adjoint():
     """A damped flow on a sphere ends at the point in the direction of `args`, which is
     differentiated by the implicit function theorem."""

@@ -45,6 +45,7 @@ def relative_error(ys, expected):
     return np.linalg.norm(ys - expected) / np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_target_of_the_oscillator():
     """Relative L2 error of the state over [0, 30] at most 1e-12."""
     ts, solver = jnp.linspace(0, 30, 301), dfc.RandomFeatureSolver()
@@ -67,12 +68,10 @@ def step(vector_field, solver, y0, h):
     return y1, jnp.max(error), result == dfx.RESULTS.successful
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "y0", "shortest", "longest", "features"),
-    [
-        (lorenz, [1.0, 1.0, 20.0], 0.08, 0.4, 8),
-        pytest.param(oscillator, [1.0, 0.3], 0.5, 10.0, 16, marks=pytest.mark.slow),
-    ],
+    [(lorenz, [1.0, 1.0, 20.0], 0.08, 0.4, 8), (oscillator, [1.0, 0.3], 0.5, 10.0, 16)],
     ids=["lorenz", "oscillator"],
 )
 def test_the_estimate_is_the_true_error_of_a_step(field, y0, shortest, longest, features):
@@ -97,6 +96,7 @@ def test_the_estimate_is_the_true_error_of_a_step(field, y0, shortest, longest, 
     assert np.all((ratios > 0.7) & (ratios < 1.5))
 
 
+@pytest.mark.slow
 def test_a_stiff_problem():
     """Robertson's kinetics: rates from 1e-5 to 1e4 and more."""
 
@@ -137,6 +137,7 @@ def test_a_step_decays_where_the_solution_does():
     np.testing.assert_allclose(moduli[:40], 1, atol=1e-7)  # purely imaginary
 
 
+@pytest.mark.slow
 def test_dense_output_and_saved_times_are_as_accurate_as_the_steps():
     ts = jnp.linspace(0, 10, 101)
     subs = dict(ts=dfx.SubSaveAt(ts=ts), steps=dfx.SubSaveAt(steps=True))
@@ -153,6 +154,7 @@ def test_dense_output_and_saved_times_are_as_accurate_as_the_steps():
     )
 
 
+@pytest.mark.slow
 def test_any_state_and_backwards_in_time():
     y0 = {"a": jnp.array(1.0), "b": (jnp.ones((2, 1)), jnp.array([3.0]))}
     sol = solve(driven, y0, -1.0, t0=2.0, dt0=-0.75, args=0.5)
@@ -162,6 +164,7 @@ def test_any_state_and_backwards_in_time():
         np.testing.assert_allclose(end[0], factor * start, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_lanes():
     """With lanes that need different numbers of iterations, and one that fails."""
 
@@ -182,6 +185,7 @@ def test_a_batch_is_its_lanes():
         np.testing.assert_allclose(batch[0][i], y, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_on_a_manifold():
     """At the steps and between them; the solver alone keeps the energy only."""
     solver = dfc.RandomFeatureSolver(6)

@@ -12,6 +12,7 @@ import diffrax_conserve.testing as dct
 
 from .. import fresh
 from ..learned import DRIVEN0, LORENZ, Still, driven, flow_map, states, unchecked
+from ..thinned import some_of
 
 TERM, DRIVEN = dfx.ODETerm(LORENZ.vector_field), dfx.ODETerm(driven)
 SHIPPED = dfc.load_pretrained("conservative-lorenz-standard")
@@ -42,6 +43,7 @@ def errors(**options):
     return jnp.median(jnp.linalg.norm(ys - jax.vmap(lambda y0: exact(TERM, y0))(y0s), axis=1))
 
 
+@pytest.mark.slow
 def test_each_sweep_gains_a_digit():
     found = [errors(corrections=k) for k in (0, 1, 4, 8)]
     assert found[0] > 5 * found[1] > 5e3 * found[2] > 5e7 * found[3]
@@ -67,6 +69,7 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
 
 
+@pytest.mark.slow
 def test_dense_output_goes_through_the_corrected_path():
     ts = jnp.array([0.07, 0.4, 0.93])
     reference = LORENZ.reference(ts)
@@ -97,6 +100,7 @@ def test_derivatives():
     dct.assert_gradients(f, jnp.array([0.3, -1.0, 0.5]), LORENZ.y0, jnp.array(0.9), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_complex_state():
     term = dfx.ODETerm(lambda t, y, args: 1j * y)
     y0 = jnp.array([1.0 + 0.5j])
@@ -110,12 +114,10 @@ def test_it_is_the_change_by_the_last_sweep():
     np.testing.assert_allclose(first, y1 - SHIPPED(LORENZ.y0, 0.25), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "factor"),
-    [
-        ("conservative-lorenz-standard", 1.0),
-        pytest.param("point-vortices-conservative", 1.5, marks=pytest.mark.slow),
-    ],
+    [("conservative-lorenz-standard", 1.0), ("point-vortices-conservative", 1.5)],
 )
 def test_it_is_the_true_error_of_the_shipped_flow_maps(name, factor):
     """Of one full step; a `factor` above one takes the states out of the domain."""
@@ -146,7 +148,7 @@ class Wrong(eqx.Module):
 LINEAR = dfx.ODETerm(lambda t, y, args: args * y)
 
 
-@pytest.mark.parametrize("rate", [-6.0, 3.0])
+@some_of("rate", [-6.0, 3.0], period=2)
 def test_it_knows_how_the_vector_field_passes_an_error_on(rate):
     """Where `h ‖∂f‖` is not small the integral of the defect, a Picard sweep, is far off."""
     network = Wrong(jnp.array(rate))
@@ -161,7 +163,7 @@ def test_it_knows_how_the_vector_field_passes_an_error_on(rate):
     assert not 0.6 < (run(1)[0] - y1) / error < 1.6
 
 
-@pytest.mark.parametrize(("order", "corrections"), [(2, 0), (0, 2)])
+@some_of("order, corrections", [(2, 0), (0, 2)], period=2)
 def test_it_falls_with_the_step_as_claimed(order, corrections):
     network, options = Wrong(-1.0, order, 0.5), dict(term=LINEAR, args=jnp.array(-1.0))
     solver = unchecked(network, corrections=corrections, nodes=8)

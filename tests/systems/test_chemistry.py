@@ -36,6 +36,7 @@ def reference(system, t1):
     return system.reference(np.linspace(0, t1, 4))
 
 
+@pytest.mark.slow
 def test_references_are_those_of_the_test_set():
     found = reference(STIFF["pollu"], 60.0)[-1]
     np.testing.assert_allclose(found, POLLU_60, rtol=1e-9)
@@ -162,6 +163,7 @@ def test_its_derivatives_are_those_of_what_it_computes():
     dct.assert_gradients(found, jnp.log(noise), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_stiff_solve_keeps_signs_and_balances():
     system = STIFF["pollu"]
     solver = dfc.ManifoldProjection(dfx.Kvaerno3(), system.manifold, projection=PROJECTION)

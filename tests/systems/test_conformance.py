@@ -48,7 +48,7 @@ def values(manifold, y):
     return {name: entry.fn(0.0, y, None) for name, entry in manifold.items()}
 
 
-@some_of("system", SYSTEMS.values(), ids=SYSTEMS, period=3)
+@some_systems
 def test_invariants_are_conserved_by_the_equations(system):
     report = check_invariance(system.vector_field, system.manifold, samples(system.name))
     assert report.ok, str(report)
@@ -79,7 +79,7 @@ def test_the_manifold_is_functionally_independent(system):
     assert np.linalg.svd(rows, compute_uv=False).min() > 1e-4
 
 
-@every_system
+@some_systems
 def test_samples_differ_and_are_like_y0(system):
     ys = samples(system.name)
     for x, x0 in zip(jtu.tree_leaves(ys), jtu.tree_leaves(system.y0), strict=True):
@@ -142,7 +142,7 @@ def test_the_solution_returns_after_a_period(system):
         np.testing.assert_allclose(ys, np.stack([ravel_pytree(y)[0]] * 5), atol=1e-12)
 
 
-@every_system
+@some_systems
 def test_what_is_drawn_and_said_of_a_system(system):
     curves = system.trajectories(samples(system.name))
     assert curves

@@ -53,6 +53,7 @@ def test_an_unbound_kepler_orbit_is_refused(errors_raise):
         systems.Kepler().reference([1.0], y0)
 
 
+@pytest.mark.slow
 def test_equal_vortices_on_an_equilateral_triangle_rotate_rigidly():
     angles = 2 * np.pi * np.arange(3) / 3
     y0 = jnp.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -111,6 +111,7 @@ def test_it_prints_what_it_returns_also_projected(capsys):
     assert found.verdict.count("projected") == 2
 
 
+@pytest.mark.slow
 @some_of("bend", [1.0, -1.0], period=2)
 def test_derivatives_by_args_are_compared(bend, monkeypatch, capsys):
     monkeypatch.setattr(CLOCK, lambda *args: 1.0)

@@ -51,6 +51,7 @@ def error(flow_map, h):
     return float(largest_difference(flow_map, y0s, jnp.asarray(h)))
 
 
+@pytest.mark.slow
 def test_a_flow_map_learns_from_trajectories():
     before = network()
     chosen = recipe(before, epochs=100)
@@ -64,6 +65,7 @@ def explosive(t, y, args):
     return y**2
 
 
+@pytest.mark.slow
 def test_trajectories_are_solutions():
     ts, ys = dfc.learned.trajectories(oscillator, Y0S[:4], TS[:4], rtol=1e-10)
     np.testing.assert_array_equal(ts, TS[:4])
@@ -101,6 +103,7 @@ def test_data_that_make_no_sense(options, error, match):
         dfc.fit(network(), key=KEY, **options)
 
 
+@pytest.mark.slow
 @some_of("exponent", [0.1, 0.5, 0.75], period=3)
 def test_exact_zeros_train_in_box_cox_coordinates(exponent):
     ts = jnp.broadcast_to(jnp.linspace(0, 2, 9), (40, 9))

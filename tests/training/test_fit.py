@@ -64,6 +64,7 @@ def error(pinn):
     return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
 
 
+@pytest.mark.slow
 def test_a_pinn_learns_a_solution():
     before = circle(LAYER)
     after, log = train(before, epochs=300, optimiser=optax.adam(5e-3))
@@ -79,6 +80,7 @@ def test_the_first_loss_is_that_of_the_formula():
     np.testing.assert_allclose(log.criteria[0], defect(model, points), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_best_model_is_returned_not_the_last():
     """A training that turns round and climbs."""
     optimiser = optax.sgd(lambda step: jnp.where(step < 60, 1e-2, -1e-2))
@@ -103,6 +105,7 @@ def test_a_planted_nan_is_survived():
     assert log.criteria.min() <= log.criteria[0]
 
 
+@pytest.mark.slow
 def test_new_points_are_drawn_when_the_recipe_says_so():
     # Without updates the loss changes only with the points.
     still = dict(optimiser=optax.sgd(0.0), epochs=9)
@@ -112,6 +115,7 @@ def test_new_points_are_drawn_when_the_recipe_says_so():
     np.testing.assert_array_equal(np.diff(fresh.losses) != 0, [0, 0, 1, 0, 0, 1, 0, 0])
 
 
+@pytest.mark.slow
 @some_of("kind", ["flow map", "data", "windows"], period=3)
 def test_the_second_of_several_seeds_compiles_nothing(kind, caplog):
     y0s = jnp.stack([EAST, -EAST, 0.5 * EAST[::-1]])
@@ -150,6 +154,7 @@ def test_progress_ends_a_training_by_returning_true():
     np.testing.assert_array_equal(log.checked, [0, 20])
 
 
+@pytest.mark.slow
 def test_a_line_search_of_optax():
     _, log = train(circle(), optimiser=optax.lbfgs(), epochs=20)
     assert log.skipped == 0

@@ -82,6 +82,7 @@ def test_the_update_in_single_precision_is_that_in_double(shape):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-20, 1e15])
 def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
     pinn, log = dfc.fit(turns(3.0, unit=unit), oscillator, key=KEY)
@@ -90,6 +91,7 @@ def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
     assert log.skipped == 0
 
 
+@pytest.mark.slow
 def test_a_conservative_window_is_as_accurate_and_on_the_manifold():
     square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
     network = turns(3.0, layer=dfc.learned.ConservativeLayer(square))
@@ -100,6 +102,7 @@ def test_a_conservative_window_is_as_accurate_and_on_the_manifold():
     np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 1, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_no_update_in_single_precision_is_skipped():
     here, network = jax.tree.map(
         lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x,
@@ -112,6 +115,7 @@ def test_no_update_in_single_precision_is_skipped():
     assert log.skipped == 0
 
 
+@pytest.mark.slow
 def test_a_flow_map_does_not_depend_on_the_units_of_components():
     def losses(units):
         here = units * states()
@@ -138,6 +142,7 @@ def test_the_recipe_goes_by_size():
     assert dfc.learned.second_order(flow_map()).optimiser == "spring"
 
 
+@pytest.mark.slow
 def test_reachable_states_are_on_the_solutions():
     angles = jr.uniform(jr.key(1), (30,)) * 6
     y0s = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1) * 2
@@ -166,6 +171,7 @@ def trained(field=LORENZ.vector_field, **options):
     return dfc.fit(network, field, key=KEY, recipe=few(network, **options))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The trained flow map is wrong")
 @pytest.mark.parametrize(
     ("field", "options"), [(stiff, dict()), (LORENZ.vector_field, dict(taylor=0))]
@@ -174,6 +180,7 @@ def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
     assert trained(field, **options).taylor is None
 
 
+@pytest.mark.slow
 def test_it_gets_the_slope_of_the_field_and_goes_on_bit_for_bit_from_between_two_comparisons():
     network = flow_map()
     chosen = few(network, epochs=400, check_every=100)

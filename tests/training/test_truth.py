@@ -40,6 +40,7 @@ def true_error(network):
     return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network))(ts) - exact)))
 
 
+@pytest.mark.slow
 def test_the_estimate_is_the_error():
     """With jumps of the state between windows."""
     network = pinn(windows=3)
@@ -51,6 +52,7 @@ def test_the_estimate_is_the_error():
     assert log.errors.shape == (network.windows,)
 
 
+@pytest.mark.slow
 def test_each_leaf_counts_in_its_own_units():
     y0 = {"q": jnp.array(1e-3), "p": jnp.array(0.0)}
     network = dfc.PINN(y0, 0.0, 2.0, width=8, depth=1, slope=2.0, key=KEY)
@@ -66,6 +68,7 @@ def test_each_leaf_counts_in_its_own_units():
     assert log.error < 1e-3
 
 
+@pytest.mark.slow
 def test_the_estimate_of_a_flow_map_is_its_error():
     network, options = small_flow_map()
     trained, log = dfc.fit(network, **options)
@@ -76,6 +79,7 @@ def test_the_estimate_of_a_flow_map_is_its_error():
     np.testing.assert_allclose(log.error, expected, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_a_window_that_failed_is_trained_until_it_is_right():
     """Three turns in one window are too many for so few units."""
     network = pinn(t1=20.0, width=20)
@@ -92,6 +96,7 @@ def test_a_window_that_failed_is_trained_until_it_is_right():
     assert log.error < 1e-5
 
 
+@pytest.mark.slow
 def test_a_warning_names_the_window_and_the_error():
     """The field is steep where no network of this size can follow."""
 
@@ -140,6 +145,7 @@ def test_other_mistakes_are_named(options, match):
         dfc.fit(flow_map(), **given)
 
 
+@pytest.mark.slow
 def test_a_layer_that_cannot_be_kept_is_told():
     wrong = dfc.FirstIntegral(lambda t, y, args: y[0] ** 2 + 2 * y[1] ** 2)
     network = pinn(layer=dfc.learned.ConservativeLayer(wrong))
@@ -204,6 +210,7 @@ def same(found, expected):
     assert log.error == other_log.error
 
 
+@pytest.mark.slow
 def test_a_training_goes_on_from_a_file(tmp_path):
     network, options = small_flow_map()
     whole, path = dfc.fit(network, **options), tmp_path / "training"
@@ -220,6 +227,7 @@ def test_a_training_goes_on_from_a_file(tmp_path):
     same((model, log), whole)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_goes_on():
     network, options = small_pinn()
     whole = dfc.fit(network, **options)
@@ -233,6 +241,7 @@ def test_an_interrupted_training_goes_on():
     assert model.windows > network.windows
 
 
+@pytest.mark.slow
 def test_it_ends_at_a_target_and_after_a_time():
     network, options = small_flow_map()
     with pytest.warns(UserWarning, match="flow map is wrong"):
