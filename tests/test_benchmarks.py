@@ -44,10 +44,6 @@ TABLES = {
     "worth": ("../zoo", lambda: lines_of("worth", "RESULTS")),
     "zoo": ("zoo", lambda: trained("zoo", "tables")),
     "paper": ("paper", lambda: trained("paper", "table")),
-    "zoo curve": (
-        "zoo",
-        lambda: (run := benchmark("zoo_curve")).table(run.read_results()).splitlines(),
-    ),
 }
 
 
@@ -86,7 +82,6 @@ SMOKE = {
         pinn["errors"]["projected"]["relative_l2_error"] < 1
         and flow_map["errors"]["RK4"]["one_step_rms"] < flow_map["errors"]["plain"]["one_step_rms"]
     ),
-    "zoo_curve": lambda point: 0 < point["one_step_rms"] < 1,
     "paper": lambda standard, conservative: (
         standard["plain"]["drift"] > 1e-6
         and all(x["projected"]["drift"] < 1e-14 for x in (standard, conservative))
