@@ -129,7 +129,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 COSTS := forms overhead work_precision scaling balance dae random_features
 TRAININGS := zoo paper learning_from_data equal_cost worth hard_cases
 STUDIES := long_run metric symmetric units
-PUBLISHED := sundials homproj_paper
+PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
@@ -143,8 +143,9 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # Each writes its result when it is done, and is skipped if that is there: remove it to measure anew.
-bench-published: $(BENCH) ## compare with what others published
+bench-published: $(BENCH) ## compare with what others published; tables of a page: half an hour
 	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
+	$(BIN)/python benchmarks/published/tables.py --write
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
 # that the pages recommend.
@@ -153,7 +154,7 @@ comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/equal_cost learned/hard_cases published/sundials \
+	  learned/equal_cost learned/hard_cases published/sundials published/mechanisms \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 

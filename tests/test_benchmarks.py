@@ -67,6 +67,14 @@ def test_the_results_are_what_the_pages_show():
         assert any(f"<!-- begin: {name} -->" in page for page in pages)
 
 
+def test_the_page_of_published_results_shows_the_results():
+    tables = benchmark("tables")
+    results, page = tables.read_results(), tables.PAGE.read_text(encoding="utf-8")
+    assert tables.filled(page, results) == page
+    for name in tables.tables(results):
+        assert f"<!-- begin: {name} -->" in page
+
+
 def test_the_drift_is_flat():
     """Of the recorded run of a hundred million steps."""
     for row in json.loads(benchmark("long_run").RESULTS.read_text()):

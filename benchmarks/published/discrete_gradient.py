@@ -215,7 +215,6 @@ def verdicts(results):
         yield common.Verdict(row, "solves of 80 that do not arrive", who, *failures)
         first = (theirs[0]["median"], mine[0]["median"])
         yield common.Verdict(row, "median error, shortest steps", who, *first)
-        yield common.Verdict(row, "seconds", who, theirs[0]["seconds"], mine[0]["seconds"])
 
 
 def main(argv=None):

@@ -282,6 +282,7 @@ def verdicts(results):
     yield common.Verdict(
         row, "seconds", "homproj, here", here["seconds"], ours["seconds"] or failed
     )
+    yield common.Verdict(row, "error", "homproj, here", here["error"], ours["error"])
     for tolerance in TOLERANCES[1:3]:
         rows = {x["program"]: x for x in results["kepler"] if x["tolerance"] == tolerance}
         a, b = rows["homproj, H, L, A_x"], rows["ours, H, L, A_x"]
