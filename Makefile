@@ -127,7 +127,7 @@ examples: $(TEST) ## execute the code blocks of the README, the docs and the doc
 	@echo "Every example ran."
 
 COSTS := forms overhead work_precision scaling balance dae random_features
-TRAININGS := zoo paper learning_from_data equal_cost worth hard_cases
+TRAININGS := zoo paper learning_from_data equal_cost worth defaults hard_cases
 STUDIES := long_run metric symmetric units
 PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms
 
@@ -143,7 +143,7 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # Each writes its result when it is done, and is skipped if that is there: remove it to measure anew.
-bench-published: $(BENCH) ## compare with what others published; tables of a page: half an hour
+bench-published: $(BENCH) ## compare with what others published; tables of a page: 40 minutes
 	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
 	$(BIN)/python benchmarks/published/tables.py --write
 
@@ -154,7 +154,7 @@ comma := ,
 bench-smoke: export XLA_FLAGS := $(subst options=,options=$(SMALL_LOOPS)$(comma),$(QUICKLY_COMPILED))
 bench-smoke: $(TEST) ## the same at toy sizes, to see that it runs; the slow tests run those of learned/
 	printf '%s\n' $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-	  learned/equal_cost learned/hard_cases published/sundials published/mechanisms \
+	  learned/equal_cost learned/defaults learned/hard_cases published/mechanisms \
 	  | xargs -P $(WORKERS) -I NAME $(BIN)/python benchmarks/NAME.py --smoke
 	$(BIN)/python benchmarks/cost/report.py
 
