@@ -122,7 +122,8 @@ def rows_of(problem, settings, smoke):
         both = jnp.array(rtol), jnp.array(atol)
         _, path, row = common.counted(field, solver, manifold, y0, t1, *both, max_steps=150_000)
         used = np.isfinite(np.asarray(path.ts))
-        off = np.abs(energies(problem, path.ys)[used] - energies(problem, np.array(start)))
+        states = np.asarray(path.ys)[used]
+        off = np.abs(energies(problem, states) - energies(problem, np.array(start)))
         saved = common.solve(field, solver, y0, t1, *both, saveat).ys
         row |= dict(energy=float(np.max(off)), end=float(energies(problem, saved[-1])))
         if exact is not None:
