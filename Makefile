@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lowest slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies build clean distclean
+.PHONY: help demo test lowest slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -127,11 +127,10 @@ examples: $(TEST) ## execute the code blocks of the README, the first pages and 
 	$(BIN)/python -m pytest $(SHARED) -qq -m "examples and not slow" tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := core forms overhead gradients work_precision scaling balance dae learned_solvers sweeps \
-  random_features
-TRAININGS := zoo paper zoo_curve learning_from_data equal_cost silent_failures chemistry worth \
-  defaults hard_cases
+COSTS := forms overhead work_precision scaling balance dae random_features
+TRAININGS := zoo paper learning_from_data equal_cost chemistry worth defaults hard_cases
 STUDIES := claims long_run metric symmetric units verdict
+PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
@@ -140,14 +139,18 @@ bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of th
 
 bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and measure them: many hours
 	set -e; for name in $(TRAININGS); do $(BIN)/python benchmarks/learned/$$name.py; done
-	$(BIN)/python benchmarks/learned/chemistry.py --system robertson
 
 bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
+# Each writes its result when it is done, and is skipped if that is there: remove it to measure anew.
+bench-published: $(BENCH) ## compare with what others published; tables of a page: 40 minutes
+	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
+	$(BIN)/python benchmarks/published/tables.py --write
+
 SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases
-SMOKED ?= cost/core learned/defaults studies/claims
+  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases $(PUBLISHED:%=published/%)
+SMOKED ?= cost/balance learned/defaults studies/claims published/mechanisms
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
 # that the pages recommend.

@@ -216,7 +216,8 @@ class ComparisonReport:
             return []
         return [
             f"It changes linear invariants that nobody declared, by {change:.0e} of the sizes of "
-            "the components: `find_invariants(vector_field, states, basis=1)` finds them."
+            "the components: `ManifoldProjection(..., keep_linear=True)` keeps them, and "
+            "`find_invariants(vector_field, states, basis=1)` finds them."
         ]
 
     def _units(self) -> list[str]:

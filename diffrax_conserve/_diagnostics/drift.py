@@ -37,10 +37,10 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$, to which roundoff is
     proportional. All components of a vector have the largest scale among them, because a component
-    may be zero at the start, as those of an angular momentum in a plane. Where all these terms are zero at the start, as of the momentum of bodies at rest,
-    the drift is absolute, in the units of the function. From the numerator the integral of a `rate`
-    from $t_0$ to $t_k$ is subtracted, computed along the dense output, which the solution must then
-    have.
+    may be zero at the start, as those of an angular momentum in a plane. Where all these terms are
+    zero, as of the momentum of bodies at rest, the drift is absolute, in the units of the function.
+    From the numerator the integral of a `rate` from $t_0$ to $t_k$ is subtracted, computed along
+    the dense output, which the solution must then have.
 
     **Arguments:**
 

@@ -1,0 +1,108 @@
+"""The tables of the page `docs/published.md`, from the results.
+
+python benchmarks/published/tables.py           # prints what is won and lost
+python benchmarks/published/tables.py --write   # puts all tables between their two markers
+"""
+
+import argparse
+import json
+import math
+import re
+
+import common
+import discrete_gradient
+import heyoka_page
+import homproj_paper
+import julia_energy
+import mechanisms
+import sundials
+
+PAGE = common.measuring.RESULTS.parents[1] / "docs" / "published.md"
+# In the order of the page.
+ROWS = (sundials, homproj_paper, heyoka_page, discrete_gradient, julia_energy, mechanisms)
+
+
+def read_results():
+    files = {module: common.RESULTS / f"{module.__name__}.json" for module in ROWS}
+    return {module: json.loads(file.read_text()) for module, file in files.items()}
+
+
+def judgement(verdict) -> str:
+    """What is smaller is better. Errors at roundoff on both sides count as equal."""
+    ours, theirs = verdict.ours, verdict.theirs
+    if ours == theirs or max(ours, theirs) < 1e-12:
+        return "equal"
+    if ours < theirs:
+        return "ours"
+    return "within 1.5" if ours <= 1.5 * theirs else "theirs"
+
+
+def verdict_table(results):
+    heads = ("problem", "what", "against", "theirs", "ours", "first")
+    verdicts = [x for module, found in results.items() for x in module.verdicts(found)]
+    return common.markdown(heads, ((*verdict, judgement(verdict)) for verdict in verdicts))
+
+
+def summary(results):
+    found = [judgement(x) for module, y in results.items() for x in module.verdicts(y)]
+    counts = {name: found.count(name) for name in ("ours", "equal", "within 1.5", "theirs")}
+    return [
+        f"Of {len(found)} comparisons ours is first in {counts['ours']}, equal in "
+        f"{counts['equal']}, within a factor of 1.5 in {counts['within 1.5']}, and behind in "
+        f"{counts['theirs']}."
+    ]
+
+
+def machine(results):
+    about = results[sundials]["machine"]
+    names = ("jax", "diffrax", "scipy", "heyoka", "homproj", "scikit-sundae")
+    versions = {k: v for x in results.values() for k, v in x["machine"]["versions"].items()}
+    packages = ", ".join(f"{name} {versions[name]}" for name in names if name in versions)
+    minutes = math.ceil(sum(x["minutes"] for x in results.values()))
+    return [
+        f"{about['cpu']}, {about['cores']} cores, shared with other work; Python "
+        f"{about['python']}, {packages}; {about['date'][:10]}; {minutes} minutes in all."
+    ]
+
+
+def tables(results):
+    """By the name in the markers of the page."""
+    return {
+        "summary": summary(results),
+        "machine": machine(results),
+        "verdicts": verdict_table(results),
+        "pendulum": sundials.table(results[sundials]),
+        "particle": sundials.table(results[sundials], "particle", (1e-4, 1e-6)),
+        "camassa-holm": homproj_paper.table(results[homproj_paper]),
+        "kepler": homproj_paper.kepler_table(results[homproj_paper]),
+        "outer solar system": heyoka_page.table(results[heyoka_page]),
+        "discrete gradient": discrete_gradient.table(results[discrete_gradient]),
+        "henon-heiles": julia_energy.table(results[julia_energy]),
+        "boson": julia_energy.table(results[julia_energy], "quadrupole boson"),
+        "default tolerances": julia_energy.loose_table(results[julia_energy]),
+        "mechanisms": mechanisms.table(results[mechanisms]),
+    }
+
+
+def filled(text, results):
+    for name, lines in tables(results).items():
+        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+        new = "\n".join([begin, *lines, end])
+        text = re.sub(
+            f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, x=new: x, text, flags=re.DOTALL
+        )
+    return text
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--write", action="store_true", help="the tables of the page")
+    options = parser.parse_args(argv)
+    results = read_results()
+    print("\n".join([*summary(results), *verdict_table(results)]))
+    if options.write:
+        PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), results), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
