@@ -72,17 +72,13 @@ class Newton(AbstractNewton):
             )
         equations, bounds = problem.equations, self.bounds(problem.like)
         given = _Given(equations.dense(), candidate, bounds)
-        # First phase: some point of the manifold.
-        if bounds is None:
-            options: Any = dict(iteration=damped, max_steps=self.max_steps)
-            first = solution(Along(equations, candidate, **options))
-        else:
-            first = project_within(bounds, equations, candidate, max_steps=self.max_steps)
         if candidate.size + equations.magnitude.size > NEAREST:
+            first = _some_point(equations, given, self.max_steps)
             y, count = given.clip(first.y), first.num_steps
             y = certain(y, False, y)
         else:
-            y, count = _nearest(given, lax.stop_gradient(first.y), self.max_steps)
+            first = _some_point(*tree_stop_gradient((equations, given)), self.max_steps)
+            y, count = _nearest(given, first.y, self.max_steps)
             count = first.num_steps + count
         return y, problem.report(candidate, y, count)
 
@@ -99,6 +95,13 @@ class _Given(eqx.Module):
 
     def clip(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
         return z if self.bounds is None else self.bounds.clip(z)
+
+
+def _some_point(equations: Equations, given: _Given, max_steps: int) -> Solved:
+    """First phase: some point of the manifold, within bounds before the clip."""
+    if given.bounds is not None:
+        return project_within(given.bounds, equations, given.candidate, max_steps=max_steps)
+    return solution(Along(equations, given.candidate, iteration=damped, max_steps=max_steps))
 
 
 class _Conditions(eqx.Module):
