@@ -77,7 +77,8 @@ class Newton(AbstractNewton):
             y, count = given.clip(first.y), first.num_steps
             y = certain(y, False, y)
         else:
-            first = _some_point(*tree_stop_gradient((equations, given)), self.max_steps)
+            equations, still = tree_stop_gradient((equations, given))
+            first = _some_point(equations, still, self.max_steps)
             y, count = _nearest(given, first.y, self.max_steps)
             count = first.num_steps + count
         return y, problem.report(candidate, y, count)
