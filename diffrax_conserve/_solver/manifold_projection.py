@@ -201,7 +201,9 @@ class ManifoldProjection(ForwardingSolver):
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
             statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
-            moves=jnp.zeros((_MOVES, ravel(y0).size), values.dtype) if self.keep_linear else None,
+            moves=jnp.zeros((2 * _MOVES, ravel(y0).size), values.dtype)
+            if self.keep_linear
+            else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -233,7 +235,9 @@ class ManifoldProjection(ForwardingSolver):
         motion = state.motion_after(change, candidate)
         # The dense output of the step is rarely needed, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
-        moves = moves_along(path(), t0, t1, y0) if self.keep_linear else None
+        moves = state.moves
+        if moves is not None:
+            moves = jnp.concatenate([moves_along(path(), t0, t1, y0), moves[:_MOVES]])
         start = self._target(terms, t1, state, change, motion, moves, args).following(t0, y0)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, lambda: y0, error)
@@ -297,7 +301,7 @@ class ManifoldProjection(ForwardingSolver):
             moved=change,
             units=motion if is_ode(terms) else None,
             gained=state.gained,
-            moves=None if moves is None else jnp.concatenate([moves, state.moves]),
+            moves=moves,
         )
 
     def _cannot_start(

@@ -50,9 +50,13 @@ FIRST = register(
     "the projection of a step failed: the correction is a larger share of the step than "
     "`max_correction` allows. Check by `check_invariance` that the quantity is conserved at all, "
     "take smaller steps, or pass another `max_correction`.",
-    "the projection of a step failed: the manifold was not reached. " + _ADVICE + "If it is, the "
-    "constraints may contradict each other or the bounds, or terms that cancel inside `fn` have "
-    "grown since the start of the solve: pass `atol`, or start again from here. " + _ENTRY,
+    "the projection of a step failed: the manifold was not reached. "
+    + _ADVICE
+    + "If it is, what is "
+    "asked for may contradict itself, as a bound above the start does, a `value` that no state has, "
+    "or all integrals of a single wave on a coarse grid: leave one out, or pass "
+    "`projection=diffrax_conserve.SimplifiedNewton(metric=1.0)`. Or terms that cancel inside `fn` "
+    "have grown since the start: pass `atol`. " + _ENTRY,
 )
 # The causes of a failure, in the order of their messages above, of which `FIRST` is the first. Zero
 # is no failure.
@@ -178,7 +182,7 @@ class State(eqx.Module):
       zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
-    - `moves`: the changes of the state within the last step, if linear invariants are kept.
+    - `moves`: the changes of the state in this step and the last one, if linear invariants are kept.
     """
 
     inner: Any

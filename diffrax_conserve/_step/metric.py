@@ -81,19 +81,19 @@ class PreferredUnits(eqx.Module):
     def along(cls, own: Any, moves: Float[Array, "k n"]) -> "PreferredUnits":
         """With the span of given `moves`, changes of the state. By the Gram-Schmidt process, where
         each move is made orthogonal to the others twice, because once would leave roundoff in the
-        ratio of its length before and after. A move that is new in less than half of its digits
-        is left out."""
+        ratio of its length before and after. A move whose new part is less
+        than `δ` of it is left out: it has too few digits to keep what the others keep."""
         moves = jax.vmap(lambda x: measured(x, own))(moves)
         sizes = jnp.max(jnp.abs(moves), axis=1, keepdims=True)
         moves = moves / jnp.where(sizes > 0, sizes, 1)
-        eps = float(jnp.finfo(moves.dtype).eps)
+        least = _outside(moves.dtype) ** 2
 
         def add(basis: Array, k: Array) -> tuple[Array, None]:
             new = moves[k]
             for _ in range(2):
                 new = new - (basis @ new) @ basis
             square = jnp.sum(new**2)
-            is_new = square > eps * jnp.sum(moves[k] ** 2)
+            is_new = square > least * jnp.sum(moves[k] ** 2)
             new = jnp.where(is_new, new * lax.rsqrt(jnp.where(is_new, square, 1)), 0)
             return basis.at[k].set(new), None
 

@@ -68,7 +68,7 @@ def test_the_momentum_stays_beside_the_energy(solver, controller):
     assert kept_energy < 200 * eps > lost_energy  # the energy is about 10
     # A hundred steps of plain summation, and the small share of a correction that leaves the span.
     assert lost_momentum > 1e-7
-    assert kept_momentum < 100 * eps + 1e-11 * lost_momentum
+    assert kept_momentum < 100 * eps + 1e-9 * lost_momentum
     for y, other in zip(ys, others, strict=True):
         assert np.abs(y - other).max() < 0.05
 
