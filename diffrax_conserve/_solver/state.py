@@ -52,9 +52,8 @@ FIRST = register(
     "take smaller steps, or pass another `max_correction`.",
     "the projection of a step failed: the manifold was not reached. "
     + _ADVICE
-    + "If it is, what is "
-    "asked for may contradict itself, as a bound above the start does, a `value` that no state has, "
-    "or all integrals of a single wave on a coarse grid: leave one out, or pass "
+    + "If it is, what is asked for may contradict itself, as a bound above the start, a `value` "
+    "that no state has, or all integrals of a single wave on a coarse grid: leave one out, or pass "
     "`projection=diffrax_conserve.SimplifiedNewton(metric=1.0)`. Or terms that cancel inside `fn` "
     "have grown since the start: pass `atol`. " + _ENTRY,
 )
@@ -182,7 +181,7 @@ class State(eqx.Module):
       zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
-    - `moves`: the changes of the state in this step and the last one, if linear invariants are kept.
+    - `moves`: the changes of the state in the last two steps, if linear invariants are kept.
     """
 
     inner: Any
