@@ -40,7 +40,8 @@ REFINEMENTS = 3
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 AT_BOUND = 1e-10
 # The nearest point from far away is sought for at most this many unknowns and constraints together,
-# because each step solves a dense system of that size.
+# because each step solves a dense system of that size. A sparse system of at most this size is
+# factored as a dense matrix if it would have to be solved by iteration.
 NEAREST = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in

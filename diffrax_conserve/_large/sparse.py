@@ -12,7 +12,8 @@ when a solve is traced, and everything that depends on it is an array of integer
   by cyclic reduction: each step eliminates every other block, for all of them at once.
 - *Dense rows.* An energy or a momentum depends on all components. A few such rows beside the sparse
   ones are eliminated last, by their Schur complement.
-- Where the blocks would be too large, as in a membrane, the system is solved by iteration.
+- Where the blocks would be too large, as in a membrane, the system is solved by iteration, if it
+  is too large for a dense matrix too.
 """
 
 import functools as ft
@@ -31,7 +32,7 @@ import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
 
-from .._constants import ADDED_POWER, FEW, LEAST_SPARSE
+from .._constants import ADDED_POWER, FEW, LEAST_SPARSE, NEAREST
 from .._fast.jaxprs import jaxprs_inside
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
@@ -212,6 +213,10 @@ def pattern_of(
             "not take it from `args`.",
             stacklevel=2,
         )
+    # An iteration does not cope with constraints that depend on each other, as the rigid bodies of
+    # an over-constrained mechanism have them, and the factors of a dense matrix do.
+    if pattern is not None and pattern.iterative and m <= NEAREST:
+        return None
     return pattern
 
 
