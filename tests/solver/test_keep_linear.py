@@ -44,9 +44,16 @@ def solved(solver, controller, x, stiffness, **options):
 FIXED, ADAPTIVE = dfx.ConstantStepSize(), dfx.PIDController(rtol=1e-5, atol=1e-5)
 
 
+SLOW = pytest.mark.slow  # all of their time is compilation
+
+
 @pytest.mark.parametrize(
     ("solver", "controller"),
-    [(dfc.RK4(), FIXED), (dfx.Tsit5(), ADAPTIVE), (dfx.Kvaerno3(), ADAPTIVE)],
+    [
+        pytest.param(dfc.RK4(), FIXED, marks=SLOW),
+        (dfx.Tsit5(), ADAPTIVE),
+        pytest.param(dfx.Kvaerno3(), ADAPTIVE, marks=SLOW),
+    ],
     ids=["RK4", "Tsit5", "Kvaerno3"],
 )
 def test_the_momentum_stays_beside_the_energy(solver, controller):
@@ -85,6 +92,7 @@ def test_a_declared_linear_invariant_is_kept_too():
     assert not np.any(dfc.off_manifold(sol, manifold, args=2.0))
 
 
+@SLOW
 def test_the_derivative_is_that_of_differences():
     def end(stiffness):
         return solved(dfc.RK4(), FIXED, 0.4, stiffness, keep_linear=True).ys[0][-1]
