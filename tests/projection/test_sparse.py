@@ -21,7 +21,8 @@ from diffrax_conserve._step.linear import solve as gram_solve
 from ..problems import largest, solve
 from ..thinned import some_of
 
-NUM = 40
+# So many that the row of a momentum counts as dense beside the rows of bonds.
+NUM = 100
 
 
 def _bonds(pairs: np.ndarray) -> dfc.Constraint:
@@ -30,7 +31,7 @@ def _bonds(pairs: np.ndarray) -> dfc.Constraint:
 
 
 def _lattice(side: int) -> np.ndarray:
-    """The bonds of a square lattice, too wide for blocks."""
+    """The bonds of a square lattice, too wide for blocks, and too many for a dense matrix."""
     of = np.arange(side**2).reshape(side, side)
     across = np.stack([of[:, :-1].ravel(), of[:, 1:].ravel()], 1)
     down = np.stack([of[:-1].ravel(), of[1:].ravel()], 1)
@@ -46,7 +47,7 @@ MANIFOLDS: dict[str, tuple[Any, int]] = {
     "chain": (_bonds(_CHAIN), NUM + 1),
     "shuffled chain": (_bonds(np.random.default_rng(0).permutation(_CHAIN)), NUM + 1),
     "ring": (_bonds(np.stack([np.arange(NUM), (np.arange(NUM) + 1) % NUM], 1)), NUM),
-    "lattice": (_bonds(_lattice(12)), 144),
+    "lattice": (_bonds(_lattice(17)), 289),
 }
 ENERGY = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.cos(y)) + jnp.sum(y[1:] * y[:-1]))
 MOMENTUM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y, axis=0))
