@@ -215,7 +215,7 @@ def pattern_of(
         )
     # An iteration does not cope with constraints that depend on each other, as the rigid bodies of
     # an over-constrained mechanism have them, and the factors of a dense matrix do.
-    if pattern is not None and pattern.iterative and m <= NEAREST:
+    if pattern is not None and pattern.iterative and m + n <= NEAREST:
         return None
     return pattern
 

@@ -47,7 +47,7 @@ MANIFOLDS: dict[str, tuple[Any, int]] = {
     "chain": (_bonds(_CHAIN), NUM + 1),
     "shuffled chain": (_bonds(np.random.default_rng(0).permutation(_CHAIN)), NUM + 1),
     "ring": (_bonds(np.stack([np.arange(NUM), (np.arange(NUM) + 1) % NUM], 1)), NUM),
-    "lattice": (_bonds(_lattice(17)), 289),
+    "lattice": (_bonds(_lattice(12)), 144),
 }
 ENERGY = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.cos(y)) + jnp.sum(y[1:] * y[:-1]))
 MOMENTUM = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y, axis=0))
