@@ -118,11 +118,13 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         away = length(ravel(tree_sub(candidate, first())), units)
         limit = lax.stop_gradient(jnp.maximum(self.limit, away))
 
+        vector = ravel(candidate)
+
         def near(y: Array, ok: Array) -> Array:
             """Whether a projection succeeded without leading too far away."""
             return ok & (length(y - vector, units) <= limit)
 
-        y, info = target.projection.solve(problem, vector := ravel(candidate))
+        y, info = target.projection.solve(problem, vector)
         ok = near(y, info.ok)
         y = jnp.where(ok, y, vector)
         bounded = bounded_parts(target.projection)

@@ -81,7 +81,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     """
     ts, ys, values, residual = _residuals(sol, manifold, args, "drift")
     _, scale = measure(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
-    scale = jtu.tree_map(lambda s: jnp.broadcast_to(jnp.max(s, initial=0), s.shape), scale)
+    scale = jtu.tree_map(lambda s: jnp.max(s, initial=0), scale)
     return jax.vmap(lambda t, y: relative(residual(t, y), scale))(ts, ys)
 
 

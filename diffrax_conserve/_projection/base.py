@@ -226,8 +226,8 @@ class Target(eqx.Module):
       backwards in time, otherwise 1.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
       second what rounding has added to them; `None` if no entry has a rate.
-    - `moves`: changes of the state in this step and the last one, if corrections are to stay in
-      their span; see `PreferredUnits`.
+    - `preferred`: changes of the state in this step and the last one, if corrections are to stay
+      in their span; see `PreferredUnits`.
     """
 
     projection: AbstractProjection
@@ -239,7 +239,7 @@ class Target(eqx.Module):
     moved: Float[Array, " n"] | None = None
     units: Float[Array, " n"] | None = None
     gained: Float[Array, "2 m"] | None = None
-    moves: Float[Array, "k n"] | None = None
+    preferred: Float[Array, "k n"] | None = None
 
     def advanced(
         self, start: RealScalarLike, end: RealScalarLike, path: Callable[[RealScalarLike], Y]
@@ -294,9 +294,9 @@ class Target(eqx.Module):
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
         equations = dataclasses.replace(equations, units=self.units, moved=self.moved)
         equations = adapted(equations, self.projection, t, y, self.args)
-        if self.moves is None:
+        if self.preferred is None:
             return equations
-        units = PreferredUnits.along(equations.units, self.moves)
+        units = PreferredUnits.along(equations.units, self.preferred)
         return dataclasses.replace(equations, units=units, pattern=None)  # their products are dense
 
     def metric(self, t: RealScalarLike, y: Y) -> Units:

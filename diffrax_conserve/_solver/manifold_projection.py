@@ -37,18 +37,18 @@ from .state import (
 from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
 from .wrapper import ForwardingSolver
 
-# The dense output of common solvers is a polynomial of at most this degree, so that as many changes
-# of the state span the directions in which it moves.
-_MOVES = 4
+# So many changes of the state are taken from the dense output of a step. They span the directions
+# in which it moves if it is a polynomial of at most this degree, as that of most solvers is.
+_CHANGES = 4
 
 
-def moves_along(
+def changes_along(
     path: dfx.AbstractLocalInterpolation, t0: RealScalarLike, t1: RealScalarLike, y0: Y
 ) -> Float[Array, "k n"]:
     """The changes of the state from the start of a step, in the dense output of the wrapped solver,
     after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
     that they are orthogonal to each `c` with `c · f = 0`."""
-    shares = (k / _MOVES for k in range(1, _MOVES + 1))
+    shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
     return jnp.stack([ravel(path.evaluate(t0 + share * (t1 - t0))) - ravel(y0) for share in shares])
 
 
@@ -186,9 +186,9 @@ class ManifoldProjection(ForwardingSolver):
         check_state(y0, kind=jnp.inexact)
         values = conserved_values(self.manifold, t, y0, args)
         values, hidden = started(values, self.manifold, t, y0, args)
-        if self.keep_linear and values.size > 2 * _MOVES:
+        if self.keep_linear and values.size > 2 * _CHANGES:
             raise ValueError(
-                f"`keep_linear` has {2 * _MOVES} directions, but `manifold` has {values.size} "
+                f"`keep_linear` has {2 * _CHANGES} directions, but `manifold` has {values.size} "
                 "scalar constraints. Leave it out, and add the linear invariants to `manifold`: "
                 "`diffrax_conserve.compare` tells which there are."
             )
@@ -201,7 +201,7 @@ class ManifoldProjection(ForwardingSolver):
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
             statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
-            moves=jnp.zeros((2 * _MOVES, ravel(y0).size), values.dtype)
+            preferred=jnp.zeros((2 * _CHANGES, ravel(y0).size), values.dtype)
             if self.keep_linear
             else None,
         )
@@ -235,10 +235,10 @@ class ManifoldProjection(ForwardingSolver):
         motion = state.motion_after(change, candidate)
         # The dense output of the step is rarely needed, so it is made when it is called.
         path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
-        moves = state.moves
-        if moves is not None:
-            moves = jnp.concatenate([moves_along(path(), t0, t1, y0), moves[:_MOVES]])
-        start = self._target(terms, t1, state, change, motion, moves, args).following(t0, y0)
+        preferred = state.preferred
+        if preferred is not None:
+            preferred = jnp.concatenate([changes_along(path(), t0, t1, y0), preferred[:_CHANGES]])
+        start = self._target(terms, t1, state, change, motion, preferred, args).following(t0, y0)
         target = start.advanced(t0, t1, lambda t: path().evaluate(t))
         step = target.step(t0, t1, lambda: y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
@@ -275,7 +275,11 @@ class ManifoldProjection(ForwardingSolver):
             (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
         )
         state = state.next(
-            inner=inner, gained=target.gained, motion=motion, statistics=statistics, moves=moves
+            inner=inner,
+            gained=target.gained,
+            motion=motion,
+            statistics=statistics,
+            preferred=preferred,
         )
         return y1, error, dense_info, state, result
 
@@ -286,7 +290,7 @@ class ManifoldProjection(ForwardingSolver):
         state: State,
         change: Float[Array, " n"],
         motion: Float[Array, " n"],
-        moves: Float[Array, "k n"] | None,
+        preferred: Float[Array, "k n"] | None,
         args: Args,
     ) -> Target:
         """The target of a step. Noise has no metric of motion: with noise the metric decides which
@@ -301,7 +305,7 @@ class ManifoldProjection(ForwardingSolver):
             moved=change,
             units=motion if is_ode(terms) else None,
             gained=state.gained,
-            moves=moves,
+            preferred=preferred,
         )
 
     def _cannot_start(

@@ -22,7 +22,7 @@ from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
-from .._step.equations import Equations, reach, shown_terms
+from .._step.equations import Equations, reach
 from .._step.metric import Units, length
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
@@ -181,7 +181,7 @@ class State(eqx.Module):
       zero before the first step.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
-    - `moves`: the changes of the state in the last two steps, if linear invariants are kept.
+    - `preferred`: the changes of the state in the last two steps, if linear invariants are kept.
     """
 
     inner: Any
@@ -192,7 +192,7 @@ class State(eqx.Module):
     first_step: RealScalarLike
     num_steps: Int[Array, ""] | None
     statistics: ProjectionStatistics
-    moves: Float[Array, "k n"] | None = None
+    preferred: Float[Array, "k n"] | None = None
 
     def motion_after(self, change: Float[Array, " n"], end: Y) -> Float[Array, " n"]:
         """`motion` after a step to `end` that changed the components by `change`.
@@ -259,9 +259,7 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     as those of `q · v = 0` where a component of a pendulum passes zero.
     """
     g, jacobian = equations.linearise(y)
-    sizes = jnp.abs(y) if equations.moved is None else jnp.abs(y) + equations.moved
-    limit = shown_terms(jacobian, sizes) + equations.hidden
-    limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * limit
+    limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * equations.scale(jacobian, y)
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
     must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], counts)

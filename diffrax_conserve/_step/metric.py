@@ -78,26 +78,26 @@ class PreferredUnits(eqx.Module):
     basis: Float[Array, "k n"]
 
     @classmethod
-    def along(cls, own: Any, moves: Float[Array, "k n"]) -> "PreferredUnits":
-        """With the span of given `moves`, changes of the state. By the Gram-Schmidt process, where
-        each move is made orthogonal to the others twice, because once would leave roundoff in the
-        ratio of its length before and after. A move whose new part is less
-        than `δ` of it is left out: it has too few digits to keep what the others keep."""
-        moves = jax.vmap(lambda x: measured(x, own))(moves)
-        sizes = jnp.max(jnp.abs(moves), axis=1, keepdims=True)
-        moves = moves / jnp.where(sizes > 0, sizes, 1)
-        least = _outside(moves.dtype) ** 2
+    def along(cls, own: Any, changes: Float[Array, "k n"]) -> "PreferredUnits":
+        """With the span of given changes of the state, by the Gram-Schmidt process. Each change is
+        made orthogonal to the others twice, because once would leave roundoff in the ratio of its
+        length before and after. If its new part is less than `δ` of it, it is left out: it has too
+        few digits to keep what the others keep."""
+        changes = jax.vmap(lambda x: measured(x, own))(changes)
+        sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
+        changes = changes / jnp.where(sizes > 0, sizes, 1)
+        least = _outside(changes.dtype) ** 2
 
         def add(basis: Array, k: Array) -> tuple[Array, None]:
-            new = moves[k]
+            new = changes[k]
             for _ in range(2):
                 new = new - (basis @ new) @ basis
             square = jnp.sum(new**2)
-            is_new = square > least * jnp.sum(moves[k] ** 2)
+            is_new = square > least * jnp.sum(changes[k] ** 2)
             new = jnp.where(is_new, new * lax.rsqrt(jnp.where(is_new, square, 1)), 0)
             return basis.at[k].set(new), None
 
-        return cls(own, lax.scan(add, jnp.zeros_like(moves), jnp.arange(len(moves)))[0])
+        return cls(own, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
     def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         """`rows S (P + δ (1 - P))`."""
