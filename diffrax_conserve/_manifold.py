@@ -247,6 +247,11 @@ def conserved_values(
             output = exactly(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
+            if value is not None:
+                raise ValueError(
+                    f"`value` has {value!r} in the place of `{name}`, which is a `Constraint` and "
+                    "is kept at zero. Put `None` there, or make it a `FirstIntegral`."
+                )
             value = jtu.tree_map(jnp.zeros_like, output)
         elif given is None and value is None:
             value = output

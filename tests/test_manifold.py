@@ -114,6 +114,7 @@ MISTAKES = [
     (lambda: dfc.ManifoldProjection(IMPLICIT, ENERGY), ValueError, "VeryChord"),
     (lambda: dfc.project(RIGID_BODY, OMEGA0, value=(1.0, 2.0)), ValueError, "not that of `manifo"),
     (lambda: dfc.project(RIGID_BODY, OMEGA0), ValueError, "Pass `value="),
+    (lambda: dfc.project(SPHERE, OMEGA0, value=2.0), ValueError, "`manifold`, which is a `Constr"),
     (lambda: dfc.project(Constraint(lambda t, y, args: 1.0 * y), jnp.array(1)), TypeError, "float"),
     (lambda: dfc.project(GAIN, OMEGA0), TypeError, "`rate` of `manifold` returns complex128"),
     (lambda: dfc.drift(run(ENERGY), ENERGY), ValueError, r"SaveAt\(t0=True, t1=True\)"),
