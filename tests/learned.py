@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 
 import diffrax_conserve as dfc
 
@@ -95,3 +96,54 @@ def driven(t, y, args):
 
 
 DRIVEN0 = {"angle": jnp.array(1.0), "rate": jnp.array([0.3])[0]}
+
+
+VORTICES, FOUR = (
+    dfc.systems.PointVortices(),
+    dfc.systems.PointVortices(strengths=(1.0, 2.0, 3.0, -1.0)),
+)
+CONSERVING = dfc.learned.ConservativeLayer(LORENZ.manifold, steps=4)
+# All that a file can hold, each at least once.
+SAVED = {
+    "pinn": lambda: solution(activation="sin", windows=3, slope=2.0, layer=CONSERVING),
+    "any state": lambda: dfc.PINN(
+        {"a": (jnp.ones(2), [jnp.zeros((2, 1), jnp.float32), None]), "b": jnp.array(2.0)},
+        0.0, 1.0, key=jr.key(0), **SMALL,
+    ),
+    "system with parameters": lambda: dfc.DeepONet(
+        states(4, FOUR), 0.5, key=jr.key(0), layer=dfc.learned.ConservativeLayer(FOUR.manifold)
+    ),
+    "deeponet": lambda: flow_map(depth=3),
+    "gated": lambda: flow_map(core="gated", taylor=dfc.learned.Taylor(LORENZ.vector_field, 2)),
+    "concatenated": lambda: flow_map(
+        core="concatenated", taylor=dfc.learned.Taylor(LORENZ.vector_field), layer=CONSERVING
+    ),
+    "framed": lambda: dfc.learned.Repeated(
+        dfc.DeepONet(
+            states(9, VORTICES), 0.5, frame=VORTICES.frame, key=jr.key(0),
+            taylor=dfc.learned.Taylor(VORTICES.vector_field), **SMALL,
+        ),
+        3,
+    ),
+    "family": lambda: dfc.learned.Repeated(
+        dfc.learned.Transformed(
+            flow_map(args_domain=dfc.learned.Box({"a": 0.5}, {"a": jnp.array(1.5)})),
+            dfc.learned.BoxCox(0.125),
+        ),
+        2,
+    ),
+    "single": lambda: in_single(saved("deeponet")),
+}  # fmt: skip
+
+
+@ft.cache
+def saved(name):
+    """With other numbers in each array, so that nothing is compiled. A later array, as an upper
+    bound, has larger ones."""
+    leaves, structure = jax.tree.flatten(eqx.filter_eval_shape(SAVED[name]))
+    rng = np.random.default_rng(0)
+    made = [
+        jnp.asarray(i + rng.random(x.shape), x.dtype) if hasattr(x, "dtype") else x
+        for i, x in enumerate(leaves, 1)
+    ]
+    return jax.tree.unflatten(structure, made)

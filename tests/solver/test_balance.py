@@ -38,7 +38,7 @@ Y0, ARGS = (jnp.array(1.2), jnp.array(0.3)), (jnp.array(0.1), jnp.array(0.4))
 
 
 def solve(y0=Y0, args=ARGS, *, t1=2.0, solver=None, field=pendulum, manifold=BALANCE, **options):
-    solver = dfx.Tsit5() if solver is None else solver
+    solver = dfx.Bosh3() if solver is None else solver
     solver = solver if manifold is None else dfc.ManifoldProjection(solver, manifold)
     options = dict(saveat=dfx.SaveAt(t0=True, steps=True, dense=True), max_steps=256) | options
     return problems.solve(field, solver, y0, t1=t1, args=args, **options)

@@ -257,9 +257,9 @@ def test_a_stiff_field_is_not_compared_where_it_changes_within_a_step():
     """States within a factor of three of those of POLLU six minutes after the emission."""
     pollu = dfc.systems.get("pollu")
     y0 = pollu.reference(jnp.array([6.0]))[0]
-    near = y0 * 3.0 ** jr.uniform(jr.key(0), (1000, 20), minval=-1.0, maxval=1.0)
-    assert refused("pollu", pollu, near) == 0
-    assert refused("pollu", pollu, y0[None]) == 0
+    factors = 3.0 ** np.random.default_rng(0).uniform(-1, 1, (1000, 20))
+    factors[0] = 1
+    assert refused("pollu", pollu, y0 * factors) == 0
 
 
 @pytest.mark.slow

@@ -10,8 +10,7 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from .. import fresh
-from ..learned import DRIVEN0, LORENZ, Still, driven, flow_map, states, unchecked
+from ..learned import DRIVEN0, LORENZ, Still, driven, states, unchecked
 from ..thinned import some_of
 
 TERM, DRIVEN = dfx.ODETerm(LORENZ.vector_field), dfx.ODETerm(driven)
@@ -192,33 +191,6 @@ def test_it_is_never_small_where_something_is_not_finite():
     term = dfx.ODETerm(lambda t, y, args: jnp.where(t > 0.1, jnp.nan, y))
     _, estimate = step(unchecked(Still()), LORENZ.y0, 0.2, term=term)
     assert jnp.all(jnp.isnan(estimate))
-
-
-def work_with_a_heavy_field():
-    """The operations of a solve with fixed steps, with those projected, and with adaptive ones. An
-    evaluation of this vector field takes millions of operations, all the rest thousands."""
-    heavy = jnp.ones((200, 200))
-
-    def field(t, y, args):
-        return LORENZ.vector_field(t, y, args) + 0 * jnp.sum(jnp.tanh(heavy @ (heavy * y[0])))
-
-    def flops(solver, **options):
-        def run(y0):
-            term = dfx.ODETerm(field)
-            return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.25, y0, max_steps=8, **options).ys
-
-        return jax.jit(run).lower(LORENZ.y0).compile().cost_analysis()["flops"]
-
-    solver, adaptive = unchecked(flow_map()), dfx.PIDController(rtol=1e-3, atol=1e-3)
-    projected = dfc.ManifoldProjection(solver, LORENZ.manifold)
-    return flops(solver), flops(projected), flops(solver, stepsize_controller=adaptive)
-
-
-def test_fixed_steps_do_not_compute_it():
-    """XLA removes what a loop carries and nobody reads, but not by the flags of the tests."""
-    plain, projected, adaptive = fresh.interpreter()["flops"]
-    assert max(plain, projected) < 1e6
-    assert adaptive > 1e7
 
 
 @eqx.filter_jit
