@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._diagnostics.compared_solves import switched
+from diffrax_conserve._diagnostics.compared_solves import Task, references, switched
 from diffrax_conserve._diagnostics.comparison import ComparisonReport, ComparisonRow
 from diffrax_conserve._diagnostics.linear_invariants import changes, linear_invariants
 from diffrax_conserve.reproduce import _verdict, main
@@ -312,6 +312,16 @@ def test_what_is_refused(given, options, error, words):
         )
     message = "\n".join([str(raised.value), *getattr(raised.value, "__notes__", [])])
     assert [word for word in words if word not in message] == []
+
+
+def test_starts_in_float32_have_a_reference_in_float64():
+    start, end = jnp.float32(0), jnp.float32(1)
+    task = Task(
+        dfx.ODETerm(lambda t, y, args: -y), None, jnp.ones((1, 2), jnp.float32), start, end, end,
+        dfx.ConstantStepSize(), dfx.SaveAt(t1=True), False, 1,
+    )  # fmt: skip
+    exact, _ = references(task, dfx.Dopri8(), np.array([0.0, 1.0]), np.ones(2))
+    np.testing.assert_allclose(exact[0, -1], np.exp(-1.0), rtol=1e-12)
 
 
 def test_float64_is_asked_for(monkeypatch):
