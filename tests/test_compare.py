@@ -178,7 +178,7 @@ def report_of(*errors, doubt=1e-13, lanes=1):
     [
         ((1e-3, 1e-4, 1e-5), 1e-9, "choice 2", ("0.01 times",)),
         ((1e-3, 2e-3, 1.5e-3), 1e-9, "nothing kept", ("Do not project", "choice 2", "1.5 times")),
-        ((1e-3, 1.08e-3), 1e-9, "choice 1", ("1.1 times", "Take")),
+        ((1e-3, 1.08e-3), 1e-9, "choice 1", ("1.1 times", "the error little", "for what it keeps")),
         ((np.nan, 1e-3), 1e-9, "choice 1", ("without projection the solve fails",)),
         ((1e-3, np.nan), 1e-9, "nothing kept", ("every projection fails.",)),
         ((np.nan, np.nan), 1e-9, None, ("Take shorter steps", "it failed")),
@@ -193,6 +193,14 @@ def test_what_is_said(errors, doubt, choice, words):
     assert [word for word in words if word not in report.verdict] == []
     assert report.verdict in str(report)
     assert report.solver is not None
+
+
+def test_the_verdict_names_keep_linear_where_linear_invariants_break():
+    plain, kept = report_of(1e-3, 1e-5).rows
+    for change, named in {1e-6: True, 1e-16: False}.items():
+        rows = plain, dataclasses.replace(kept, linear=np.full(1, change))
+        report = dataclasses.replace(report_of(1e-3, 1e-5), rows=rows, num_linear=1)
+        assert ("keep_linear=True" in report.verdict) is named
 
 
 def test_errors_are_judged_up_to_where_the_reference_is_trusted():
