@@ -149,10 +149,11 @@ class ComparisonReport:
             return f"Take `{self.choice}`: without projection the solve fails{where}{self._linear}."
         ratios = error[:, np.isfinite(error[0])] / error[0, np.isfinite(error[0])]
         if self.index > 0:
-            told = f"Take `{self.choice}`:"
+            told = f"Take `{self.choice}`: "
             if _mean(ratios[self.index]) >= 1 - _EQUAL:
-                told = f"Projecting changes the error little: `{self.choice}` is for what it keeps, and"
-            return f"{told} {_compared(ratios[self.index])}{self._linear}."
+                told = f"Projecting changes the error little: `{self.choice}` is good for what it "
+                told += "keeps, and "
+            return f"{told}{_compared(ratios[self.index])}{self._linear}."
         rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
         if not rivals:
             where = " in some lane" if error.shape[1] > 1 else ""
