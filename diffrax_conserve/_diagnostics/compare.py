@@ -72,8 +72,8 @@ def compare(
 
     What to take is the projection with the least error up to then, in the geometric mean over a
     batch; of those within 10 % of it the first. No projection is taken if each is worse by more
-    than that, or is within 10 % of none and worse by half in a lane. Of more than eight entries
-    none is left out.
+    than that, or is within 10 % of none and worse by half in a lane. One that gains less than 10 %
+    is said to be for what it keeps only. Of more than eight entries none is left out.
 
     A small system takes half a minute, most of it compilation. Lists that differ in what is left
     out, and metrics of weights, share programs: so the time of a solve contains the evaluation of

@@ -150,7 +150,7 @@ def _accurate(
         _, ys = lax.scan(step, (y0, jnp.array(True)), (ts[:-1], ts[1:]))
         return jtu.tree_map(lambda x, xs: jnp.concatenate([x[None], xs]), y0, ys)
 
-    precise = lambda x: x.astype(jnp.promote_types(x.dtype, float))  # noqa: E731
+    precise = lambda x: x.astype(jnp.promote_types(x.dtype, jnp.float64))  # noqa: E731
     return task.lanes(one, jtu.tree_map(precise, task.y0s))
 
 

@@ -146,10 +146,14 @@ class ComparisonReport:
         failures = np.sum(np.isinf(error), axis=1)
         if failures[0] > failures[self.index]:
             where = f" in {failures[0]} of {error.shape[1]} lanes" if error.shape[1] > 1 else ""
-            return f"Take `{self.choice}`: without projection the solve fails{where}."
+            return f"Take `{self.choice}`: without projection the solve fails{where}{self._linear}."
         ratios = error[:, np.isfinite(error[0])] / error[0, np.isfinite(error[0])]
         if self.index > 0:
-            return f"Take `{self.choice}`: {_compared(ratios[self.index])}."
+            told = f"Take `{self.choice}`: "
+            if _mean(ratios[self.index]) >= 1 - _EQUAL:
+                told = f"Projecting changes the error little: `{self.choice}` is good for what it "
+                told += "keeps, and "
+            return f"{told}{_compared(ratios[self.index])}{self._linear}."
         rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
         if not rivals:
             where = " in some lane" if error.shape[1] > 1 else ""
@@ -209,14 +213,23 @@ class ComparisonReport:
             if not row.success.all()
         ]
 
-    def _broken(self) -> list[str]:
+    @property
+    def _broken_by(self) -> float:
+        """By how much the choice breaks linear invariants that nobody declared; or zero."""
         row = self.rows[self.index or 0]
         change, before = (np.max(r.linear, initial=0) for r in (row, self.rows[0]))
-        if not row.kept or not change > max(_BROKEN, 10 * before):
+        return float(change) if row.kept and change > max(_BROKEN, 10 * before) else 0.0
+
+    @property
+    def _linear(self) -> str:
+        return "; without `keep_linear=True` it breaks linear invariants" * (self._broken_by > 0)
+
+    def _broken(self) -> list[str]:
+        if not self._broken_by:
             return []
         return [
-            f"It changes linear invariants that nobody declared, by {change:.0e} of the sizes of "
-            "the components: `ManifoldProjection(..., keep_linear=True)` keeps them, and "
+            f"It changes linear invariants that nobody declared, by {self._broken_by:.0e} of the "
+            "sizes of the components: `ManifoldProjection(..., keep_linear=True)` keeps them, and "
             "`find_invariants(vector_field, states, basis=1)` finds them."
         ]
 

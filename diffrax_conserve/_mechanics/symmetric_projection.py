@@ -175,7 +175,7 @@ class SymmetricProjection(ForwardingSolver):
             residual,
             ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
             (vector, state.multiplier),
-            equilibrated,
+            ft.partial(equilibrated, vector.size),
         )
         # Half of the digits of its derivative are right, or it is NaN.
         rows = scaled_rows(end.in_units(end.linearise(y1)[1]))[1]

@@ -7,6 +7,7 @@ are then those of Newton's method, and the derivative follows from the implicit 
 """
 
 import dataclasses
+import functools as ft
 from typing import Any, final
 
 import equinox as eqx
@@ -185,7 +186,9 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     ok = ok & still.equations.holds(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
-    found = root(conditions, lambda x: Solved(x, ok, count), start, equilibrated)
+    found = root(
+        conditions, lambda x: Solved(x, ok, count), start, ft.partial(equilibrated, first.size)
+    )
     y = conditions.state(found.y)
     equations, there = still.equations, lax.stop_gradient(y)
     gradients = scaled_rows(equations.in_units(equations.linearise(there)[1]))[1]

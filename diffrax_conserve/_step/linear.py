@@ -83,11 +83,19 @@ def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Arr
     return refined(factors, lambda x: combined(x, matrix.T), b)
 
 
-def equilibrated(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`solve_large` in units of the rows in which their largest elements are one."""
-    rows = lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1))
-    rows = jnp.where(rows > 0, rows, 1)
-    return solve_large(matrix / rows[:, None], b / rows)
+def equilibrated(n: int, matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`solve_large` in units in which nothing depends on those of the multipliers, which come after
+    `n` components of the state. The largest elements of the rows are one, without the columns of
+    the multipliers, and then those of these columns."""
+
+    def sizes(part: Array, axis: int) -> Array:
+        size = lax.stop_gradient(jnp.max(jnp.abs(part), axis=axis))
+        return jnp.where(size > 0, size, 1)
+
+    rows = sizes(matrix[:, :n], 1)
+    matrix = matrix / rows[:, None]
+    columns = sizes(matrix, 0).at[:n].set(1)
+    return solve_large(matrix / columns, b / rows) / columns
 
 
 class Factors(eqx.Module):

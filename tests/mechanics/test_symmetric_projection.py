@@ -147,6 +147,21 @@ def test_derivatives_in_both_modes_against_finite_differences():
     assert difference(forward(W0, one)[1], by_scale) < 1e-12
 
 
+def test_a_metric_that_is_a_number_changes_no_derivative():
+    @jax.jit
+    def slope(metric):
+        def end(scale):
+            solver = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), RIGID_BODY, metric=metric)
+            field = dfx.ODETerm(lambda t, w, args: args * rigid_body(t, w, None))
+            adjoint = dfx.ForwardMode()
+            return dfx.diffeqsolve(field, solver, 0.0, 0.5, 0.1, W0, scale, adjoint=adjoint).ys[-1]
+
+        return jax.jvp(end, (1.0,), (1.0,))[1]
+
+    for metric in (1e-14, 1e14):
+        assert difference(slope(metric), slope(1.0)) < 1e-11
+
+
 @pytest.mark.slow
 def test_a_lane_is_that_lane_alone_and_float32_works():
     lanes = jnp.stack([W0, 2 * W0, W0[::-1]])
