@@ -1,0 +1,460 @@
+"""Differential-algebraic equations, as equations on a manifold."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._custom_types import Args, RealScalarLike, State, Values, Y
+from .._manifold import Constraint, slope_like
+from .._options import check_function
+from .._projection.options import check_state
+from .._projection.project import project
+from .._projection.simplified_newton import SimplifiedNewton
+from .._solver.manifold_projection import ManifoldProjection
+from .._tree import ravel, tree_shapes, unravel
+from .radau import Radau
+from .reduction import (
+    Implicit,
+    Singular,
+    Structure,
+    concrete,
+    find_structure,
+    outside,
+    tree_key,
+)
+
+# `consistent` ends after this many corrections. If the voltage at a diode is guessed too large, each
+# lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
+_MAX_STEPS = 500
+
+
+@final
+class _Matrix(eqx.Module):
+    """A constant matrix, known while JAX traces."""
+
+    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+
+def _mass(mass: Any) -> Any:
+    if mass is None or callable(mass) or isinstance(mass, _Matrix):
+        return mass
+    if isinstance(mass, jax.core.Tracer):
+        raise TypeError(
+            "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are solved. "
+            "Pass a function `mass(t, y, args)`, and what it depends on in `args`."
+        )
+    mass = np.asarray(mass)
+    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(mass)):
+        raise ValueError(
+            f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square matrix "
+            "of numbers, with a row for each equation and a column for each number of the state, or "
+            "a function `mass(t, y, args)` that returns one."
+        )
+    return _Matrix(tuple(map(tuple, mass.astype(float).tolist())))
+
+
+@final
+class DAE(eqx.Module):
+    r"""A differential-algebraic equation, in one of three forms.
+
+    - `DAE(residual=F)` is $F(t, y, y', args) = 0$.
+    - `DAE(f, mass=M)` is $M y' = f(t, y, args)$, where $M$ may be singular.
+    - `DAE(f, algebraic=g)` is $x' = f(t, x, z, args)$, $0 = g(t, x, z, args)$, and its state is the
+        pair $(x, z)$.
+
+    Equations without slopes are constraints. The program finds them, also as combinations of
+    equations, differentiates them by automatic differentiation, and goes on until the equations
+    determine all slopes. The number of differentiations is the index. What is found on the way are
+    the hidden constraints: of a pendulum in Cartesian coordinates, of index 3, its length, that its
+    velocity is tangential, and the equation for its force. `report` tells what was found.
+
+    `wrap` gives a solver that projects each step, saved times, dense output and events to the
+    manifold of all these constraints, to roundoff. Use [`diffrax_conserve.Radau`][], which solves
+    the equations themselves, after all differentiations but the last. Every other solver of diffrax
+    solves the ordinary differential equation that follows from the last; that is good for equations
+    that are not stiff.
+
+    Which equations are differentiated is found once, from numbers in general position: the guess of
+    `consistent`, or where it is not called before, random numbers in the place of states and
+    arguments that JAX traces. So call `consistent` first if zeros in `args` decide about the index.
+    For the same functions and shapes, what the last call of `consistent` has found counts.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        # A pendulum of length 1 in Cartesian coordinates: position, velocity, and force.
+        def pendulum(t, y, dy, args):
+            (q, v, force), (dq, dv, _) = y, dy
+            return dq - v, dv + force * q - jnp.array([0.0, -9.81]), jnp.sum(q**2) - 1
+
+        dae = dfc.DAE(residual=pendulum)
+        y0 = dae.consistent((jnp.array([1.0, 0.0]), jnp.zeros(2), jnp.array(0.0)))
+        print(dae.report(y0))
+        steps = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+        sol = diffrax.diffeqsolve(
+            dae.term, dae.wrap(dfc.Radau()), 0.0, 1.0, 1e-3, y0, stepsize_controller=steps
+        )
+        ```
+
+        ```text
+        Index 3, with 2 degrees of freedom.
+        Differentiated: [2] 3 times.
+        Without slopes: y[2].
+        ```
+
+    ??? cite "Reference"
+
+        Rabier and Rheinboldt, *Theoretical and numerical analysis of differential-algebraic
+        equations*, Handbook of Numerical Analysis VIII, 2002; Hairer and Wanner, *Solving Ordinary
+        Differential Equations II*, Springer 1996, VI and VII.
+    """
+
+    f: Callable[..., Any] | None = None
+    mass: Any = eqx.field(default=None, kw_only=True, converter=_mass)
+    algebraic: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
+    residual: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        forms = [x is not None for x in (self.mass, self.algebraic, self.residual)]
+        if sum(forms) != 1 or (self.f is None) != (self.residual is not None):
+            raise ValueError(
+                "A `DAE` is given as `DAE(residual=F)`, as `DAE(f, mass=M)` or as "
+                "`DAE(f, algebraic=g)`. If no slope is multiplied and there are no algebraic "
+                "equations, it is an ordinary differential equation: use `diffrax.ODETerm(f)`."
+            )
+        pair = self.algebraic is not None
+        call = "t, x, z, args" if pair else "t, y, args"
+        if self.f is not None:
+            check_function("`f` of a `DAE`", self.f, f"f({call})", "a value like `x` or `y`")
+        if self.algebraic is not None:
+            name, returns = "`algebraic` of a `DAE`", "as many numbers as `z` has"
+            check_function(name, self.algebraic, f"algebraic({call})", returns)
+        if self.residual is not None:
+            call, returns = "residual(t, y, dy, args)", "as many numbers as `y` has"
+            check_function("`residual` of a `DAE`", self.residual, call, returns)
+        if callable(self.mass):
+            check_function("`mass` of a `DAE`", self.mass, "mass(t, y, args)", "a square matrix")
+
+    @property
+    def term(self) -> dfx.ODETerm[Any]:
+        """The term for [`diffrax.diffeqsolve`][], with the slopes that the equations determine."""
+        return dfx.ODETerm(_Slopes(self))
+
+    def wrap(self, solver: dfx.AbstractSolver[Any]) -> ManifoldProjection:
+        """A solver whose steps and dense output satisfy all constraints to roundoff.
+
+        **Arguments:**
+
+        - `solver`: [`diffrax_conserve.Radau`][], or another solver of diffrax if the equations are
+            not stiff.
+
+        **Returns:**
+
+        A [`diffrax_conserve.ManifoldProjection`][].
+
+        **Raises:**
+
+        `TypeError` if `solver` is none.
+        """
+        if isinstance(solver, Radau):
+            solver = dataclasses.replace(solver, equations=_Stages(self))
+        return ManifoldProjection(solver, {"equations": Constraint(_Constraints(self))})
+
+    def consistent(
+        self,
+        *guess: State,
+        t: RealScalarLike = 0.0,
+        args: Args = None,
+        fixed: PyTree[bool] | None = None,
+    ) -> Any:
+        """The state near the guess that satisfies all constraints, those that are hidden too.
+
+        Use it at the start, and after an event that changes the state, `args` or the equations.
+
+        **Arguments:**
+
+        - `guess`: the state, with its structure, shapes and dtype; of `DAE(f, algebraic=g)` its two
+            parts, `consistent(x, z)`.
+        - `t`, `args`: passed to the functions.
+        - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
+            each leaf is `True`, `False` or an array of them. By default, with index 1, all unknowns
+            whose slopes the equations contain stay; with a higher index the others, such as forces,
+            change at a price of almost nothing, and what must change beside them is nearest.
+
+        **Returns:**
+
+        The state, as `y0` of [`diffrax.diffeqsolve`][]. What was changed is told by `report`.
+
+        **Raises:**
+
+        `ValueError` or `TypeError` if the equations do not fit the state, or are singular; at run
+        time, an error if no consistent state is found.
+        """
+        y = self._state(guess)
+        structure = _structure(self, t, y, args, anew=True)
+        if structure.index == 0:
+            return y
+        vector = ravel(y)
+        eps = float(jnp.finfo(vector.dtype).eps)
+        price = np.full(vector.size, np.inf if structure.index == 1 and fixed is None else 1.0)
+        price[list(structure.algebraic)] = eps**0.5
+        if fixed is not None:
+            price[_flags(fixed, y)] = np.inf
+        sizes = jnp.abs(vector)
+        sizes = jnp.where(sizes > 0, sizes, 1)
+        metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+        found, info = project(
+            {"equations": Constraint(_Constraints(self))},
+            y,
+            t=jnp.asarray(t, jnp.result_type(float, t)),
+            args=args,
+            projection=SimplifiedNewton(metric=metric, max_steps=_MAX_STEPS),
+        )
+        return eqx.error_if(
+            found,
+            ~info.ok,
+            "`consistent` found no state near the guess that satisfies the equations and their "
+            "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
+            "the equations that are differentiated.",
+        )
+
+    def report(self, *guess: State, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
+        """What was found out about the equations, at the state of a guess.
+
+        **Arguments:**
+
+        - `guess`, `t`, `args`: as those of `consistent`.
+
+        **Returns:**
+
+        A `DAEReport`, which prints as a text. Its fields are `index`; `differentiated`, how often
+        which equation is; `algebraic`, the unknowns whose slopes no equation contains; `freedom`,
+        the number of degrees of freedom; and `residuals`, the largest of each group of constraints
+        at the guess, in the order in which they were found.
+
+        **Raises:**
+
+        As `consistent`.
+        """
+        y = self._state(guess)
+        structure = _structure(self, t, y, args, anew=True)
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        equations, unknowns = self._names(t, y, args), _names("y", y)
+        times = [sum(i in structure.left(k) for k in range(structure.index)) for i in range(len(equations))]
+        off = _Constraints(self)(t, y, args)
+        return DAEReport(
+            index=structure.index,
+            differentiated={equations[i]: n for i, n in enumerate(times) if n},
+            algebraic=tuple(unknowns[j] for j in structure.algebraic),
+            freedom=len(unknowns) - sum(times),
+            residuals=tuple(float(jnp.max(jnp.abs(h), initial=0)) for h in off),
+        )
+
+    def _state(self, guess: tuple[Any, ...]) -> Any:
+        wanted = 1 if self.algebraic is None else 2
+        if len(guess) != wanted:
+            names = "the state `y`" if wanted == 1 else "the two parts of the state, `x, z`"
+            raise ValueError(f"Pass {names}: {wanted} positional arguments, not {len(guess)}.")
+        y = jtu.tree_map(jnp.asarray, guess[0] if wanted == 1 else guess)
+        check_state(y, "a `DAE`", kind=jnp.inexact)
+        return y
+
+    def _values(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> dict[str, Any]:
+        """What the user's functions return, by their names."""
+        if self.residual is not None:
+            return {"": self.residual(t, y, slopes, args)}
+        assert self.f is not None
+        if self.algebraic is None:
+            return {"f": self.f(t, y, args)}
+        if not isinstance(y, tuple | list) or len(y) != 2:
+            raise ValueError(
+                "The state of a `DAE` with `algebraic` must be a pair `(x, z)`, but it is "
+                f"{tree_shapes(y)}. Pass `y0=dae.consistent(x, z)`."
+            )
+        slope = slope_like(y[0], self.f(t, *y, args))
+        return {"f": slope, "algebraic": self.algebraic(t, *y, args)}
+
+    def _names(self, t: RealScalarLike, y: Y, args: Args) -> list[str]:
+        """The names of the equations."""
+        values = jax.eval_shape(lambda: self._values(t, y, y, args))
+        return [name for key, value in values.items() for name in _names(key, value)]
+
+    def equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
+        """The equations as a function of vectors, for states like `y`."""
+        size, given = ravel(y).size, len(self._names(t, y, args))
+        if given != size:
+            which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
+            raise ValueError(
+                f"`{which}` makes {given} equations for a state of {size} numbers: there must be as "
+                "many equations as unknowns."
+            )
+        matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
+        if matrix is not None and len(matrix) != size:
+            raise ValueError(
+                f"`mass` has {len(matrix)} rows, but the state has {size} numbers: pass a matrix "
+                "with a row for each equation and a column for each number of the state."
+            )
+
+        def equations(t: Array, vector: Array, slopes: Array) -> Array:
+            state = unravel(vector, y)
+            values = self._values(t, state, unravel(slopes, y), args)
+            if self.residual is not None:
+                return ravel(values).astype(vector.dtype)
+            f = ravel(values["f"]).astype(vector.dtype)
+            if self.algebraic is not None:
+                g = ravel(values["algebraic"]).astype(vector.dtype)
+                return jnp.concatenate([slopes[: f.size] - f, g])
+            mass = self.mass(t, state, args) if matrix is None else matrix
+            return jnp.asarray(mass, vector.dtype) @ slopes - f
+
+        return equations
+
+
+DAE.__init__.__doc__ = r"""**Arguments:**
+
+- `f`: with `mass`, called as `f(t, y, args)`, and returns as many numbers as `y` has; with
+    `algebraic`, called as `f(t, x, z, args)`, and returns a value like `x`.
+- `mass`: the matrix $M$, or a function `mass(t, y, args)` that returns it. It acts on the numbers of
+    the state, in the order of the leaves.
+- `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as `z`
+    has.
+- `residual`: called as `residual(t, y, dy, args)`; a PyTree with as many numbers as `y` has.
+
+JAX differentiates all of them, as often as the index is.
+
+**Raises:**
+
+`TypeError` or `ValueError` if they make none of the three forms, or cannot be called so. In a
+solve, before compilation, `ValueError` if the numbers of equations and unknowns differ, or if the
+equations are singular.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class DAEReport:
+    """What was found out about a [`diffrax_conserve.DAE`][]; see its `report`."""
+
+    index: int
+    differentiated: Mapping[str, int]
+    algebraic: tuple[str, ...]
+    freedom: int
+    residuals: tuple[float, ...]
+
+    def __str__(self) -> str:
+        times = lambda n: "once" if n == 1 else f"{n} times"  # noqa: E731
+        lines = [f"Index {self.index}, with {self.freedom} degrees of freedom."]
+        if self.differentiated:
+            found = (f"{name} {times(n)}" for name, n in self.differentiated.items())
+            lines += ["Differentiated: " + ", ".join(found) + "."]
+        if self.algebraic:
+            lines += ["Without slopes: " + ", ".join(self.algebraic) + "."]
+        return "\n".join(lines)
+
+
+# ---- The structure ----
+
+# The structures that were found, by the functions and the shapes. Inside a solve the numbers are not
+# known any more.
+_FOUND: dict[Any, Structure] = {}
+
+
+def _structure(
+    dae: DAE, t: RealScalarLike, y: Y, args: Args, anew: bool = False
+) -> Structure:
+    key = tree_key((dae, y, args))
+    if anew or key not in _FOUND:
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        numbers = concrete(dae.equations(t, y, args), t, ravel(y))
+        mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
+        try:
+            _FOUND[key] = outside(find_structure, *numbers, mass)
+        except Singular as error:
+            names = dae._names(t, y, args)
+            which = ", ".join(f"`{names[i]}`" for i in error.left)
+            raise ValueError(
+                f"The equations are singular: {which}, or a derivative of it, follows from the "
+                "other equations or contradicts them. So some unknown is not determined. Leave out "
+                "what is stated twice, and add the equation that is missing."
+            ) from None
+        except FloatingPointError:
+            raise ValueError(
+                "The equations, or their derivatives, are not finite near the state. Start at a "
+                "state where they are, and find it by `dae.consistent(guess, t=t0, args=args)`, "
+                "outside of functions that JAX traces."
+            ) from None
+    return _FOUND[key]
+
+
+def _names(root: str, tree: Any) -> list[str]:
+    """The names of the numbers of a tree, such as `y[0][1]`."""
+    out = []
+    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
+        name = root + jtu.keystr(path)
+        parts = 2 if jnp.issubdtype(leaf.dtype, jnp.complexfloating) else 1
+        places = [""] if leaf.ndim == 0 else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
+        out += [name + place for place in places] * parts
+    return out
+
+
+def _flags(fixed: Any, y: Y) -> np.ndarray:
+    try:
+        flags = jtu.tree_map(lambda flag, x: np.broadcast_to(flag, x.shape), fixed, y)
+    except ValueError as error:
+        raise ValueError(
+            "`fixed` must have the structure of the state, "
+            f"{tree_shapes(y)}, with `True`, `False` or an array of them for each leaf."
+        ) from error
+    return np.asarray(ravel(flags), bool)
+
+
+@final
+class _Slopes(eqx.Module):
+    """The vector field: the slopes that the equations determine after all differentiations."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return unravel(structure.slopes(equations, structure.index, t, vector), y)
+
+
+@final
+class _Constraints(eqx.Module):
+    """All constraints. Not a closure, with which every `wrap` would compile anew."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return [structure.constraint(equations, k)(t, vector) for k in range(structure.index)]
+
+
+@final
+class _Stages(eqx.Module):
+    """The equations that [`diffrax_conserve.Radau`][] solves, of index 1 at most."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return structure.reduced(equations, max(structure.index - 1, 0))(t, vector, ravel(slopes))
+
+
+def _at(
+    dae: DAE, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Structure, Implicit, Array, Array]:
+    y = jtu.tree_map(jnp.asarray, y)
+    t = jnp.asarray(t, jnp.result_type(float, t))
+    return _structure(dae, t, y, args), dae.equations(t, y, args), t, ravel(y)
