@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lowest slow shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
+.PHONY: help demo test lowest slow coverage shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -86,6 +86,11 @@ slow: export EQX_ON_ERROR ?= raise
 slow: $(TEST) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
 	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
+
+COVERED ?= tests
+
+coverage: $(TEST) ## which lines the fast tests execute
+	$(BIN)/python -m pytest $(SHARED) -m "not slow and not examples" --cov --cov-report=term:skip-covered $(COVERED)
 
 # Some projections, solves, systems and networks.
 CHECKED := tests/laws/test_projection.py tests/solver/test_options.py tests/systems/test_paper.py \

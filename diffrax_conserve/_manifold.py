@@ -141,11 +141,13 @@ def slope_of(vector_field: Any, t: RealScalarLike, y: Y, args: Args) -> Y:
 
 
 def slope_like(y: Y, slope: Any) -> Y:
-    """The value of a vector field, broadcast and cast to the shapes and dtypes of the state. Raises
-    if a leaf has another shape than that of the state and is no scalar."""
+    """The value of a vector field, cast to the dtypes of the state. Raises if a leaf has another
+    shape than that of the state and is no Python number, which is broadcast."""
     if jtu.tree_structure(slope) == jtu.tree_structure(y):
         pairs = zip(jtu.tree_leaves(slope), jtu.tree_leaves(y), strict=True)
-        if all(jnp.shape(f) in ((), jnp.shape(x)) for f, x in pairs):
+        if all(
+            isinstance(f, int | float | complex) or jnp.shape(f) == jnp.shape(x) for f, x in pairs
+        ):
             return jtu.tree_map(
                 lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope
             )
@@ -177,9 +179,9 @@ def check_manifold(manifold: Manifold) -> None:
     entries = named_entries(manifold)
     if not entries:
         raise ValueError(
-            f"`manifold` is {manifold!r}: there is nothing to conserve. Give a `FirstIntegral` or "
-            "`Constraint`; bounds for `()`, as `projection=SimplifiedNewton(lower=0)`; or use the "
-            "solver without projection."
+            f"`manifold` is {manifold!r}: there is nothing to conserve, or to measure. Give a "
+            "`FirstIntegral` or `Constraint`. Only a `ManifoldProjection` with bounds, as "
+            "`projection=SimplifiedNewton(lower=0)`, takes `()`: its states are within them."
         )
     for name, entry in entries:
         if not is_entry(entry):
@@ -245,6 +247,11 @@ def conserved_values(
             output = exactly(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
+            if value is not None:
+                raise ValueError(
+                    f"`value` has {value!r} in the place of `{name}`, which is a `Constraint` and "
+                    "is kept at zero. Put `None` there, or make it a `FirstIntegral`."
+                )
             value = jtu.tree_map(jnp.zeros_like, output)
         elif given is None and value is None:
             value = output

@@ -9,6 +9,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax.core
+import jax.errors
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -120,7 +121,15 @@ def one_of(states: Any, args: Any = ()) -> Iterator[None]:
 def _needs(error: Exception, args: Any) -> str:
     if args is None and "NoneType" in str(error):
         return " The function seems to need `args`: pass them here too."
+    if isinstance(error, _NEEDS_NUMBERS) or str(error).startswith("Reverse-mode diff"):
+        return (
+            " JAX traces and differentiates it: in the place of `if` write `jnp.where`, of `float`,"
+            " `math` and `numpy` functions of `jax.numpy`, of a `while_loop` a `lax.scan`."
+        )
     return ""
+
+
+_NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 
 
 ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."

@@ -112,6 +112,7 @@ NO_BATCH = [jnp.array(1.0), jnp.zeros((0, 3)), (jnp.ones(3), jnp.ones(4)), jnp.o
     ("field", "manifold", "ys", "match"),
     [
         *((lambda t, y, a: y, KEPT, ys, "`states` must be a sampler") for ys in NO_BATCH),
+        (lambda t, y, a: y[0], KEPT, jnp.ones((4, 3)), r"structure \(\), but.*has \(3,\)"),
         (lambda t, y, a: y[:2], KEPT, jnp.ones((4, 3)), "must return a PyTree like `y`"),
         (lambda t, y, a: (y, y), KEPT, jnp.ones((4, 3)), "must return a PyTree like `y`"),
         (lambda t, y, a: jnp.stack([y[1], -y[0]]), KEPT, jnp.ones(2), "For one state `y` write"),

@@ -67,6 +67,7 @@ def test_within_the_bounds_nothing_changes():
         (lambda: dfc.clipped(1.0, lower=0.0), TypeError, "`vector_field` is"),
         (lambda: dfc.clipped(SEEN), ValueError, "needs a bound"),
         (lambda: dfc.clipped(SEEN, lower="0"), TypeError, "`lower` is"),
+        (lambda: dfc.clipped(SEEN, lower=1.0, upper=0.0), ValueError, "at most `upper`"),
         (lambda: SEEN(0.0, jnp.ones(2), None), ValueError, "`lower` has the structure"),
         (lambda: SEEN(0.0, (1, 1), None), TypeError, "floating-point"),
     ],

@@ -47,14 +47,28 @@ def looped(t, y, args):
     return jax.lax.while_loop(lambda x: x[0] < 3, lambda x: (x[0] + 1, x[1] * y[0]), (0, y[1]))[1]
 
 
+def branched(t, y, args):
+    return y[0] if y[1] > 0 else y[2]
+
+
+NOT_TRACEABLE = (
+    (looped, ValueError),
+    (branched, jax.errors.TracerBoolConversionError),
+    (lambda t, y, args: jnp.asarray(float(y[0])), jax.errors.ConcretizationTypeError),
+    (lambda t, y, args: jnp.asarray(np.sin(y[0])), jax.errors.TracerArrayConversionError),
+)
+
+
+def to_unit(integral):
+    return dfc.project({"a": integral}, OMEGA0, value={"a": jnp.array(1.0)})
+
+
 def check(field=rigid_body, integral=ENERGY, states=OMEGA0[None]):
     return dfc.check_invariance(field, {"a": integral}, states)
 
 
 NEEDS_ARGS = lambda t, y, args: args["scale"] * y[0]  # noqa: E731
-A_CALLED = (
-    r"`fn` of `manifold\['a'\]` was called as `fn\(t, y, args\)`, here with t = f64\[\], y = f64"
-)
+A_CALLED = r"`fn` of `manifold\['a'\]` was called as `fn\(t, y, args\)`, here with t = .*, y = f64"
 SUBS = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=[0.0, 1.0]), dfx.SubSaveAt(t1=True)])
 PARTS = dfx.SaveAt(ts=[0.0, 1.0], fn=lambda t, y, args: y[:2], dense=True)
 MISTAKES = [
@@ -82,8 +96,9 @@ MISTAKES = [
         for f in (check, lambda integral: run({"a": integral}))
     ),
     *(
-        (lambda f=f: f(integral=FirstIntegral(looped)), ValueError, A_CALLED)
-        for f in (check, lambda integral: run({"a": integral}))
+        (lambda f=f, fn=fn: f(integral=FirstIntegral(fn)), error, f"{A_CALLED}.*`jnp.where`")
+        for fn, error in NOT_TRACEABLE
+        for f in (check, lambda integral: run({"a": integral}), to_unit)
     ),
     (lambda: dfc.systems.hamiltonian_vector_field(ENERGY), TypeError, "is of type `FirstIntegral`"),
     (lambda: dfc.ClosedForm(lambda t, y, args: y), TypeError, r"`fn\(t, y, args, values\)`"),
@@ -99,6 +114,7 @@ MISTAKES = [
     (lambda: dfc.ManifoldProjection(IMPLICIT, ENERGY), ValueError, "VeryChord"),
     (lambda: dfc.project(RIGID_BODY, OMEGA0, value=(1.0, 2.0)), ValueError, "not that of `manifo"),
     (lambda: dfc.project(RIGID_BODY, OMEGA0), ValueError, "Pass `value="),
+    (lambda: dfc.project(SPHERE, OMEGA0, value=2.0), ValueError, "`manifold`, which is a `Constr"),
     (lambda: dfc.project(Constraint(lambda t, y, args: 1.0 * y), jnp.array(1)), TypeError, "float"),
     (lambda: dfc.project(GAIN, OMEGA0), TypeError, "`rate` of `manifold` returns complex128"),
     (lambda: dfc.drift(run(ENERGY), ENERGY), ValueError, r"SaveAt\(t0=True, t1=True\)"),

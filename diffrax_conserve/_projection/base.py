@@ -44,6 +44,13 @@ class Step(eqx.Module):
     error: Float[Array, " n"] | None
 
 
+# What `print` says of a projection that has not reached the manifold.
+_MISSED = """the manifold was not reached. What is asked for may contradict itself: entries that
+exclude each other, bounds, or a `value` that no state has. If `residual_after` is small, redundant
+entries agree only to that: leave one out, or pass a larger `rtol` to the projection. From a state
+where a gradient is zero no direction leads to the manifold: start beside it."""
+
+
 class ProjectionInfo(eqx.Module):
     """The report on a projection.
 
@@ -82,7 +89,9 @@ class ProjectionInfo(eqx.Module):
         if ok.ndim > 0:
             title = f"{ok.sum()} of {ok.size} projections succeeded"
         else:
-            title = "projected" if ok else f"NOT PROJECTED: {optx.RESULTS[self.result]}"
+            missed = self.result == optx.RESULTS.nonlinear_max_steps_reached
+            reason = _MISSED if missed else optx.RESULTS[self.result]
+            title = "projected" if ok else f"NOT PROJECTED: {reason}"
         numbers = ("num_steps", "residual_before", "residual_after", "correction", "roundoff")
         rows = {name: getattr(self, name) for name in numbers}
         worst = {} if ok.all() else {"worst": names_at(self.worst, self.names)}

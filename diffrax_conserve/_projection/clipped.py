@@ -13,7 +13,7 @@ from .._manifold import check_vector_field
 from .._options import check_numbers
 from .._tree import ravel, unravel
 from .options import check_state
-from .within_bounds import Bounds
+from .within_bounds import Bounds, check_bounds
 
 
 def clipped(
@@ -53,8 +53,8 @@ def clipped(
     **Raises:**
 
     `TypeError` or `ValueError` if the vector field cannot be called so, if a bound is not a number,
-    if there is none, or, when it is called, if they do not fit the state. Where a lower bound is
-    above its upper bound, the field is NaN.
+    if there is none, if a lower bound is above its upper bound, or, when it is called, if they do
+    not fit the state. Where such bounds are traced, the field is NaN.
 
     !!! example
 
@@ -78,6 +78,7 @@ def clipped(
     check_vector_field(vector_field)
     for name, bound in (("lower", lower), ("upper", upper)):
         check_numbers(name, bound, least=-float("inf"))
+    check_bounds(lower, upper)
     if lower is None and upper is None:
         raise ValueError("`clipped` needs a bound. Pass `lower=` or `upper=`, or both.")
     return _Clipped(vector_field, lower, upper)

@@ -200,7 +200,9 @@ class ManifoldProjection(ForwardingSolver):
             motion=distances(y0, y0),
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
-            statistics=ProjectionStatistics.zero(self.manifold, values.dtype),
+            statistics=ProjectionStatistics.zero(
+                self.manifold, values.dtype, bool(bounded_parts(self.projection))
+            ),
             preferred=jnp.zeros((2 * _CHANGES, ravel(y0).size), values.dtype)
             if self.keep_linear
             else None,
@@ -245,10 +247,11 @@ class ManifoldProjection(ForwardingSolver):
         y1, info = target.project_if(due, t1, candidate, step)
         # Whether it succeeded, and if not, whether a shorter step could.
         units = start.metric(t0, y0)
-        cannot_start = self._cannot_start(start, state, t0, y0, made_jump)
-        states = y0, candidate, y1
-        failed = cause_of_failure(info.ok, cannot_start, states, units, self.max_correction)
+        first = jnp.all(state.motion == 0)  # it is zero only before the first step
+        cannot_start = self._cannot_start(start, state, t0, y0, first, made_jump)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
+        told = info.ok, cannot_start, state.values, (y0, candidate, y1), units
+        failed = cause_of_failure(*told, self.max_correction, hopeless=first | final)
         statistics = state.statistics.add(
             info, due, None if error is None else length(ravel(error), units)
         )
@@ -309,7 +312,13 @@ class ManifoldProjection(ForwardingSolver):
         )
 
     def _cannot_start(
-        self, target: Target, state: State, t0: RealScalarLike, y0: Y, made_jump: BoolScalarLike
+        self,
+        target: Target,
+        state: State,
+        t0: RealScalarLike,
+        y0: Y,
+        first: Bool[Array, ""],
+        made_jump: BoolScalarLike,
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off a `Constraint` where
         nothing has projected its state: at the first step, and after a jump of the vector field,
@@ -317,7 +326,6 @@ class ManifoldProjection(ForwardingSolver):
         lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
             return lost
-        first = jnp.all(state.motion == 0)  # it is zero only before the first step
         # If not every step is projected, a later step may well start off the constraint.
         fresh = first if self.every > 1 else first | made_jump
         equations = target.equations(t0, y0)

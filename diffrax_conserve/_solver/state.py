@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import ROUNDOFF
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._custom_types import Args, BoolScalarLike, Manifold, RealScalarLike, Values, Y
 from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
@@ -28,38 +28,37 @@ from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
 
-_ADVICE = (
-    "Take smaller steps, or pass `projection=diffrax_conserve.Newton()` to a `ManifoldProjection`, "
-    "which copes with far candidates. Check by `check_invariance` that the quantity is conserved "
-    "at all. "
-)
 _ENTRY = (
     "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
 )
 FIRST = register(
-    "a step cannot start: its state violates a `Constraint`, or a function of the "
-    "manifold is not finite there. At the start of a solve, start on the manifold: "
-    "`y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a `SemiExplicitDAE` "
-    "`y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps "
-    "the value that it has at the start is a `FirstIntegral`. After a jump of the vector field end "
-    "the solve there, `project`, and go on. " + _ENTRY,
-    "the projection of a step failed: the state that the wrapped solver proposed is not finite, or "
-    "a function of the manifold there, or the iteration diverged. Check the vector field and `fn`. "
-    + _ADVICE
-    + _ENTRY,
+    "a step cannot start: its state violates a `Constraint`. At the start of a solve, start on the "
+    "manifold: `y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a "
+    "`SemiExplicitDAE` `y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps the "
+    "value that it has at the start is a `FirstIntegral`. After a jump of the vector field end the "
+    "solve there, `project`, and go on. " + _ENTRY,
+    "the projection of a step failed: a state is not finite, or a function of the manifold there, "
+    "or the iteration diverged. At the first step look for NaN in `y0` and `args`, and for "
+    "overflow, in float32 of squares of 2e19: use other units, or float64. Later check the vector "
+    "field and `fn`, and take smaller steps. " + _ENTRY,
     "the projection of a step failed: the correction is a larger share of the step than "
     "`max_correction` allows. Check by `check_invariance` that the quantity is conserved at all, "
     "take smaller steps, or pass another `max_correction`.",
-    "the projection of a step failed: the manifold was not reached. "
-    + _ADVICE
-    + "If it is, what is asked for may contradict itself, as a bound above the start, a `value` "
-    "that no state has, or all integrals of a single wave on a coarse grid: leave one out, or pass "
-    "`projection=diffrax_conserve.SimplifiedNewton(metric=1.0)`. Or terms that cancel inside `fn` "
-    "have grown since the start: pass `atol`. " + _ENTRY,
+    "the projection of a step failed: the manifold was not reached. Take smaller steps, as "
+    "`diffrax.PIDController` does, or pass `projection=diffrax_conserve.Newton()` to a "
+    "`ManifoldProjection`, which copes with far candidates. Check by `check_invariance` that the "
+    "quantity is conserved at all. If terms that cancel inside `fn` have grown since the start, "
+    "pass `atol`. " + _ENTRY,
+    "the projection of a step failed: the manifold was not reached, by the first step or however "
+    "short a step. What is asked for may contradict itself: a `value` that no state has, `lower` "
+    "or `upper` that exclude the manifold, or entries that exclude each other, such as all "
+    "integrals of a single wave on a coarse grid, for which `SimplifiedNewton(metric=1.0)` may do: "
+    "change or leave out one of them. Or the quantity is not conserved, as `check_invariance` "
+    "tells, or a first step of fixed length is too long. " + _ENTRY,
 )
 # The causes of a failure, in the order of their messages above, of which `FIRST` is the first. Zero
 # is no failure.
-_START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED = 1, 2, 3, 4
+_START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED, _NO_STATE = range(1, 6)
 # Corrections are usually shorter than the error estimate of their step, because that is the
 # estimate for a method of lower order. If one is longer by this factor, the quantity is probably
 # not conserved. The number is a choice.
@@ -81,6 +80,7 @@ class ProjectionStatistics(eqx.Module):
     - `worst`: the position in `names` of the entry of the manifold that failed last; -1 if none
         failed. `print` shows the name.
     - `names`: the names of the entries of the manifold, such as `manifold['energy']`.
+    - `bounded`: whether the projection has bounds, where corrections may be long.
     """
 
     num_projections: Int[Array, "..."]
@@ -93,22 +93,30 @@ class ProjectionStatistics(eqx.Module):
     error: Float[Array, "..."]
     worst: Int[Array, "..."]
     names: tuple[str, ...] = eqx.field(static=True)
+    bounded: bool = eqx.field(static=True)
 
     @classmethod
-    def zero(cls, manifold: Manifold, dtype: jnp.dtype) -> "ProjectionStatistics":
+    def zero(
+        cls, manifold: Manifold, dtype: jnp.dtype, bounded: bool = False
+    ) -> "ProjectionStatistics":
         count, size, worst = jnp.asarray(0), jnp.zeros((), dtype), jnp.asarray(-1)
         names = tuple(name for name, _ in named_entries(manifold))
-        return cls(count, count, count, size, size, size, size, size * jnp.nan, worst, names)
+        sizes = size, size, size, size, size * jnp.nan
+        return cls(count, count, count, *sizes, worst=worst, names=names, bounded=bounded)
 
     def __str__(self) -> str:
         if is_traced(self):
             return repr(self)
         rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         rows["worst"] = names_at(self.worst, rows.pop("names"))
+        bounded = rows.pop("bounded")
         if not rows["worst"]:
             del rows["worst"]
+        if np.all(np.isnan(self.error)):
+            del rows["error"]
         text = printed("projections of the accepted steps", rows)
-        if np.any(np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)):
+        suspicious = np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)
+        if not bounded and np.any(suspicious):
             text += (
                 "\nCorrections are far longer than the error estimates of the steps explain:"
                 "\ncheck by `check_invariance` that the quantities are conserved."
@@ -131,6 +139,7 @@ class ProjectionStatistics(eqx.Module):
             self.error if error is None else jnp.fmax(self.error, error),
             jnp.where(info.ok, self.worst, info.worst),
             self.names,
+            self.bounded,
         )
 
 
@@ -269,21 +278,24 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
 def cause_of_failure(
     ok: Bool[Array, ""],
     cannot_start: Bool[Array, ""],
+    values: Float[Array, " m"],
     states: tuple[Y, Y, Y],
-    units: Units,
-    max_correction: RealScalarLike | None,
+    units: Units = None,
+    max_correction: RealScalarLike | None = None,
+    hopeless: BoolScalarLike = False,
 ) -> Int[Array, ""]:
     """Why a step failed, 0 if it did not. The `states` are the last one, the candidate and the
-    result of its projection."""
+    result of its projection. A step is `hopeless` if a shorter one would hardly help."""
     last, candidate, result = (ravel(y) for y in states)
     correction = result - candidate
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
-    finite = jnp.abs(jnp.sum(correction)) < jnp.inf
-    cause = jnp.where(ok, 0, jnp.where(finite, _NOT_REACHED, _NOT_FINITE))
+    finite, known = jnp.abs(jnp.sum(correction)) < jnp.inf, jnp.all(jnp.isfinite(values))
+    cause = jnp.where(ok, 0, jnp.where(hopeless, _NO_STATE, _NOT_REACHED))
     if max_correction is not None:
         limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, units)
         cause = jnp.where(ok & (length(correction, units) > limit), _TOO_FAR, cause)
-    return jnp.where(cannot_start, _START, cause)
+    cause = jnp.where(cannot_start, _START, cause)
+    return jnp.where(known & (finite | (cause == 0)), cause, _NOT_FINITE)
 
 
 def is_final(

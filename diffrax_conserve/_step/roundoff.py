@@ -65,11 +65,14 @@ def hidden_scale(
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)
     functions = functions_of(manifold, t, y, args)
-    sizes = [jax.eval_shape(fn, vector).size for fn in functions]
+    entries, sizes = [*zip(named_entries(manifold), functions, strict=True)], []
+    for (name, _), fn in entries:
+        with calling_fn(name, t, y, args):
+            sizes.append(jax.eval_shape(fn, vector).size)
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
         measured = []
-        for (name, _), fn in zip(named_entries(manifold), functions, strict=True):
+        for (name, _), fn in entries:
             with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
                 measured.append(hidden_terms(fn, vector))
         value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))

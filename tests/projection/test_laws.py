@@ -143,6 +143,7 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, seed, share):
 def test_inconsistent_constraints_fail(projection):
     _, info = project((ENERGY, ENERGY), OMEGA0, projection, (jnp.array(0.3), jnp.array(0.4)))
     assert not successful(info)
+    assert "exclude each other" in str(info)
     _, info = project(
         dfc.Constraint(lambda t, y, args: jnp.sum(y**2) + 1), OMEGA0, projection, None
     )

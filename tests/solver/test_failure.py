@@ -36,14 +36,15 @@ def out_of_reach(t, y, args):
 
 OUT_OF_REACH = {"square": dfc.FirstIntegral(square), "jump": dfc.FirstIntegral(out_of_reach)}
 NOT_FINITE, TOO_FAR, NOT_REACHED = "is not finite, or", "`max_correction`", "was not reached"
-CANNOT_START = "a step cannot start"
+CANNOT_START, NO_STATE = "a step cannot start", "may contradict itself"
 HOPELESS = 150  # attempts after which an adaptive solve ends
 
 
 def test_the_error_of_fixed_steps_leads_to_the_entry_and_a_remedy(errors_raise):
     with pytest.raises(eqx.EquinoxRuntimeError, match=NOT_REACHED) as e:
         run(OUT_OF_REACH)
-    assert "smaller steps" in str(e.value)
+    assert "Take smaller steps" in str(e.value)
+    assert NO_STATE not in str(e.value)
     assert "print(diffrax_conserve.statistics(sol))" in str(e.value)
 
 
@@ -67,8 +68,8 @@ def test_the_list_of_messages_is_the_same_whatever_was_solved():
     ("manifold", "message"),
     [
         (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), CANNOT_START),
-        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan), CANNOT_START),
-        (dfc.FirstIntegral(square, value=-1.0), NOT_REACHED),
+        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan), NOT_FINITE),
+        (dfc.FirstIntegral(square, value=-1.0), NO_STATE),
     ],
     ids=["violated", "not-finite", "out-of-reach"],
 )
@@ -77,7 +78,24 @@ def test_what_cannot_start_ends_at_once(manifold, message):
     sol = run(manifold, dfx.Tsit5(), stepsize_controller=adaptive, max_steps=None, throw=False)
     assert message in dfx.RESULTS[sol.result]
     # Where the solve can start, smaller steps are tried.
-    assert sol.stats["num_steps"] <= (HOPELESS if message == NOT_REACHED else 1)
+    assert sol.stats["num_steps"] <= (HOPELESS if message == NO_STATE else 1)
+
+
+@pytest.mark.parametrize(
+    ("manifold", "options", "message"),
+    [
+        (dfc.FirstIntegral(square), dict(y0=jnp.array([1.0, jnp.nan])), NOT_FINITE),
+        (dfc.Constraint(square), dict(y0=jnp.array([1.0, jnp.nan])), NOT_FINITE),
+        (dfc.FirstIntegral(square), dict(y0=jnp.array([2e19, 0], jnp.float32)), NOT_FINITE),
+        (dfc.FirstIntegral(square, value=-1.0), {}, NO_STATE),
+        (dfc.FirstIntegral(square), dict(projection=dfc.SimplifiedNewton(lower=1.5)), NO_STATE),
+    ],
+    ids=["nan", "nan of a constraint", "overflow", "out of reach", "bound above the start"],
+)
+def test_the_first_of_fixed_steps_tells_what_is_wrong_with_the_start(manifold, options, message):
+    told = dfx.RESULTS[run(manifold, throw=False, **options).result]
+    assert message in told
+    assert "`project" not in told
 
 
 @pytest.mark.slow

@@ -58,6 +58,7 @@ def test_statistics_are_those_of_the_projections():
     sol = run(projection=dfc.SimplifiedNewton(metric=1.0))
     statistics = dfc.statistics(sol)
     assert statistics.worst == -1
+    assert "nan" not in str(statistics)  # this solver estimates no error
     steps = int(sol.stats["num_steps"])
     assert statistics.num_projections == steps
     assert steps <= statistics.num_iterations <= steps * statistics.max_iterations
