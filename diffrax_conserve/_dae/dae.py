@@ -209,7 +209,7 @@ class DAE(eqx.Module):
         vector = ravel(y)
         eps = float(jnp.finfo(vector.dtype).eps)
         price = np.full(vector.size, np.inf if structure.index == 1 and fixed is None else 1.0)
-        price[list(structure.algebraic)] = eps**0.5
+        price[list(structure.algebraic)] = eps**2
         if fixed is not None:
             price[_flags(fixed, y)] = np.inf
         sizes = jnp.abs(vector)
@@ -438,7 +438,7 @@ class _Constraints(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         structure, equations, t, vector = _at(self.dae, t, y, args)
-        return [structure.constraint(equations, k)(t, vector) for k in range(structure.index)]
+        return structure.constraints(equations, structure.index)(t, vector)
 
 
 @final

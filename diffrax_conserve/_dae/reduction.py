@@ -32,9 +32,8 @@ from .._step.implicit import root
 from .._step.iterate import Solved
 from .._tree import without_pattern
 
-# `F(t, y, y')` as a function of a time and two vectors, and a constraint `h(t, y)`.
+# `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
-Hidden = Callable[[Array, Array], Array]
 
 
 class Round(NamedTuple):
@@ -100,20 +99,24 @@ class Structure:
             slopes = root(residual, ft.partial(_newton, residual), begin, divided).y
         return none.at[columns].set(slopes)
 
-    def constraint(self, equations: Implicit, k: int) -> Hidden:
-        """`h_k`, the equations that are left in round `k` at the slopes that are selected. After
-        the first round they are derivatives of those of the last one."""
-        left = np.array(self.left(k), int)
+    def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
+        """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
+        selected; each of the others is a derivative of what is left of the one before."""
+        if k == 0:
+            return lambda t, y: []
+        left = np.array(self.left(k - 1), int)
 
-        def given(t: Array, y: Array) -> Array:
-            return equations(t, y, self.slopes(equations, 0, t, y))[left]
+        def given(t: Array, y: Array) -> list[Array]:
+            free = self.mass is not None and not np.any(self.mass[left])
+            slopes = jnp.zeros_like(y) if free else self.slopes(equations, 0, t, y)
+            return [equations(t, y, slopes)[left]]
 
-        def derivative(t: Array, y: Array) -> Array:
-            slopes = self.slopes(equations, k, t, y)
-            rates = _along(self.constraint(equations, k - 1), t, y, slopes)
-            return rates[np.searchsorted(self.left(k - 1), left)]
+        def further(t: Array, y: Array) -> list[Array]:
+            before = self.constraints(equations, k - 1)
+            given, rates = _along(before, t, y, self.slopes(equations, k - 1, t, y))
+            return [*given, rates[-1][np.searchsorted(self.left(k - 2), left)]]
 
-        return derivative if k else given
+        return given if k == 1 else further
 
     def reduced(self, equations: Implicit, k: int) -> Implicit:
         """`F_k`, the equations after so many differentiations."""
@@ -122,15 +125,15 @@ class Structure:
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
             before = self.reduced(equations, k - 1)(t, y, slopes)
-            rates = _along(self.constraint(equations, k - 1), t, y, slopes)
-            return before.at[np.array(self.left(k - 1), int)].set(rates)
+            _, rates = _along(self.constraints(equations, k), t, y, slopes)
+            return before.at[np.array(self.left(k - 1), int)].set(rates[-1])
 
         return differentiated
 
 
-def _along(hidden: Hidden, t: Array, y: Array, slopes: Array) -> Array:
-    """The derivative of a constraint along the slopes."""
-    return jax.jvp(hidden, (t, y), (jnp.ones_like(t), slopes))[1]
+def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
+    """Constraints, and their derivatives along the slopes."""
+    return jax.jvp(constraints, (t, y), (jnp.ones_like(t), slopes))
 
 
 def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -178,9 +181,9 @@ def find_structure(
     selected, gradients = Round((), ()), np.zeros((0, y.size))
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
-        hidden = structure.constraint(equations, structure.index - 1)
+        hidden = structure.constraints(equations, structure.index)
         left = structure.left(structure.index - 1)
-        new = np.asarray(jax.jit(jax.jacfwd(hidden, 1))(t, y))
+        new = np.asarray(jax.jit(jax.jacfwd(lambda t, y: hidden(t, y)[-1], 1))(t, y))
         gradients = np.concatenate([gradients, new])
         independent = _extended(gradients, Round((), ())).equations
         if len(independent) < len(gradients):
