@@ -25,9 +25,7 @@ from .reduction import (
     Implicit,
     Singular,
     Structure,
-    concrete,
-    find_structure,
-    outside,
+    structure_of,
     tree_key,
 )
 
@@ -376,10 +374,9 @@ def _structure(
     key = tree_key((dae, y, args))
     if anew or key not in _FOUND:
         t = jnp.asarray(t, jnp.result_type(float, t))
-        numbers = concrete(dae.equations(t, y, args), t, ravel(y))
         mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
         try:
-            _FOUND[key] = outside(find_structure, *numbers, mass)
+            _FOUND[key] = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
         except Singular as error:
             names = dae._names(t, y, args)
             which = ", ".join(f"`{names[i]}`" for i in error.left)

@@ -27,9 +27,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import ADDED_POWER
+from .._constants import ADDED_POWER, MAX_STEPS
 from .._step.implicit import root
-from .._step.iterate import Solved
+from .._step.iterate import Solved, after_step, iterate, keep_done
 from .._tree import without_pattern
 
 # `F(t, y, y')` as a function of a time and two vectors.
@@ -144,8 +144,6 @@ def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, 
 
 def _newton(residual: Callable[[Array], Array], x: Array) -> Solved:
     """Newton's method for slopes, which are NaN if it does not converge."""
-    from .._step.iterate import after_step, iterate, keep_done
-
     eps = float(jnp.finfo(x.dtype).eps)
 
     def advance(x: Array, counter: Array) -> tuple[Array, Array]:
@@ -155,7 +153,7 @@ def _newton(residual: Callable[[Array], Array], x: Array) -> Solved:
         hopeful = jnp.all(jnp.isfinite(step))
         return keep_done(counter, x + step, x), after_step(settled, hopeful, counter)
 
-    found = iterate(advance, x, max_steps=50)
+    found = iterate(advance, x, max_steps=MAX_STEPS)
     return found._replace(y=jnp.where(found.ok, found.y, jnp.nan))
 
 
@@ -242,29 +240,28 @@ def _general_position(
     raise FloatingPointError
 
 
-def outside(fn: Callable[..., Any], *args: Any) -> Any:
-    """`fn(*args)` on numbers, although JAX may be tracing here: it traces in one thread."""
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        return thread.submit(fn, *args).result()
-
-
-def concrete(equations: Implicit, t: Any, y: Any) -> tuple[Implicit, Implicit, Array, Array]:
-    """The equations as a function without tracers: what is traced is replaced by numbers in general
-    position. And the equations with other parameters."""
+def structure_of(equations: Implicit, t: Array, y: Array, mass: np.ndarray | None) -> Structure:
+    """The structure of equations. What JAX traces in them is replaced by numbers in general
+    position. JAX traces in one thread, so that another one computes with numbers."""
     slopes = jax.ShapeDtypeStruct(y.shape, y.dtype)
     closed = jax.make_jaxpr(equations)(t, slopes, slopes)
-    here = [_stand_in(x) for x in closed.consts]
-    there = [x * 1.5 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in map(jnp.asarray, here)]
 
-    def of(consts: list[Any]) -> Implicit:
-        return lambda t, y, slopes: jax.core.eval_jaxpr(closed.jaxpr, consts, t, y, slopes)[0]
+    def numbers() -> Structure:
+        here = [_stand_in(x) for x in closed.consts]
+        there = [x * 1.5 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
 
-    return of(here), of(there), _stand_in(t), _stand_in(y)
+        def of(consts: list[Array]) -> Implicit:
+            return lambda t, y, slopes: jax.core.eval_jaxpr(closed.jaxpr, consts, t, y, slopes)[0]
+
+        return find_structure(of(here), of(there), _stand_in(t), _stand_in(y), mass)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        return thread.submit(numbers).result()
 
 
 def _stand_in(x: Any) -> Any:
     if not isinstance(x, jax.core.Tracer):
-        return x
+        return jnp.asarray(x)
     if not jnp.issubdtype(x.dtype, jnp.inexact):
         return jnp.ones(x.shape, x.dtype)
     pattern = without_pattern(max(x.size, 1), jnp.finfo(x.dtype).dtype)[: x.size]
