@@ -1,25 +1,30 @@
 """Differential-algebraic equations, as equations on a manifold."""
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable, Mapping
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from .._custom_types import Args, RealScalarLike, State, Values, Y
+from .._custom_types import Args, RealScalarLike, Values, Y
 from .._manifold import Constraint, slope_like
 from .._options import check_function
+from .._projection.base import AbstractProjection, Problem, ProjectionInfo
 from .._projection.options import check_state
 from .._projection.project import project
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
+from .._step.implicit import root
 from .._tree import ravel, tree_shapes, unravel
+from .newton import MOST, algebraic_newton, divided
 from .radau import Radau
 from .reduction import (
     Implicit,
@@ -28,10 +33,6 @@ from .reduction import (
     structure_of,
     tree_key,
 )
-
-# `consistent` ends after this many corrections. If the voltage at a diode is guessed too large, each
-# lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
-_MAX_STEPS = 500
 
 
 @final
@@ -46,15 +47,15 @@ def _mass(mass: Any) -> Any:
         return mass
     if isinstance(mass, jax.core.Tracer):
         raise TypeError(
-            "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are solved. "
-            "Pass a function `mass(t, y, args)`, and what it depends on in `args`."
+            "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are "
+            "solved. Pass a function `mass(t, y, args)`, and what it depends on in `args`."
         )
     mass = np.asarray(mass)
     if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(mass)):
         raise ValueError(
-            f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square matrix "
-            "of numbers, with a row for each equation and a column for each number of the state, or "
-            "a function `mass(t, y, args)` that returns one."
+            f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square "
+            "matrix of numbers, with a row for each equation and a column for each number of the "
+            "state, or a function `mass(t, y, args)` that returns one."
         )
     return _Matrix(tuple(map(tuple, mass.astype(float).tolist())))
 
@@ -168,11 +169,12 @@ class DAE(eqx.Module):
         """
         if isinstance(solver, Radau):
             solver = dataclasses.replace(solver, equations=_Stages(self))
-        return ManifoldProjection(solver, {"equations": Constraint(_Constraints(self))})
+        manifold = {"equations": Constraint(_Constraints(self))}
+        return ManifoldProjection(solver, manifold, projection=_Return(dae=self))
 
     def consistent(
         self,
-        *guess: State,
+        *guess: Any,
         t: RealScalarLike = 0.0,
         args: Args = None,
         fixed: PyTree[bool] | None = None,
@@ -187,9 +189,10 @@ class DAE(eqx.Module):
             parts, `consistent(x, z)`.
         - `t`, `args`: passed to the functions.
         - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
-            each leaf is `True`, `False` or an array of them. By default, with index 1, all unknowns
-            whose slopes the equations contain stay; with a higher index the others, such as forces,
-            change at a price of almost nothing, and what must change beside them is nearest.
+            each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
+            equations differentiate stays, such as $x$ or $M y$. With a higher index unknowns
+            without slopes, such as forces, are free, and the others move to the nearest point,
+            relative to their sizes.
 
         **Returns:**
 
@@ -204,21 +207,22 @@ class DAE(eqx.Module):
         structure = _structure(self, t, y, args, anew=True)
         if structure.index == 0:
             return y
-        vector = ravel(y)
-        eps = float(jnp.finfo(vector.dtype).eps)
-        price = np.full(vector.size, np.inf if structure.index == 1 and fixed is None else 1.0)
-        price[list(structure.algebraic)] = eps**2
-        if fixed is not None:
-            price[_flags(fixed, y)] = np.inf
-        sizes = jnp.abs(vector)
-        sizes = jnp.where(sizes > 0, sizes, 1)
-        metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+        projection = _Return(dae=self)
+        if fixed is not None or structure.index > 1:
+            vector = ravel(y)
+            price = np.ones(vector.size)
+            price[list(structure.algebraic)] = float(jnp.finfo(vector.dtype).eps) ** 2
+            if fixed is not None:
+                price[_flags(fixed, y)] = np.inf
+            sizes = jnp.where(vector == 0, 1, jnp.abs(vector))
+            metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+            projection = SimplifiedNewton(metric=metric, max_steps=MOST)
         found, info = project(
             {"equations": Constraint(_Constraints(self))},
             y,
             t=jnp.asarray(t, jnp.result_type(float, t)),
             args=args,
-            projection=SimplifiedNewton(metric=metric, max_steps=_MAX_STEPS),
+            projection=projection,
         )
         return eqx.error_if(
             found,
@@ -228,7 +232,7 @@ class DAE(eqx.Module):
             "the equations that are differentiated.",
         )
 
-    def report(self, *guess: State, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
+    def report(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
         """What was found out about the equations, at the state of a guess.
 
         **Arguments:**
@@ -250,7 +254,10 @@ class DAE(eqx.Module):
         structure = _structure(self, t, y, args, anew=True)
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
-        times = [sum(i in structure.left(k) for k in range(structure.index)) for i in range(len(equations))]
+        times = [
+            sum(i in structure.left(k) for k in range(structure.index))
+            for i in range(len(equations))
+        ]
         off = _Constraints(self)(t, y, args)
         return DAEReport(
             index=structure.index,
@@ -295,8 +302,8 @@ class DAE(eqx.Module):
         if given != size:
             which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
             raise ValueError(
-                f"`{which}` makes {given} equations for a state of {size} numbers: there must be as "
-                "many equations as unknowns."
+                f"`{which}` makes {given} equations for a state of {size} numbers: there must be "
+                "as many equations as unknowns."
             )
         matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
         if matrix is not None and len(matrix) != size:
@@ -324,10 +331,10 @@ DAE.__init__.__doc__ = r"""**Arguments:**
 
 - `f`: with `mass`, called as `f(t, y, args)`, and returns as many numbers as `y` has; with
     `algebraic`, called as `f(t, x, z, args)`, and returns a value like `x`.
-- `mass`: the matrix $M$, or a function `mass(t, y, args)` that returns it. It acts on the numbers of
-    the state, in the order of the leaves.
-- `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as `z`
-    has.
+- `mass`: the matrix $M$, or a function `mass(t, y, args)` that returns it. It acts on the
+    numbers of the state, in the order of the leaves.
+- `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as
+    `z` has.
 - `residual`: called as `residual(t, y, dy, args)`; a PyTree with as many numbers as `y` has.
 
 JAX differentiates all of them, as often as the index is.
@@ -363,14 +370,12 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The structures that were found, by the functions and the shapes. Inside a solve the numbers are not
-# known any more.
+# The structures that were found, by the functions and the shapes. Inside a solve the numbers are
+# not known any more.
 _FOUND: dict[Any, Structure] = {}
 
 
-def _structure(
-    dae: DAE, t: RealScalarLike, y: Y, args: Args, anew: bool = False
-) -> Structure:
+def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args, anew: bool = False) -> Structure:
     key = tree_key((dae, y, args))
     if anew or key not in _FOUND:
         t = jnp.asarray(t, jnp.result_type(float, t))
@@ -400,7 +405,11 @@ def _names(root: str, tree: Any) -> list[str]:
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         name = root + jtu.keystr(path)
         parts = 2 if jnp.issubdtype(leaf.dtype, jnp.complexfloating) else 1
-        places = [""] if leaf.ndim == 0 else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
+        places = (
+            [""]
+            if leaf.ndim == 0
+            else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
+        )
         out += [name + place for place in places] * parts
     return out
 
@@ -414,6 +423,37 @@ def _flags(fixed: Any, y: Y) -> np.ndarray:
             f"{tree_shapes(y)}, with `True`, `False` or an array of them for each leaf."
         ) from error
     return np.asarray(ravel(flags), bool)
+
+
+@final
+class _Return(AbstractProjection):
+    """The way back to the constraints. With index 1 it keeps all that the equations differentiate,
+    as the solution does: the state moves in the directions in which `F` has no slopes, and the
+    unknowns there are solved for. With a higher index the state moves to the nearest point."""
+
+    dae: DAE
+    metric: None = None
+    sees_step: ClassVar[bool] = False
+
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        state = problem.state(candidate)
+        structure, equations, t, y = _at(self.dae, problem.t, state, problem.args)
+        if structure.index != 1:
+            return SimplifiedNewton().solve(problem, candidate)
+        along, free = structure.freely_moved(equations, t, y)
+
+        def moved(z: Array) -> Array:
+            return (y + along @ (z - y[free])).at[free].set(z)
+
+        def residual(z: Array) -> Array:
+            return structure.constraints(equations, 1)(t, moved(z))[0]
+
+        found = root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y
+        # Newton's method knows the roundoff of the equations, and is NaN if it misses the root.
+        ok = jnp.all(jnp.isfinite(found))
+        return moved(found), problem.report(candidate, moved(found), ok=ok)
 
 
 @final
@@ -449,9 +489,7 @@ class _Stages(eqx.Module):
         return structure.reduced(equations, max(structure.index - 1, 0))(t, vector, ravel(slopes))
 
 
-def _at(
-    dae: DAE, t: RealScalarLike, y: Y, args: Args
-) -> tuple[Structure, Implicit, Array, Array]:
+def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Implicit, Array, Array]:
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float, t))
     return _structure(dae, t, y, args), dae.equations(t, y, args), t, ravel(y)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import check_state, option
-from .._solver.terms import is_ode, time_direction
+from .._solver.terms import time_direction
 from .._step.implicit import root
 from .._step.iterate import Solved, after_step, iterate, keep_done
 from .._tree import ravel, unravel
@@ -27,7 +27,7 @@ _POWERS = _NODES[:, None] ** np.arange(1, 4)
 _INVERSE = (_POWERS / _NODES[:, None] * np.arange(1, 4)) @ np.linalg.inv(_POWERS)
 # `A⁻¹ = V Λ V⁻¹`, with the real eigenvalue first, and one of the conjugate pair.
 _EIGENVALUES, _VECTORS = np.linalg.eig(_INVERSE)
-_ORDER = np.argsort(np.abs(_EIGENVALUES.imag), kind="stable")
+_ORDER = np.argsort(np.abs(np.imag(_EIGENVALUES)), kind="stable")
 _EIGENVALUES, _VECTORS = _EIGENVALUES[_ORDER], _VECTORS[:, _ORDER]
 _REAL, _PAIR = float(_EIGENVALUES[0].real), complex(_EIGENVALUES[1])
 _TO_MODES = np.linalg.inv(_VECTORS)
@@ -89,7 +89,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
     """
 
     root_finder: Any = option(dfx.with_stepsize_controller_tols(dfx.VeryChord)())
-    root_find_max_steps: int = option(10, static=True)
+    root_find_max_steps: int = option(10, static=True)  # pyright: ignore
     equations: Equations | None = eqx.field(default=None, kw_only=True)
 
     term_structure: ClassVar = dfx.ODETerm
@@ -115,7 +115,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         del terms, args
         check_state(y0, kind=jnp.inexact)
         y = ravel(y0)
-        return _Last(jnp.zeros((3, y.size), y.dtype), jnp.abs(t1 - t0).astype(y.dtype))
+        return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
 
     def step(
         self,
@@ -129,7 +129,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
     ) -> tuple[Y, Y, DenseInfo, _Last, dfx.RESULTS]:
         start = ravel(y0)
         nodes, inverse = jnp.asarray(_NODES, start.dtype), jnp.asarray(_INVERSE, start.dtype)
-        length = (t1 - t0).astype(start.dtype)
+        length = jnp.asarray(t1 - t0, start.dtype)
         residual = self._residual(terms, t0, y0, args)
         at_stages = jax.vmap(residual)
         # The polynomial of the last step is continued.
@@ -195,9 +195,8 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         ok = found.ok & jnp.all(jnp.isfinite(error))
         big = float(jnp.finfo(start.dtype).max) ** 0.5
         error = lax.stop_gradient(jnp.where(ok, error, big))
-        result = dfx.RESULTS.where(
-            found.ok, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
-        )
+        success, failure = dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
+        result = dfx.RESULTS.where(found.ok, success, failure)  # pyright: ignore
         y1 = unravel(y[2], y0)
         dense_info = dict(y0=y0, y1=y1, coefficients=coefficients)
         state = lax.stop_gradient(_Last(coefficients, length))
@@ -220,6 +219,16 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         return residual
 
 
+Radau.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: a `diffrax.VeryChord`, whose tolerances, norm and `kappa` end Newton's method. By
+    default they are those of the step size controller, which must be adaptive then.
+- `root_find_max_steps`: the largest number of iterations. If they are not enough, a shorter step is
+    tried.
+- `equations`: of a `DAE`, which passes them.
+"""
+
+
 @final
 class CollocationInterpolation(dfx.AbstractLocalInterpolation):
     """The collocation polynomial of a step."""
@@ -238,5 +247,5 @@ class CollocationInterpolation(dfx.AbstractLocalInterpolation):
             ends = self.evaluate(t1), self.evaluate(t0)
             return jtu.tree_map(lambda a, b: a - b, *ends)
         dtype = self.coefficients.dtype
-        share = ((t0 - self.t0) / (self.t1 - self.t0)).astype(dtype)
+        share = jnp.asarray((t0 - self.t0) / (self.t1 - self.t0), dtype)
         return unravel(ravel(self.y0) + share ** jnp.arange(1, 4) @ self.coefficients, self.y0)

@@ -1,16 +1,16 @@
 """Index reduction: from the equations `F(t, y, y') = 0` to their hidden constraints.
 
 Of the equations `F_0 = F` we select, by elimination, as many as can be solved for some of the
-slopes `y'`, and put these slopes into the others. What is left does not contain `y'` any more. It is
-a constraint, `h_0(t, y) = 0`. Its derivative `∂h_0/∂t + ∂h_0/∂y y' = 0` takes the place of the
+slopes `y'`, and put these slopes into the others. What is left does not contain `y'` any more. It
+is a constraint, `h_0(t, y) = 0`. Its derivative `∂h_0/∂t + ∂h_0/∂y y' = 0` takes the place of the
 equations that gave it, which makes `F_1`. We go on until `F_ν` determines all slopes. `ν` is the
 index. A solution satisfies all `h_k = 0`, and `F_ν` is an ordinary differential equation on the
 manifold of these states (P. J. Rabier and W. C. Rheinboldt, *Theoretical and numerical analysis of
 differential-algebraic equations*, Handbook of Numerical Analysis VIII, 2002; C. W. Gear,
 *Differential-algebraic equation index transformations*, SIAM J. Sci. Stat. Comput. 9, 1988).
 
-Which equations and slopes are selected is the `Structure`. It is that of almost all states, so it is
-found from numbers at a single state in general position.
+Which equations and slopes are selected is the `Structure`. It is that of almost all states, so it
+is found from numbers at a single state in general position.
 """
 
 import concurrent.futures
@@ -21,16 +21,16 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.lax as lax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import ADDED_POWER, MAX_STEPS
+from .._constants import ADDED_POWER
 from .._step.implicit import root
-from .._step.iterate import Solved, after_step, iterate, keep_done
 from .._tree import without_pattern
+from .newton import algebraic_newton, divided
 
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
@@ -77,8 +77,7 @@ class Structure:
         are not selected are zero."""
         every = tuple(range(self.size))
         rows, columns = (
-            np.array(x, int)
-            for x in (self.rounds[k] if k < self.index else Round(every, every))
+            np.array(x, int) for x in (self.rounds[k] if k < self.index else Round(every, every))
         )
         none = jnp.zeros_like(y)
         if not rows.size:
@@ -96,8 +95,27 @@ class Structure:
         elif self.is_linear:
             slopes = divided(jax.jacfwd(residual)(begin), -residual(begin))
         else:
-            slopes = root(residual, ft.partial(_newton, residual), begin, divided).y
+            slopes = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
         return none.at[columns].set(slopes)
+
+    def freely_moved(
+        self, equations: Implicit, t: Array, y: Float[Array, " n"]
+    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
+        what the equations differentiate, such as the charges of condensers; and which unknowns are
+        the coordinates along it."""
+        rows, columns = (np.array(x, int) for x in self.rounds[0])
+        free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
+        if self.mass is not None:
+            matrix, along = self.mass, np.zeros((self.size, free.size))
+            along[free] = np.eye(free.size)
+            inner = matrix[np.ix_(rows, columns)]
+            along[columns] = -np.linalg.solve(inner, matrix[np.ix_(rows, free)])
+            return jnp.asarray(along, y.dtype), free
+        matrix = jax.jacfwd(lambda slopes: equations(t, y, slopes))(jnp.zeros_like(y))[rows]
+        others = -jnp.linalg.solve(matrix[:, columns], matrix[:, free])
+        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(jnp.eye(free.size))
+        return along.at[columns].set(others), free
 
     def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
         """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
@@ -118,6 +136,10 @@ class Structure:
 
         return given if k == 1 else further
 
+    def last_gradients(self, equations: Implicit, t: Array, y: Array) -> np.ndarray:
+        constraints = self.constraints(equations, self.index)
+        return np.asarray(jax.jit(jax.jacfwd(lambda t, y: constraints(t, y)[-1], 1))(t, y))
+
     def reduced(self, equations: Implicit, k: int) -> Implicit:
         """`F_k`, the equations after so many differentiations."""
         if k == 0:
@@ -134,27 +156,6 @@ class Structure:
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
     """Constraints, and their derivatives along the slopes."""
     return jax.jvp(constraints, (t, y), (jnp.ones_like(t), slopes))
-
-
-def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`matrix⁻¹ b`, in units of the rows in which their largest elements are one."""
-    rows = lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1))
-    return jnp.linalg.solve(matrix / rows[:, None], b / rows)
-
-
-def _newton(residual: Callable[[Array], Array], x: Array) -> Solved:
-    """Newton's method for slopes, which are NaN if it does not converge."""
-    eps = float(jnp.finfo(x.dtype).eps)
-
-    def advance(x: Array, counter: Array) -> tuple[Array, Array]:
-        step = divided(jax.jacfwd(residual)(x), -residual(x))
-        size = jnp.max(jnp.abs(x + step), initial=0)
-        settled = jnp.max(jnp.abs(step), initial=0) <= eps**0.5 * size
-        hopeful = jnp.all(jnp.isfinite(step))
-        return keep_done(counter, x + step, x), after_step(settled, hopeful, counter)
-
-    found = iterate(advance, x, max_steps=MAX_STEPS)
-    return found._replace(y=jnp.where(found.ok, found.y, jnp.nan))
 
 
 # ---- The structure ----
@@ -179,9 +180,8 @@ def find_structure(
     selected, gradients = Round((), ()), np.zeros((0, y.size))
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
-        hidden = structure.constraints(equations, structure.index)
         left = structure.left(structure.index - 1)
-        new = np.asarray(jax.jit(jax.jacfwd(lambda t, y: hidden(t, y)[-1], 1))(t, y))
+        new = structure.last_gradients(equations, t, y)
         gradients = np.concatenate([gradients, new])
         independent = _extended(gradients, Round((), ())).equations
         if len(independent) < len(gradients):
@@ -227,7 +227,7 @@ def _general_position(
     def near(share: float) -> tuple[Array, Array, Array, Array, Array]:
         moved = y + share * size * (1 + pattern[: y.size] / 2)
         later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
-        slopes = (size * pattern[:-1].reshape(3, -1)[1:])
+        slopes = size * pattern[:-1].reshape(3, -1)[1:]
         by_y = jax.jacfwd(equations, 1)(later, moved, slopes[0])
         by_slope = jax.vmap(lambda slope: jax.jacfwd(equations, 2)(later, moved, slope))(slopes)
         finite = jnp.all(jnp.isfinite(by_y)) & jnp.all(jnp.isfinite(by_slope))
