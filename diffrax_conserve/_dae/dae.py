@@ -23,7 +23,7 @@ from .._projection.project import project
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._step.implicit import root
-from .._tree import ravel, tree_shapes, unravel
+from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, divided
 from .radau import Radau
 from .reduction import (
@@ -207,8 +207,11 @@ class DAE(eqx.Module):
         structure = _structure(self, t, y, args, anew=True)
         if structure.index == 0:
             return y
-        projection = _Return(dae=self)
-        if fixed is not None or structure.index > 1:
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        if fixed is None and structure.index == 1:
+            found = unravel(_solved_for(self, t, y, args), y)
+            ok = tree_all_finite(found)
+        else:
             vector = ravel(y)
             price = np.ones(vector.size)
             price[list(structure.algebraic)] = float(jnp.finfo(vector.dtype).eps) ** 2
@@ -216,17 +219,13 @@ class DAE(eqx.Module):
                 price[_flags(fixed, y)] = np.inf
             sizes = jnp.where(vector == 0, 1, jnp.abs(vector))
             metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+            manifold = {"equations": Constraint(_Constraints(self))}
             projection = SimplifiedNewton(metric=metric, max_steps=MOST)
-        found, info = project(
-            {"equations": Constraint(_Constraints(self))},
-            y,
-            t=jnp.asarray(t, jnp.result_type(float, t)),
-            args=args,
-            projection=projection,
-        )
+            found, info = project(manifold, y, t=t, args=args, projection=projection)
+            ok = info.ok
         return eqx.error_if(
             found,
-            ~info.ok,
+            ~ok,
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
             "the equations that are differentiated.",
@@ -439,21 +438,27 @@ class _Return(AbstractProjection):
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
-        structure, equations, t, y = _at(self.dae, problem.t, state, problem.args)
-        if structure.index != 1:
+        if _structure(self.dae, problem.t, state, problem.args).index != 1:
             return SimplifiedNewton().solve(problem, candidate)
-        along, free = structure.freely_moved(equations, t, y)
-
-        def moved(z: Array) -> Array:
-            return (y + along @ (z - y[free])).at[free].set(z)
-
-        def residual(z: Array) -> Array:
-            return structure.constraints(equations, 1)(t, moved(z))[0]
-
-        found = root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y
+        y = _solved_for(self.dae, problem.t, state, problem.args)
         # Newton's method knows the roundoff of the equations, and is NaN if it misses the root.
-        ok = jnp.all(jnp.isfinite(found))
-        return moved(found), problem.report(candidate, moved(found), ok=ok)
+        return y, problem.report(candidate, y, ok=jnp.all(jnp.isfinite(y)))
+
+
+@eqx.filter_jit
+def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Array, " n"]:
+    """The state of equations of index 1, moved without what they differentiate; NaN if there is
+    none."""
+    structure, equations, t, y = _at(dae, t, state, args)
+    along, free = structure.freely_moved(equations, t, y)
+
+    def moved(z: Array) -> Array:
+        return (y + along @ (z - y[free])).at[free].set(z)
+
+    def residual(z: Array) -> Array:
+        return structure.constraints(equations, 1)(t, moved(z))[0]
+
+    return moved(root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y)
 
 
 @final
