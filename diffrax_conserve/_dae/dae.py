@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._manifold import Constraint, slope_like
 from .._options import check_function
+from .._printing import is_traced
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
 from .._projection.options import check_state
 from .._projection.project import project
@@ -204,7 +205,7 @@ class DAE(eqx.Module):
         time, an error if no consistent state is found.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args, anew=True)
+        structure = _structure(self, t, y, args, by_numbers=True)
         if structure.index == 0:
             return y
         t = jnp.asarray(t, jnp.result_type(float, t))
@@ -250,7 +251,7 @@ class DAE(eqx.Module):
         As `consistent`.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args, anew=True)
+        structure = _structure(self, t, y, args, by_numbers=True)
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
         times = [
@@ -369,18 +370,22 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The structures that were found, by the functions and the shapes. Inside a solve the numbers are
-# not known any more.
-_FOUND: dict[Any, Structure] = {}
+# The structures that were found, by the functions and the shapes, and the zeros in functions and
+# `args` for which they were. Inside a solve the numbers are not known any more.
+_FOUND: dict[Any, tuple[Structure, tuple[bytes, ...]]] = {}
 
 
-def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args, anew: bool = False) -> Structure:
-    key = tree_key((dae, y, args))
-    if anew or key not in _FOUND:
+def _structure(
+    dae: DAE, t: RealScalarLike, y: Y, args: Args, *, by_numbers: bool = False
+) -> Structure:
+    """The structure of the equations; that for the zeros in these numbers if `by_numbers`."""
+    key, zeros = tree_key((dae, y, args)), _zeros((dae, args)) if by_numbers else None
+    if key not in _FOUND or (zeros is not None and _FOUND[key][1] != zeros):
         t = jnp.asarray(t, jnp.result_type(float, t))
         mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
         try:
-            _FOUND[key] = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
+            found = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
+            _FOUND[key] = found, zeros or ()
         except Singular as error:
             names = dae._names(t, y, args)
             which = ", ".join(f"`{names[i]}`" for i in error.left)
@@ -395,7 +400,13 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args, anew: bool = False
                 "state where they are, and find it by `dae.consistent(guess, t=t0, args=args)`, "
                 "outside of functions that JAX traces."
             ) from None
-    return _FOUND[key]
+    return _FOUND[key][0]
+
+
+def _zeros(tree: Any) -> tuple[bytes, ...] | None:
+    """Where the arrays of a tree are zero; `None` if JAX traces one."""
+    arrays = [x for x in jtu.tree_leaves(tree) if eqx.is_array(x)]
+    return None if is_traced(arrays) else tuple((np.asarray(x) == 0).tobytes() for x in arrays)
 
 
 def _names(root: str, tree: Any) -> list[str]:

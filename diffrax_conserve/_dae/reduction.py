@@ -230,7 +230,8 @@ def _general_position(
         slopes = size * pattern[:-1].reshape(3, -1)[1:]
         by_y = jax.jacfwd(equations, 1)(later, moved, slopes[0])
         by_slope = jax.vmap(lambda slope: jax.jacfwd(equations, 2)(later, moved, slope))(slopes)
-        finite = jnp.all(jnp.isfinite(by_y)) & jnp.all(jnp.isfinite(by_slope))
+        value = equations(later, moved, slopes[0])
+        finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
         return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), finite
 
     for share in (1e-1, 1e-3, 1e-5, 0.0):
