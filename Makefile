@@ -132,7 +132,7 @@ examples: $(TEST) ## execute the code blocks of the README, the first pages and 
 	$(BIN)/python -m pytest $(SHARED) -qq -m "examples and not slow" tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := forms overhead work_precision scaling balance dae random_features
+COSTS := forms overhead work_precision scaling balance dae stiff random_features
 TRAININGS := zoo paper learning_from_data equal_cost chemistry worth defaults hard_cases
 STUDIES := claims long_run metric symmetric units verdict
 PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms

@@ -13,6 +13,7 @@ What is conserved    FirstIntegral, Constraint, find_invariants
 Diagnostics          check_invariance, compare, drift, off_manifold, statistics
 Solvers              ManifoldProjection, RK4, Unrolled
 Symmetric solvers    SymmetricProjection, ImplicitMidpoint, RATTLE
+Stiff, algebraic     Radau, DAE
 Projections          SimplifiedNewton, Newton, AlongLine, Staged, project
 Formulas             ClosedForm, closed_forms
 Learned solvers      PINNSolver, DeepONetSolver, RandomFeatureSolver, fit, load_pretrained, learned
@@ -25,6 +26,9 @@ accurate: measure its error too.
 
 from . import learned as learned
 from . import systems as systems
+from ._dae.dae import DAE as DAE
+from ._dae.dae import DAEReport as DAEReport
+from ._dae.radau import Radau as Radau
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.compare import compare as compare
 from ._diagnostics.comparison import ComparisonReport as ComparisonReport
@@ -50,7 +54,6 @@ from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
-from ._solver.semi_explicit_dae import SemiExplicitDAE as SemiExplicitDAE
 from ._solver.state import statistics as statistics
 from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled

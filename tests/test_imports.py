@@ -43,10 +43,11 @@ MAY_IMPORT = {
     "_solver": _PROJECTION | {"_interpolation"},
     "_diagnostics": _PROJECTION | {"_interpolation", "_solver"},
     "_mechanics": _PROJECTION | {"_interpolation", "_solver"},
+    "_dae": _PROJECTION | {"_interpolation", "_solver"},
     "learned": _CORE | {"systems"},
     "systems": _CORE,
     "testing": _CORE | {"systems"},
-    PACKAGE: _CORE | _GUESTS | {"_mechanics"},
+    PACKAGE: _CORE | _GUESTS | {"_mechanics", "_dae"},
     "reproduce": _CORE | _GUESTS | {PACKAGE},
     "__main__": _CORE | _GUESTS | {"reproduce", PACKAGE},
 }

@@ -34,7 +34,7 @@ _ENTRY = (
 FIRST = register(
     "a step cannot start: its state violates a `Constraint`. At the start of a solve, start on the "
     "manifold: `y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a "
-    "`SemiExplicitDAE` `y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps the "
+    "`DAE` `y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps the "
     "value that it has at the start is a `FirstIntegral`. After a jump of the vector field end the "
     "solve there, `project`, and go on. " + _ENTRY,
     "the projection of a step failed: a state is not finite, or a function of the manifold there, "

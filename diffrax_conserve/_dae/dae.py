@@ -1,0 +1,511 @@
+"""Differential-algebraic equations, as equations on a manifold."""
+
+import dataclasses
+import functools as ft
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Args, RealScalarLike, Values, Y
+from .._manifold import Constraint, slope_like
+from .._options import check_function
+from .._printing import is_traced
+from .._projection.base import AbstractProjection, Problem, ProjectionInfo
+from .._projection.options import check_state
+from .._projection.project import project
+from .._projection.simplified_newton import SimplifiedNewton
+from .._solver.manifold_projection import ManifoldProjection
+from .._step.implicit import root
+from .._tree import ravel, tree_all_finite, tree_shapes, unravel
+from .newton import MOST, algebraic_newton, divided
+from .radau import Radau
+from .reduction import (
+    Implicit,
+    Singular,
+    Structure,
+    structure_of,
+    tree_key,
+)
+
+
+@final
+class _Matrix(eqx.Module):
+    """A constant matrix, known while JAX traces."""
+
+    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+
+def _mass(mass: Any) -> Any:
+    if mass is None or callable(mass) or isinstance(mass, _Matrix):
+        return mass
+    if isinstance(mass, jax.core.Tracer):
+        raise TypeError(
+            "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are "
+            "solved. Pass a function `mass(t, y, args)`, and what it depends on in `args`."
+        )
+    mass = np.asarray(mass)
+    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(mass)):
+        raise ValueError(
+            f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square "
+            "matrix of numbers, with a row for each equation and a column for each number of the "
+            "state, or a function `mass(t, y, args)` that returns one."
+        )
+    return _Matrix(tuple(map(tuple, mass.astype(float).tolist())))
+
+
+@final
+class DAE(eqx.Module):
+    r"""A differential-algebraic equation, in one of three forms.
+
+    - `DAE(residual=F)` is $F(t, y, y', args) = 0$.
+    - `DAE(f, mass=M)` is $M y' = f(t, y, args)$, where $M$ may be singular.
+    - `DAE(f, algebraic=g)` is $x' = f(t, x, z, args)$, $0 = g(t, x, z, args)$, and its state is the
+        pair $(x, z)$.
+
+    Equations without slopes are constraints. The program finds them, also as combinations of
+    equations, differentiates them by automatic differentiation, and goes on until the equations
+    determine all slopes. The number of differentiations is the index. What is found on the way are
+    the hidden constraints: of a pendulum in Cartesian coordinates, of index 3, its length, that its
+    velocity is tangential, and the equation for its force. `report` tells what was found.
+
+    `wrap` gives a solver that projects each step, saved times, dense output and events to the
+    manifold of all these constraints, to roundoff. Use [`diffrax_conserve.Radau`][], which solves
+    the equations themselves, after all differentiations but the last. Every other solver of diffrax
+    solves the ordinary differential equation that follows from the last; that is good for equations
+    that are not stiff.
+
+    Which equations are differentiated is found once, from numbers in general position: the guess of
+    `consistent`, or where it is not called before, random numbers in the place of states and
+    arguments that JAX traces. So call `consistent` first if zeros in `args` decide about the index.
+    For the same functions and shapes, what the last call of `consistent` has found counts.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        # A pendulum of length 1 in Cartesian coordinates: position, velocity, and force.
+        def pendulum(t, y, dy, args):
+            (q, v, force), (dq, dv, _) = y, dy
+            return dq - v, dv + force * q - jnp.array([0.0, -9.81]), jnp.sum(q**2) - 1
+
+        dae = dfc.DAE(residual=pendulum)
+        y0 = dae.consistent((jnp.array([1.0, 0.0]), jnp.zeros(2), jnp.array(0.0)))
+        print(dae.report(y0))
+        steps = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+        sol = diffrax.diffeqsolve(
+            dae.term, dae.wrap(dfc.Radau()), 0.0, 1.0, 1e-3, y0, stepsize_controller=steps
+        )
+        ```
+
+        ```text
+        Index 3, with 2 degrees of freedom.
+        Differentiated: [2] 3 times.
+        Without slopes: y[2].
+        ```
+
+    ??? cite "Reference"
+
+        Rabier and Rheinboldt, *Theoretical and numerical analysis of differential-algebraic
+        equations*, Handbook of Numerical Analysis VIII, 2002; Hairer and Wanner, *Solving Ordinary
+        Differential Equations II*, Springer 1996, VI and VII.
+    """
+
+    f: Callable[..., Any] | None = None
+    mass: Any = eqx.field(default=None, kw_only=True, converter=_mass)
+    algebraic: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
+    residual: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        forms = [x is not None for x in (self.mass, self.algebraic, self.residual)]
+        if sum(forms) != 1 or (self.f is None) != (self.residual is not None):
+            raise ValueError(
+                "A `DAE` is given as `DAE(residual=F)`, as `DAE(f, mass=M)` or as "
+                "`DAE(f, algebraic=g)`. If no slope is multiplied and there are no algebraic "
+                "equations, it is an ordinary differential equation: use `diffrax.ODETerm(f)`."
+            )
+        pair = self.algebraic is not None
+        call = "t, x, z, args" if pair else "t, y, args"
+        if self.f is not None:
+            check_function("`f` of a `DAE`", self.f, f"f({call})", "a value like `x` or `y`")
+        if self.algebraic is not None:
+            name, returns = "`algebraic` of a `DAE`", "as many numbers as `z` has"
+            check_function(name, self.algebraic, f"algebraic({call})", returns)
+        if self.residual is not None:
+            call, returns = "residual(t, y, dy, args)", "as many numbers as `y` has"
+            check_function("`residual` of a `DAE`", self.residual, call, returns)
+        if callable(self.mass):
+            check_function("`mass` of a `DAE`", self.mass, "mass(t, y, args)", "a square matrix")
+
+    @property
+    def term(self) -> dfx.ODETerm[Any]:
+        """The term for [`diffrax.diffeqsolve`][], with the slopes that the equations determine."""
+        return dfx.ODETerm(_Slopes(self))
+
+    def wrap(self, solver: dfx.AbstractSolver[Any]) -> ManifoldProjection:
+        """A solver whose steps and dense output satisfy all constraints to roundoff.
+
+        **Arguments:**
+
+        - `solver`: [`diffrax_conserve.Radau`][], or another solver of diffrax if the equations are
+            not stiff.
+
+        **Returns:**
+
+        A [`diffrax_conserve.ManifoldProjection`][].
+
+        **Raises:**
+
+        `TypeError` if `solver` is none.
+        """
+        if isinstance(solver, Radau):
+            solver = dataclasses.replace(solver, equations=_Stages(self))
+        manifold = {"equations": Constraint(_Constraints(self))}
+        return ManifoldProjection(solver, manifold, projection=_Return(dae=self))
+
+    def consistent(
+        self,
+        *guess: Any,
+        t: RealScalarLike = 0.0,
+        args: Args = None,
+        fixed: PyTree[bool] | None = None,
+    ) -> Any:
+        """The state near the guess that satisfies all constraints, those that are hidden too.
+
+        Use it at the start, and after an event that changes the state, `args` or the equations.
+
+        **Arguments:**
+
+        - `guess`: the state, with its structure, shapes and dtype; of `DAE(f, algebraic=g)` its two
+            parts, `consistent(x, z)`.
+        - `t`, `args`: passed to the functions.
+        - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
+            each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
+            equations differentiate stays, such as $x$ or $M y$. With a higher index unknowns
+            without slopes, such as forces, are free, and the others move to the nearest point,
+            relative to their sizes.
+
+        **Returns:**
+
+        The state, as `y0` of [`diffrax.diffeqsolve`][]. What was changed is told by `report`.
+
+        **Raises:**
+
+        `ValueError` or `TypeError` if the equations do not fit the state, or are singular; at run
+        time, an error if no consistent state is found.
+        """
+        y = self._state(guess)
+        structure = _structure(self, t, y, args, by_numbers=True)
+        if structure.index == 0:
+            return y
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        if fixed is None and structure.index == 1:
+            found = unravel(_solved_for(self, t, y, args), y)
+            ok = tree_all_finite(found)
+        else:
+            vector = ravel(y)
+            price = np.ones(vector.size)
+            price[list(structure.algebraic)] = float(jnp.finfo(vector.dtype).eps) ** 2
+            if fixed is not None:
+                price[_flags(fixed, y)] = np.inf
+            sizes = jnp.where(vector == 0, 1, jnp.abs(vector))
+            metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+            manifold = {"equations": Constraint(_Constraints(self))}
+            projection = SimplifiedNewton(metric=metric, max_steps=MOST)
+            found, info = project(manifold, y, t=t, args=args, projection=projection)
+            ok = info.ok
+        return eqx.error_if(
+            found,
+            ~ok,
+            "`consistent` found no state near the guess that satisfies the equations and their "
+            "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
+            "the equations that are differentiated.",
+        )
+
+    def report(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
+        """What was found out about the equations, at the state of a guess.
+
+        **Arguments:**
+
+        - `guess`, `t`, `args`: as those of `consistent`.
+
+        **Returns:**
+
+        A `DAEReport`, which prints as a text. Its fields are `index`; `differentiated`, how often
+        which equation is; `algebraic`, the unknowns whose slopes no equation contains; `freedom`,
+        the number of degrees of freedom; and `residuals`, the largest of each group of constraints
+        at the guess, in the order in which they were found.
+
+        **Raises:**
+
+        As `consistent`.
+        """
+        y = self._state(guess)
+        structure = _structure(self, t, y, args, by_numbers=True)
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        equations, unknowns = self._names(t, y, args), _names("y", y)
+        times = [
+            sum(i in structure.left(k) for k in range(structure.index))
+            for i in range(len(equations))
+        ]
+        off = _Constraints(self)(t, y, args)
+        return DAEReport(
+            index=structure.index,
+            differentiated={equations[i]: n for i, n in enumerate(times) if n},
+            algebraic=tuple(unknowns[j] for j in structure.algebraic),
+            freedom=len(unknowns) - sum(times),
+            residuals=tuple(float(jnp.max(jnp.abs(h), initial=0)) for h in off),
+        )
+
+    def _state(self, guess: tuple[Any, ...]) -> Any:
+        wanted = 1 if self.algebraic is None else 2
+        if len(guess) != wanted:
+            names = "the state `y`" if wanted == 1 else "the two parts of the state, `x, z`"
+            raise ValueError(f"Pass {names}: {wanted} positional arguments, not {len(guess)}.")
+        y = jtu.tree_map(jnp.asarray, guess[0] if wanted == 1 else guess)
+        check_state(y, "a `DAE`", kind=jnp.inexact)
+        return y
+
+    def _values(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> dict[str, Any]:
+        """What the user's functions return, by their names."""
+        if self.residual is not None:
+            return {"": self.residual(t, y, slopes, args)}
+        assert self.f is not None
+        if self.algebraic is None:
+            return {"f": self.f(t, y, args)}
+        if not isinstance(y, tuple | list) or len(y) != 2:
+            raise ValueError(
+                "The state of a `DAE` with `algebraic` must be a pair `(x, z)`, but it is "
+                f"{tree_shapes(y)}. Pass `y0=dae.consistent(x, z)`."
+            )
+        slope = slope_like(y[0], self.f(t, *y, args))
+        return {"f": slope, "algebraic": self.algebraic(t, *y, args)}
+
+    def _names(self, t: RealScalarLike, y: Y, args: Args) -> list[str]:
+        """The names of the equations."""
+        values = jax.eval_shape(lambda: self._values(t, y, y, args))
+        return [name for key, value in values.items() for name in _names(key, value)]
+
+    def equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
+        """The equations as a function of vectors, for states like `y`."""
+        size, given = ravel(y).size, len(self._names(t, y, args))
+        if given != size:
+            which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
+            raise ValueError(
+                f"`{which}` makes {given} equations for a state of {size} numbers: there must be "
+                "as many equations as unknowns."
+            )
+        matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
+        if matrix is not None and len(matrix) != size:
+            raise ValueError(
+                f"`mass` has {len(matrix)} rows, but the state has {size} numbers: pass a matrix "
+                "with a row for each equation and a column for each number of the state."
+            )
+
+        def equations(t: Array, vector: Array, slopes: Array) -> Array:
+            state = unravel(vector, y)
+            values = self._values(t, state, unravel(slopes, y), args)
+            if self.residual is not None:
+                return ravel(values).astype(vector.dtype)
+            f = ravel(values["f"]).astype(vector.dtype)
+            if self.algebraic is not None:
+                g = ravel(values["algebraic"]).astype(vector.dtype)
+                return jnp.concatenate([slopes[: f.size] - f, g])
+            mass = self.mass(t, state, args) if matrix is None else matrix
+            return jnp.asarray(mass, vector.dtype) @ slopes - f
+
+        return equations
+
+
+DAE.__init__.__doc__ = r"""**Arguments:**
+
+- `f`: with `mass`, called as `f(t, y, args)`, and returns as many numbers as `y` has; with
+    `algebraic`, called as `f(t, x, z, args)`, and returns a value like `x`.
+- `mass`: the matrix $M$, or a function `mass(t, y, args)` that returns it. It acts on the
+    numbers of the state, in the order of the leaves.
+- `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as
+    `z` has.
+- `residual`: called as `residual(t, y, dy, args)`; a PyTree with as many numbers as `y` has.
+
+JAX differentiates all of them, as often as the index is.
+
+**Raises:**
+
+`TypeError` or `ValueError` if they make none of the three forms, or cannot be called so. In a
+solve, before compilation, `ValueError` if the numbers of equations and unknowns differ, or if the
+equations are singular.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class DAEReport:
+    """What was found out about a [`diffrax_conserve.DAE`][]; see its `report`."""
+
+    index: int
+    differentiated: Mapping[str, int]
+    algebraic: tuple[str, ...]
+    freedom: int
+    residuals: tuple[float, ...]
+
+    def __str__(self) -> str:
+        times = lambda n: "once" if n == 1 else f"{n} times"  # noqa: E731
+        lines = [f"Index {self.index}, with {self.freedom} degrees of freedom."]
+        if self.differentiated:
+            found = (f"{name} {times(n)}" for name, n in self.differentiated.items())
+            lines += ["Differentiated: " + ", ".join(found) + "."]
+        if self.algebraic:
+            lines += ["Without slopes: " + ", ".join(self.algebraic) + "."]
+        return "\n".join(lines)
+
+
+# ---- The structure ----
+
+# The structures that were found, by the functions and the shapes, and the zeros in functions and
+# `args` for which they were. Inside a solve the numbers are not known any more.
+_FOUND: dict[Any, tuple[Structure, tuple[bytes, ...]]] = {}
+
+
+def _structure(
+    dae: DAE, t: RealScalarLike, y: Y, args: Args, *, by_numbers: bool = False
+) -> Structure:
+    """The structure of the equations; that for the zeros in these numbers if `by_numbers`."""
+    key, zeros = tree_key((dae, y, args)), _zeros((dae, args)) if by_numbers else None
+    if key not in _FOUND or (zeros is not None and _FOUND[key][1] != zeros):
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
+        try:
+            found = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
+            _FOUND[key] = found, zeros or ()
+        except Singular as error:
+            names = dae._names(t, y, args)
+            which = ", ".join(f"`{names[i]}`" for i in error.left)
+            raise ValueError(
+                f"The equations are singular: {which}, or a derivative of it, follows from the "
+                "other equations or contradicts them. So some unknown is not determined. Leave out "
+                "what is stated twice, and add the equation that is missing."
+            ) from None
+        except FloatingPointError:
+            raise ValueError(
+                "The equations, or their derivatives, are not finite near the state. Start at a "
+                "state where they are, and find it by `dae.consistent(guess, t=t0, args=args)`, "
+                "outside of functions that JAX traces."
+            ) from None
+    return _FOUND[key][0]
+
+
+def _zeros(tree: Any) -> tuple[bytes, ...] | None:
+    """Where the arrays of a tree are zero; `None` if JAX traces one."""
+    arrays = [x for x in jtu.tree_leaves(tree) if eqx.is_array(x)]
+    return None if is_traced(arrays) else tuple((np.asarray(x) == 0).tobytes() for x in arrays)
+
+
+def _names(root: str, tree: Any) -> list[str]:
+    """The names of the numbers of a tree, such as `y[0][1]`."""
+    out = []
+    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
+        name = root + jtu.keystr(path)
+        parts = 2 if jnp.issubdtype(leaf.dtype, jnp.complexfloating) else 1
+        places = (
+            [""]
+            if leaf.ndim == 0
+            else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
+        )
+        out += [name + place for place in places] * parts
+    return out
+
+
+def _flags(fixed: Any, y: Y) -> np.ndarray:
+    try:
+        flags = jtu.tree_map(lambda flag, x: np.broadcast_to(flag, x.shape), fixed, y)
+    except ValueError as error:
+        raise ValueError(
+            "`fixed` must have the structure of the state, "
+            f"{tree_shapes(y)}, with `True`, `False` or an array of them for each leaf."
+        ) from error
+    return np.asarray(ravel(flags), bool)
+
+
+@final
+class _Return(AbstractProjection):
+    """The way back to the constraints. With index 1 it keeps all that the equations differentiate,
+    as the solution does: the state moves in the directions in which `F` has no slopes, and the
+    unknowns there are solved for. With a higher index the state moves to the nearest point."""
+
+    dae: DAE
+    metric: None = None
+    sees_step: ClassVar[bool] = False
+
+    def solve(
+        self, problem: Problem, candidate: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], ProjectionInfo]:
+        state = problem.state(candidate)
+        if _structure(self.dae, problem.t, state, problem.args).index != 1:
+            return SimplifiedNewton().solve(problem, candidate)
+        y = _solved_for(self.dae, problem.t, state, problem.args)
+        # Newton's method knows the roundoff of the equations, and is NaN if it misses the root.
+        return y, problem.report(candidate, y, ok=jnp.all(jnp.isfinite(y)))
+
+
+@eqx.filter_jit
+def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Array, " n"]:
+    """The state of equations of index 1, moved without what they differentiate; NaN if there is
+    none."""
+    structure, equations, t, y = _at(dae, t, state, args)
+    along, free = structure.freely_moved(equations, t, y)
+
+    def moved(z: Array) -> Array:
+        return (y + along @ (z - y[free])).at[free].set(z)
+
+    def residual(z: Array) -> Array:
+        return structure.constraints(equations, 1)(t, moved(z))[0]
+
+    return moved(root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y)
+
+
+@final
+class _Slopes(eqx.Module):
+    """The vector field: the slopes that the equations determine after all differentiations."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return unravel(structure.slopes(equations, structure.index, t, vector), y)
+
+
+@final
+class _Constraints(eqx.Module):
+    """All constraints. Not a closure, with which every `wrap` would compile anew."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return structure.constraints(equations, structure.index)(t, vector)
+
+
+@final
+class _Stages(eqx.Module):
+    """The equations that [`diffrax_conserve.Radau`][] solves, of index 1 at most."""
+
+    dae: DAE
+
+    def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
+        structure, equations, t, vector = _at(self.dae, t, y, args)
+        return structure.reduced(equations, max(structure.index - 1, 0))(t, vector, ravel(slopes))
+
+
+def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Implicit, Array, Array]:
+    y = jtu.tree_map(jnp.asarray, y)
+    t = jnp.asarray(t, jnp.result_type(float, t))
+    return _structure(dae, t, y, args), dae.equations(t, y, args), t, ravel(y)

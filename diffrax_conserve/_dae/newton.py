@@ -1,0 +1,115 @@
+"""Newton's method for algebraic unknowns, from guesses that may be poor."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy as jsp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._constants import ROUNDOFF, SHORTER
+from .._step.equations import shown_terms
+from .._step.iterate import Solved, after_step, any_lane, iterate, keep_done
+from .._step.roundoff import hidden_terms
+
+# Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
+# rough guess it may need many: if the voltage at a diode is guessed too large, each correction
+# lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
+MOST = 500
+
+
+def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`matrix⁻¹ b`, computed in units in which all elements are about one."""
+    if b.size == 1:
+        return b / matrix[0]
+    rows, columns = lax.stop_gradient(_sizes(matrix))
+    return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
+
+
+def _sizes(jacobian: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """The units of equations and unknowns, in which no entry is larger than one."""
+    rows = jnp.max(jnp.abs(jacobian), axis=1)
+    return rows, jnp.max(jnp.abs(jacobian) / rows[:, None], axis=0)
+
+
+class _Factored(NamedTuple):
+    """The LU decomposition of a Jacobian in the units of its rows and columns. A single number is
+    its own: a call of LAPACK would take most of the time of a small solve."""
+
+    lu: tuple[Float[Array, "m m"], Int[Array, " m"]]
+    rows: Float[Array, " m"]
+    columns: Float[Array, " m"]
+
+    @classmethod
+    def of(cls, jacobian: Float[Array, "m m"]) -> "_Factored":
+        rows, columns = _sizes(jacobian)
+        scaled = jacobian / rows[:, None] / columns
+        one = scaled, jnp.zeros(1, jnp.int32)
+        return cls(one if rows.size == 1 else jsp.linalg.lu_factor(scaled), rows, columns)
+
+    def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
+        right = residual / self.rows
+        one = right.size == 1
+        return (
+            -(right / self.lu[0][0] if one else jsp.linalg.lu_solve(self.lu, right)) / self.columns
+        )
+
+    def regular(self) -> Bool[Array, ""]:
+        pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
+        return jnp.all(pivots > ROUNDOFF * float(jnp.finfo(pivots.dtype).eps))
+
+
+def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
+    """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
+    Nonlinear Problems*, Springer 2004, 3.3).
+
+    A correction is accepted if the one after it, computed with the same Jacobian, is shorter. So
+    the test compares changes of `z`, and does not depend on the units of the equations. A
+    correction that is NaN is not accepted. The iteration ends with NaN if there is no root.
+    """
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def advance(now: tuple[Array, Array], counter: Array) -> tuple[tuple[Array, Array], Array]:
+        z, share = now  # the unknowns, and the share of the correction to try next
+        jacobian = jax.jacfwd(residual)(z)
+        factored = _Factored.of(jacobian)
+        step = factored.correction(residual(z))
+        trial = z + share * step
+        after = factored.correction(residual(trial))
+        size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
+        # An unknown near zero is compared with the change that the largest term of one of its
+        # equations stands for, whatever the units of the others are.
+        slopes = jnp.abs(jacobian)
+        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
+        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+        size = size + eps**0.5 * jnp.min(least, axis=0, initial=jnp.inf)
+        size = jnp.where(size > 0, size, 1)
+        before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
+        # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
+        # for half of that gain.
+        better = then <= (1 - share / 2) * before
+        # The later corrections shrink at least by the same ratio, `then / before`. So the one that
+        # would follow both is at most `then² / before`, which is roundoff here.
+        settled = better & (share == 1) & (then * then <= eps * before) & factored.regular()
+        # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
+        # helping. Whether it is, we ask once, at the end.
+        stuck = ~better & (before <= eps**0.5)
+        # A share of the root of roundoff still changes half of the digits of the unknown.
+        going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > eps**0.5))
+        z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
+        share = jnp.where(better, jnp.minimum(share / SHORTER, 1), share * SHORTER)
+        return keep_done(counter, (z, share), now), after_step(settled, going, counter)
+
+    start = z, jnp.ones((), z.dtype)
+    (z, _), settled, num_steps, _ = iterate(advance, start, max_steps=MOST)
+
+    def at_roundoff() -> Bool[Array, ""]:
+        """Whether the state where the iteration ended is a root as far as rounding lets us see."""
+        g, jacobian, hidden = hidden_terms(residual, z)
+        limit = ROUNDOFF * eps * (shown_terms(jacobian, jnp.abs(z)) + hidden)
+        return jnp.all(jnp.abs(g) <= limit) & _Factored.of(jacobian).regular()
+
+    found = settled | lax.cond(any_lane(~settled), at_roundoff, lambda: jnp.asarray(True))
+    return Solved(jnp.where(found, z, jnp.nan), found, num_steps)

@@ -1,0 +1,251 @@
+"""The Radau IIA method of order five, for stiff and for differential-algebraic equations."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, final
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._options import check_counts
+from .._projection.options import check_state, option
+from .._solver.terms import time_direction
+from .._step.implicit import root
+from .._step.iterate import Solved, after_step, iterate, keep_done
+from .._tree import ravel, unravel
+
+# The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
+# powers of the nodes, by which the coefficients of the collocation polynomial follow from them.
+_NODES = np.array([(4 - 6**0.5) / 10, (4 + 6**0.5) / 10, 1.0])
+_POWERS = _NODES[:, None] ** np.arange(1, 4)
+_INVERSE = (_POWERS / _NODES[:, None] * np.arange(1, 4)) @ np.linalg.inv(_POWERS)
+# `A⁻¹ = V Λ V⁻¹`, with the real eigenvalue first, and one of the conjugate pair.
+_EIGENVALUES, _VECTORS = np.linalg.eig(_INVERSE)
+_ORDER = np.argsort(np.abs(np.imag(_EIGENVALUES)), kind="stable")
+_EIGENVALUES, _VECTORS = _EIGENVALUES[_ORDER], _VECTORS[:, _ORDER]
+_REAL, _PAIR = float(_EIGENVALUES[0].real), complex(_EIGENVALUES[1])
+_TO_MODES = np.linalg.inv(_VECTORS)
+# The weights of the increments in the error estimate.
+_ERROR = np.array([-13 - 7 * 6**0.5, -13 + 7 * 6**0.5, -1.0]) / 3
+
+# The equations `F(t, y, y', args) = 0`, in the time of the user, as numbers.
+Equations = Callable[[RealScalarLike, Any, Any, Args], Any]
+
+
+class _Last(NamedTuple):
+    """What a step leaves to the next: the coefficients of its polynomial in the share of the step,
+    without the constant one, and its length. They are zero before the first step."""
+
+    coefficients: Float[Array, "3 n"]
+    length: Float[Array, ""]
+
+
+@final
+class Radau(dfx.AbstractImplicitSolver[_Last]):
+    r"""The Radau IIA method with three stages, of order five, for stiff equations.
+
+    A step is the collocation polynomial $u$ of degree three with $u(t_n) = y_n$ that satisfies the
+    equations at the times $t_n + c_i h$, where $c = (4 \mp \sqrt 6)/10$ and $1$. It is L-stable,
+    and dense output is $u$ itself. The three stages are solved for together, by Newton's method
+    with one Jacobian for a step, from the polynomial of the last step as a guess; the linear
+    systems are one real and one complex one of the size of the state. The error estimate is that
+    of an embedded method of order three, and damps stiff components.
+
+    Inside [`diffrax_conserve.DAE`][] the equations are $F(t, y, y') = 0$; by itself, they are
+    $y' = f(t, y)$.
+
+    !!! example
+
+        ```python
+        import diffrax
+        import diffrax_conserve as dfc
+        import jax.numpy as jnp
+
+        def van_der_pol(t, y, args):
+            return jnp.stack([y[1], args * (1 - y[0] ** 2) * y[1] - y[0]])
+
+        steps = diffrax.PIDController(rtol=1e-4, atol=1e-4)
+        sol = diffrax.diffeqsolve(
+            diffrax.ODETerm(van_der_pol), dfc.Radau(), 0.0, 2000.0, 1e-2, jnp.array([2.0, 0.0]),
+            args=1000.0, stepsize_controller=steps,
+        )
+        print(sol.stats["num_steps"] < 500)
+        ```
+
+        ```text
+        True
+        ```
+
+    ??? cite "Reference"
+
+        Hairer and Wanner, *Solving Ordinary Differential Equations II*, Springer 1996, IV.5 and
+        IV.8.
+    """
+
+    root_finder: Any = option(dfx.with_stepsize_controller_tols(dfx.VeryChord)())
+    root_find_max_steps: int = option(10, static=True)  # pyright: ignore
+    equations: Equations | None = eqx.field(default=None, kw_only=True)
+
+    term_structure: ClassVar = dfx.ODETerm
+
+    @property
+    def interpolation_cls(self) -> Callable[..., dfx.AbstractLocalInterpolation]:  # pyright: ignore
+        return CollocationInterpolation
+
+    def __check_init__(self):
+        check_counts(root_find_max_steps=self.root_find_max_steps)
+
+    def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
+        del terms
+        return 5
+
+    def error_order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
+        del terms
+        return 4
+
+    def init(
+        self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> _Last:
+        del terms, args
+        check_state(y0, kind=jnp.inexact)
+        y = ravel(y0)
+        return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
+
+    def step(
+        self,
+        terms: dfx.AbstractTerm,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: _Last,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Y, DenseInfo, _Last, dfx.RESULTS]:
+        start = ravel(y0)
+        nodes, inverse = jnp.asarray(_NODES, start.dtype), jnp.asarray(_INVERSE, start.dtype)
+        length = jnp.asarray(t1 - t0, start.dtype)
+        residual = self._residual(terms, t0, y0, args)
+        at_stages = jax.vmap(residual)
+        # The polynomial of the last step is continued.
+        last = lax.stop_gradient(solver_state)
+        q = jnp.where(made_jump, 0, last.coefficients)
+        powers = jnp.arange(1, 4)
+        later = (1 + nodes * length / last.length)[:, None] ** powers - 1
+        guess = start + later @ q
+        slope = powers.astype(start.dtype) @ q / last.length
+
+        def stages(y: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+            times = t0 + jnp.asarray(_NODES, jnp.result_type(t0)) * (t1 - t0)
+            return at_stages(times, y, inverse @ (y - start) / length)
+
+        by_y, by_slope = lax.stop_gradient(
+            (
+                jax.jacfwd(lambda y: residual(t0, y, slope))(start),
+                jax.jacfwd(lambda slope: residual(t0, start, slope))(slope),
+            )
+        )
+        real = jax.scipy.linalg.lu_factor(_REAL / length * by_slope + by_y)
+        pair = jax.scipy.linalg.lu_factor(_PAIR / length * by_slope + by_y)
+
+        def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+            """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
+            by the eigenvectors of `A⁻¹`."""
+            modes = -jnp.asarray(_TO_MODES, pair[0].dtype) @ residuals
+            first = jax.scipy.linalg.lu_solve(real, modes[0].real)
+            second = jax.scipy.linalg.lu_solve(pair, modes[1])
+            vectors = jnp.asarray(_VECTORS, pair[0].dtype)
+            other = 2 * (vectors[:, 1, None] * second).real
+            return vectors[:, 0, None].real * first + other
+
+        finder = self.root_finder
+
+        def size(change: Array, y: Array) -> Array:
+            scale = finder.atol + finder.rtol * jnp.abs(y)
+            return finder.norm(jax.vmap(lambda x: unravel(x, y0))(change / scale))
+
+        def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+            y, before = now
+            change = correction(stages(y))
+            new = y + change
+            now_size = size(change, new)
+            rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
+            small = now_size < 10 * jnp.finfo(start.dtype).eps
+            settled = small | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
+            return keep_done(counter, (new, now_size), now), after_step(settled, rate < 2, counter)
+
+        def newton(guess: Array) -> Solved:
+            begin = guess, jnp.asarray(jnp.inf, start.dtype)
+            found = iterate(advance, begin, max_steps=self.root_find_max_steps)
+            return found._replace(y=found.y[0])
+
+        found = root(stages, newton, guess, jnp.linalg.solve)
+        y = found.y
+        increments = y - start
+        coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
+        # The error estimate.
+        slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
+        filtered = lambda y: -jax.scipy.linalg.lu_solve(real, residual(t0, y, slopes))  # noqa: E731
+        error = filtered(start + filtered(start))
+        ok = found.ok & jnp.all(jnp.isfinite(error))
+        big = float(jnp.finfo(start.dtype).max) ** 0.5
+        error = lax.stop_gradient(jnp.where(ok, error, big))
+        success, failure = dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
+        result = dfx.RESULTS.where(found.ok, success, failure)  # pyright: ignore
+        y1 = unravel(y[2], y0)
+        dense_info = dict(y0=y0, y1=y1, coefficients=coefficients)
+        state = lax.stop_gradient(_Last(coefficients, length))
+        return y1, unravel(error, y0), dense_info, state, result
+
+    def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
+        return terms.vf(t0, y0, args)
+
+    def _residual(self, terms: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+        """The equations as a function of the time of the solver and of vectors."""
+        direction = time_direction(terms, t0)
+
+        def residual(t: Array, y: Array, slope: Array) -> Array:
+            if self.equations is None:
+                k = ravel(terms.vf(t, unravel(y, y0), args)).astype(y.dtype)
+                return slope - direction.astype(y.dtype) * k
+            rate = unravel(direction.astype(y.dtype) * slope, y0)
+            return ravel(self.equations(direction * t, unravel(y, y0), rate, args)).astype(y.dtype)
+
+        return residual
+
+
+Radau.__init__.__doc__ = """**Arguments:**
+
+- `root_finder`: a `diffrax.VeryChord`, whose tolerances, norm and `kappa` end Newton's method. By
+    default they are those of the step size controller, which must be adaptive then.
+- `root_find_max_steps`: the largest number of iterations. If they are not enough, a shorter step is
+    tried.
+- `equations`: of a `DAE`, which passes them.
+"""
+
+
+@final
+class CollocationInterpolation(dfx.AbstractLocalInterpolation):
+    """The collocation polynomial of a step."""
+
+    t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
+    y0: Y
+    y1: Y
+    coefficients: Float[Array, "3 n"]
+
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> PyTree[Array]:
+        del left
+        if t1 is not None:
+            ends = self.evaluate(t1), self.evaluate(t0)
+            return jtu.tree_map(lambda a, b: a - b, *ends)
+        dtype = self.coefficients.dtype
+        share = jnp.asarray((t0 - self.t0) / (self.t1 - self.t0), dtype)
+        return unravel(ravel(self.y0) + share ** jnp.arange(1, 4) @ self.coefficients, self.y0)

@@ -1,0 +1,278 @@
+"""Index reduction: from the equations `F(t, y, y') = 0` to their hidden constraints.
+
+Of the equations `F_0 = F` we select, by elimination, as many as can be solved for some of the
+slopes `y'`, and put these slopes into the others. What is left does not contain `y'` any more. It
+is a constraint, `h_0(t, y) = 0`. Its derivative `∂h_0/∂t + ∂h_0/∂y y' = 0` takes the place of the
+equations that gave it, which makes `F_1`. We go on until `F_ν` determines all slopes. `ν` is the
+index. A solution satisfies all `h_k = 0`, and `F_ν` is an ordinary differential equation on the
+manifold of these states (P. J. Rabier and W. C. Rheinboldt, *Theoretical and numerical analysis of
+differential-algebraic equations*, Handbook of Numerical Analysis VIII, 2002; C. W. Gear,
+*Differential-algebraic equation index transformations*, SIAM J. Sci. Stat. Comput. 9, 1988).
+
+Which equations and slopes are selected is the `Structure`. It is that of almost all states, so it
+is found from numbers at a single state in general position.
+"""
+
+import concurrent.futures
+import dataclasses
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._constants import ADDED_POWER
+from .._step.implicit import root
+from .._tree import without_pattern
+from .newton import algebraic_newton, divided
+
+# `F(t, y, y')` as a function of a time and two vectors.
+Implicit = Callable[[Array, Array, Array], Array]
+
+
+class Round(NamedTuple):
+    """The equations that are solved, and the slopes for which they are solved."""
+
+    equations: tuple[int, ...]
+    slopes: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Structure:
+    """How equations are reduced.
+
+    - `size`: the number of equations and of unknowns.
+    - `rounds`: for each differentiation, what is solved for what before it.
+    - `is_linear`: whether the equations are linear in the slopes.
+    - `mass`: `∂F/∂y'`, if it is known to be constant.
+    """
+
+    size: int
+    rounds: tuple[Round, ...]
+    is_linear: bool
+    mass: np.ndarray | None = None
+
+    @property
+    def index(self) -> int:
+        return len(self.rounds)
+
+    def left(self, k: int) -> tuple[int, ...]:
+        """The equations that are left in a round, and give constraints."""
+        return tuple(i for i in range(self.size) if i not in self.rounds[k].equations)
+
+    @property
+    def algebraic(self) -> tuple[int, ...]:
+        """The unknowns whose slopes no equation contains before the last differentiation."""
+        known = self.rounds[-1].slopes if self.rounds else range(self.size)
+        return tuple(j for j in range(self.size) if j not in known)
+
+    def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
+        """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
+        are not selected are zero."""
+        every = tuple(range(self.size))
+        rows, columns = (
+            np.array(x, int) for x in (self.rounds[k] if k < self.index else Round(every, every))
+        )
+        none = jnp.zeros_like(y)
+        if not rows.size:
+            return none
+        as_given = not self.rounds or not set(rows) & set(self.left(0))
+        equations = equations if as_given else self.reduced(equations, k)
+        begin = jnp.zeros(columns.size, y.dtype)
+
+        def residual(slopes: Array) -> Array:
+            return equations(t, y, none.at[columns].set(slopes))[rows]
+
+        if as_given and self.mass is not None:
+            inverse = np.linalg.inv(self.mass[np.ix_(rows, columns)])
+            slopes = -jnp.asarray(inverse, y.dtype) @ residual(begin)
+        elif self.is_linear:
+            slopes = divided(jax.jacfwd(residual)(begin), -residual(begin))
+        else:
+            slopes = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
+        return none.at[columns].set(slopes)
+
+    def freely_moved(
+        self, equations: Implicit, t: Array, y: Float[Array, " n"]
+    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
+        what the equations differentiate, such as the charges of condensers; and which unknowns are
+        the coordinates along it."""
+        rows, columns = (np.array(x, int) for x in self.rounds[0])
+        free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
+        if self.mass is not None:
+            matrix, along = self.mass, np.zeros((self.size, free.size))
+            along[free] = np.eye(free.size)
+            inner = matrix[np.ix_(rows, columns)]
+            along[columns] = -np.linalg.solve(inner, matrix[np.ix_(rows, free)])
+            return jnp.asarray(along, y.dtype), free
+        matrix = jax.jacfwd(lambda slopes: equations(t, y, slopes))(jnp.zeros_like(y))[rows]
+        others = -jnp.linalg.solve(matrix[:, columns], matrix[:, free])
+        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(jnp.eye(free.size))
+        return along.at[columns].set(others), free
+
+    def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
+        """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
+        selected; each of the others is a derivative of what is left of the one before."""
+        if k == 0:
+            return lambda t, y: []
+        left = np.array(self.left(k - 1), int)
+
+        def given(t: Array, y: Array) -> list[Array]:
+            free = self.mass is not None and not np.any(self.mass[left])
+            slopes = jnp.zeros_like(y) if free else self.slopes(equations, 0, t, y)
+            return [equations(t, y, slopes)[left]]
+
+        def further(t: Array, y: Array) -> list[Array]:
+            before = self.constraints(equations, k - 1)
+            given, rates = _along(before, t, y, self.slopes(equations, k - 1, t, y))
+            return [*given, rates[-1][np.searchsorted(self.left(k - 2), left)]]
+
+        return given if k == 1 else further
+
+    def last_gradients(self, equations: Implicit, t: Array, y: Array) -> np.ndarray:
+        constraints = self.constraints(equations, self.index)
+        return np.asarray(jax.jit(jax.jacfwd(lambda t, y: constraints(t, y)[-1], 1))(t, y))
+
+    def reduced(self, equations: Implicit, k: int) -> Implicit:
+        """`F_k`, the equations after so many differentiations."""
+        if k == 0:
+            return equations
+
+        def differentiated(t: Array, y: Array, slopes: Array) -> Array:
+            before = self.reduced(equations, k - 1)(t, y, slopes)
+            _, rates = _along(self.constraints(equations, k), t, y, slopes)
+            return before.at[np.array(self.left(k - 1), int)].set(rates[-1])
+
+        return differentiated
+
+
+def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
+    """Constraints, and their derivatives along the slopes."""
+    return jax.jvp(constraints, (t, y), (jnp.ones_like(t), slopes))
+
+
+# ---- The structure ----
+
+
+class Singular(ValueError):
+    """Equations that determine no solution, with their positions."""
+
+    def __init__(self, left: tuple[int, ...]):
+        self.left = left
+
+
+def find_structure(
+    equations: Implicit, changed: Implicit, t: Array, y: Array, mass: np.ndarray | None
+) -> Structure:
+    """The structure of concrete equations near a state, by elimination."""
+    t, y, matrix, is_linear = _general_position(equations, t, y)
+    if mass is None:  # does it depend on the time, the state or parameters?
+        other = jax.jit(jax.jacfwd(changed, 2))(2 * t + 1, 2 * y, y)
+        mass = matrix.copy() if np.array_equal(matrix, other) else None
+    structure = Structure(y.size, (), is_linear, mass)
+    selected, gradients = Round((), ()), np.zeros((0, y.size))
+    while len((selected := _extended(matrix, selected)).equations) < y.size:
+        structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
+        left = structure.left(structure.index - 1)
+        new = structure.last_gradients(equations, t, y)
+        gradients = np.concatenate([gradients, new])
+        independent = _extended(gradients, Round((), ())).equations
+        if len(independent) < len(gradients):
+            first = len(gradients) - len(left)
+            raise Singular(tuple(i for k, i in enumerate(left) if first + k not in independent))
+        matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
+    return structure
+
+
+def _extended(matrix: np.ndarray, round: Round) -> Round:
+    """The selection with as many more equations and slopes as the rank of the matrix allows, by
+    elimination with the largest pivot."""
+    matrix = np.array(matrix, float)
+    for _ in range(8):  # in units of rows and columns in which the largest elements are one
+        for axis in (0, 1):
+            largest = np.sqrt(np.max(np.abs(matrix), axis=axis, keepdims=True, initial=0))
+            matrix = matrix / np.where(largest > 0, largest, 1)
+    rows, columns = list(round.equations), list(round.slopes)
+    if rows:
+        inner = matrix[np.ix_(rows, columns)]
+        matrix = matrix - matrix[:, columns] @ np.linalg.solve(inner, matrix[rows])
+    matrix[rows], matrix[:, columns] = 0, 0
+    least = float(jnp.finfo(jnp.result_type(float)).eps) ** ADDED_POWER
+    while np.max(np.abs(matrix), initial=0) > least:
+        i, j = np.unravel_index(np.argmax(np.abs(matrix)), matrix.shape)
+        matrix = matrix - np.outer(matrix[:, j], matrix[i]) / matrix[i, j]
+        matrix[i], matrix[:, j] = 0, 0
+        rows.append(int(i))
+        columns.append(int(j))
+    return Round(tuple(rows), tuple(columns))
+
+
+def _general_position(
+    equations: Implicit, t: Array, y: Array
+) -> tuple[Array, Array, np.ndarray, bool]:
+    """A time and a state in general position, near the given ones, at which the equations and their
+    derivatives are finite; `∂F/∂y'` there; and whether it depends on `y'`."""
+    pattern = without_pattern(3 * y.size + 1, y.dtype)
+    largest = jnp.max(jnp.abs(y), initial=0)
+    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
+
+    @jax.jit
+    def near(share: float) -> tuple[Array, Array, Array, Array, Array]:
+        moved = y + share * size * (1 + pattern[: y.size] / 2)
+        later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
+        slopes = size * pattern[:-1].reshape(3, -1)[1:]
+        by_y = jax.jacfwd(equations, 1)(later, moved, slopes[0])
+        by_slope = jax.vmap(lambda slope: jax.jacfwd(equations, 2)(later, moved, slope))(slopes)
+        value = equations(later, moved, slopes[0])
+        finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
+        return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), finite
+
+    for share in (1e-1, 1e-3, 1e-5, 0.0):
+        t, moved, by_slope, is_linear, finite = near(share)
+        if finite:
+            return t, moved, np.array(by_slope), bool(is_linear)
+    raise FloatingPointError
+
+
+def structure_of(equations: Implicit, t: Array, y: Array, mass: np.ndarray | None) -> Structure:
+    """The structure of equations. What JAX traces in them is replaced by numbers in general
+    position. JAX traces in one thread, so that another one computes with numbers."""
+    slopes = jax.ShapeDtypeStruct(y.shape, y.dtype)
+    closed = jax.make_jaxpr(equations)(t, slopes, slopes)
+
+    def numbers() -> Structure:
+        here = [_stand_in(x) for x in closed.consts]
+        there = [x * 1.5 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
+
+        def of(consts: list[Array]) -> Implicit:
+            return lambda t, y, slopes: jax.core.eval_jaxpr(closed.jaxpr, consts, t, y, slopes)[0]
+
+        return find_structure(of(here), of(there), _stand_in(t), _stand_in(y), mass)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:
+        return thread.submit(numbers).result()
+
+
+def _stand_in(x: Any) -> Any:
+    if not isinstance(x, jax.core.Tracer):
+        return jnp.asarray(x)
+    if not jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.ones(x.shape, x.dtype)
+    pattern = without_pattern(max(x.size, 1), jnp.finfo(x.dtype).dtype)[: x.size]
+    return (1 + pattern / 2).reshape(x.shape).astype(x.dtype)
+
+
+def tree_key(tree: Any) -> Any:
+    """What tells two trees apart when they are traced: their structure, what is not an array, and
+    the shapes of arrays."""
+    leaves, treedef = jtu.tree_flatten(tree)
+    return treedef, tuple(
+        (x.shape, x.dtype) if eqx.is_array_like(x) and hasattr(x, "shape") else x for x in leaves
+    )

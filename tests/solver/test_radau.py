@@ -1,0 +1,245 @@
+"""Radau, on stiff equations and on differential-algebraic ones of index 1 to 3, against published
+values and exact solutions."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffrax_conserve as dfc
+
+from ..problems import largest
+
+EPS = np.finfo(np.float64).eps
+
+
+@eqx.filter_jit
+def solve(term, solver, t1, y0, args, tol, *, scale=1.0, saveat=dfx.SaveAt(t1=True)):
+    controller = dfx.PIDController(rtol=tol, atol=tol * scale)
+    return dfx.diffeqsolve(
+        term, solver, 0.0, t1, 1e-6, y0, args, stepsize_controller=controller, max_steps=10_000,
+        saveat=saveat, throw=False,
+    )  # fmt: skip
+
+
+def digits(found, known):
+    return float(-np.log10(np.max(np.abs(np.asarray(found) / known - 1))))
+
+
+# ---- Ordinary differential equations ----
+
+
+def test_a_stage_is_collocation():
+    """`y' = p(t)` with `p` of degree four is integrated exactly, and `y' = λ y` by the stability
+    function, the Padé approximation of degree (2, 3)."""
+    solver = dfc.Radau(root_finder=dfx.VeryChord(rtol=1e-13, atol=1e-13))
+    term = dfx.ODETerm(lambda t, y, a: jnp.stack([5 * t**4, a * y[1]]))
+    y0, a, h = jnp.array([0.0, 1.0]), -3.0, 0.5
+    state = solver.init(term, 0.0, h, y0, a)
+    y1, _, dense, _, _ = solver.step(term, 0.0, h, y0, a, state, False)
+    z = a * h
+    pade = (1 + 2 * z / 5 + z**2 / 20) / (1 - 3 * z / 5 + 3 * z**2 / 20 - z**3 / 60)
+    assert np.allclose(y1, [h**5, pade], rtol=1e-14)
+    path = solver.interpolation_cls(t0=0.0, t1=h, **dense)
+    c = (4 - 6**0.5) / 10
+    slope = jax.jacfwd(lambda t: path.evaluate(t))(c * h)
+    assert np.allclose(slope, term.vf(c * h, path.evaluate(c * h), a), rtol=1e-12)
+
+
+HIRES = [0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4,
+         0.1175651343283149e-2, 0.2386356198831331e-2, 0.6238968252742796e-2, 0.2849998395185769e-2,
+         0.2850001604814231e-2]  # fmt: skip
+
+
+def hires(t, y, args):
+    a, b, c, d, e, f, g, h = y
+    return jnp.stack([
+        -1.71 * a + 0.43 * b + 8.32 * c + 0.0007, 1.71 * a - 8.75 * b,
+        -10.03 * c + 0.43 * d + 0.035 * e, 8.32 * b + 1.71 * c - 1.12 * d,
+        -1.745 * e + 0.43 * f + 0.43 * g, -280 * f * h + 0.69 * d + 1.71 * e - 0.43 * f + 0.69 * g,
+        280 * f * h - 1.81 * g, -280 * f * h + 1.81 * g,
+    ])  # fmt: skip
+
+
+@pytest.mark.slow
+def test_hires():
+    """Published by the test set for initial value problem solvers (Bari)."""
+    y0 = jnp.array([1.0, 0, 0, 0, 0, 0, 0, 0.0057])
+    found = solve(dfx.ODETerm(hires), dfc.Radau(), 321.8122, y0, None, 1e-6, scale=1e-2)
+    assert digits(found.ys[-1], HIRES) > 5
+    assert found.stats["num_accepted_steps"] <= 156 * 1.3  # of scipy's `Radau`
+
+
+# ---- Index 1 ----
+
+CAPACITIES = np.arange(1, 6) * 1e-6
+MASS = np.zeros((8, 8))
+for (i, j), c in zip([(0, 1), (3, 4), (6, 7)], CAPACITIES[[0, 2, 4]], strict=True):
+    MASS[[i, j], [i, j]], MASS[[i, j], [j, i]] = -c, c
+MASS[2, 2], MASS[5, 5] = -CAPACITIES[1], -CAPACITIES[3]
+AMPLIFIED = [-0.5562145012262709e-2, 3.006522471903042, 2.849958788608128,
+             2.926422536206241, 2.704617865010554, 2.761837778393145, 4.770927631616772,
+             1.236995868091548]  # fmt: skip
+START = jnp.array([0.0, 3, 3, 6, 3, 3, 6, 0])
+
+
+def amplifier(t, y, args):
+    ub, r, alpha = 6.0, 9e3 if args is None else args, 0.99
+    one, two = (1e-6 * jnp.expm1((y[k] - y[k + 1]) / 0.026) for k in (1, 4))
+    return jnp.stack([
+        (y[0] - 0.1 * jnp.sin(200 * jnp.pi * t)) / 1e3,
+        (2 * y[1] - ub) / r + (1 - alpha) * one, y[2] / r - one, (y[3] - ub) / r + alpha * one,
+        (2 * y[4] - ub) / r + (1 - alpha) * two, y[5] / r - two, (y[6] - ub) / r + alpha * two,
+        y[7] / r,
+    ])  # fmt: skip
+
+
+AMPLIFIER = dfc.DAE(amplifier, mass=MASS)
+
+
+def test_a_transistor_amplifier():
+    """Published by the Bari test set; and what is differentiated are the charges."""
+    y0 = AMPLIFIER.consistent(START + 0.1)
+    assert np.allclose(MASS @ (y0 - START - 0.1), 0, atol=1e-21)
+    report = AMPLIFIER.report(START)
+    assert (report.index, report.freedom, len(report.algebraic)) == (1, 5, 3)
+    found = solve(AMPLIFIER.term, AMPLIFIER.wrap(dfc.Radau()), 0.2, START, None, 1e-6)
+    assert found.result == dfx.RESULTS.successful
+    assert largest(found.ys[-1] - np.array(AMPLIFIED)) < 1e-5
+
+
+@pytest.mark.slow
+def test_the_gradient_and_a_batch_of_amplifiers():
+    def end(r, tol=1e-9):
+        y0 = AMPLIFIER.consistent(START, args=r)
+        return solve(AMPLIFIER.term, AMPLIFIER.wrap(dfc.Radau()), 0.005, y0, r, tol).ys[-1, 7]
+
+    slope, h = jax.grad(end)(9e3), 0.5
+    assert np.isclose(slope, (end(9e3 + h) - end(9e3 - h)) / (2 * h), rtol=1e-5)
+    resistors = jnp.linspace(8e3, 1e4, 3)
+    batch = jax.vmap(lambda r: end(r, 1e-6))(resistors)
+    assert np.allclose(batch[1], end(resistors[1], 1e-6), rtol=1e-12)
+
+
+AKZO = [0.1150794920661702, 0.1203831471567715e-2, 0.1611562887407974, 0.3656156421249283e-3,
+        0.1708010885264404e-1, 0.4873531310307455e-2]  # fmt: skip
+
+
+def akzo(t, y, dy, args):
+    a, b, c, d, e, f = y
+    r1, r2, r3 = 18.7 * a**4 * jnp.sqrt(b), 0.58 * c * d, 0.58 / 34.4 * a * e
+    r4, r5, inflow = 0.09 * a * d**2, 0.42 * f**2 * jnp.sqrt(b), 3.3 * (0.9 / 737 - b)
+    slopes = [-2 * r1 + r2 - r3 - r4, -r1 / 2 - r4 - r5 / 2 + inflow, r1 - r2 + r3,
+              -r2 + r3 - 2 * r4, r2 - r3 + r5]  # fmt: skip
+    return dy[:5] - jnp.stack(slopes), 115.83 * a * d - f
+
+
+@pytest.mark.slow
+def test_akzo_nobel():
+    """Published by the Bari test set."""
+    dae = dfc.DAE(residual=akzo)
+    y0 = dae.consistent(jnp.array([0.444, 0.00123, 0, 0.007, 0, 0.4]))
+    found = solve(dae.term, dae.wrap(dfc.Radau()), 180.0, y0, None, 1e-6, scale=1e-2)
+    assert digits(found.ys[-1], AKZO) > 5
+
+
+# ---- Index 2 and 3 ----
+
+
+def pendulum(t, y, dy, args):
+    (q, v, force), (dq, dv, _) = y, dy
+    return dq - v, dv + force * q - jnp.array([0.0, -9.81]), jnp.sum(q**2) - 1
+
+
+def test_a_pendulum_in_cartesian_coordinates():
+    """With its angle as another solution: what is hidden holds at steps and between them."""
+    dae = dfc.DAE(residual=pendulum)
+    y0 = dae.consistent((jnp.array([1.0, 0.0]), jnp.zeros(2), jnp.array(0.3)))
+    assert np.allclose(np.concatenate([y0[0], y0[2:]], axis=None), [1, 0, 0], atol=EPS)
+    report = dae.report(y0)
+    assert (report.differentiated, report.algebraic) == ({"[2]": 3}, ("y[2]",))
+    assert str(report).startswith("Index 3, with 2 degrees of freedom.")
+    times = jnp.linspace(0.0, 2.0, 21)
+    saveat = dfx.SaveAt(ts=times)
+    found = solve(dae.term, dae.wrap(dfc.Radau()), 2.0, y0, None, 1e-9, saveat=saveat)
+    q, v, force = found.ys
+    hidden = (
+        jnp.sum(q**2, axis=1) - 1,
+        jnp.sum(q * v, axis=1),
+        jnp.sum(v**2, axis=1) - force - 9.81 * q[:, 1],
+    )
+    assert largest(hidden) < 16 * EPS * 4 * 9.81
+    angle = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -9.81 * jnp.sin(y[0])]))
+    known = solve(angle, dfx.Dopri8(), 2.0, jnp.array([np.pi / 2, 0.0]), None, 1e-12, saveat=saveat)
+    angles = known.ys[:, 0]
+    assert largest(q - jnp.stack([jnp.sin(angles), -jnp.cos(angles)], 1)) < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [dfc.Radau(), dfx.Tsit5()], ids=["Radau", "Tsit5"])
+def test_jays_problem_of_index_3(solver):
+    """Jay, *Convergence of Runge-Kutta methods for differential-algebraic systems of index 3*,
+    Appl. Numer. Math. 17, 1995, with an exact solution."""
+
+    def jay(t, y, dy, args):
+        a, b, c, d, u = y
+        return dy[:4] - jnp.stack([
+            2 * a * b * c * d, -a * b * d**2, (a * b + c * d) * u, -a * b**2 * d**2 * u
+        ]), a * b**2 - 1  # fmt: skip
+
+    dae = dfc.DAE(residual=jay)
+    y0 = dae.consistent(jnp.ones(5))
+    assert np.array_equal(y0, np.ones(5))
+    assert dae.report(y0).index == 3
+    found = solve(dae.term, dae.wrap(solver), 1.0, y0, None, 1e-9)
+    e = np.exp
+    assert largest(found.ys[-1] - np.array([e(2), e(-1), e(2), e(-1), e(1)])) < 1e-7
+
+
+# ---- What is refused ----
+
+ONE = jnp.ones(2)
+NOWHERE = dfc.DAE(residual=lambda t, y, dy, args: dy - jnp.log(-jnp.abs(y)))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "match"),
+    [
+        (lambda: dfc.DAE(lambda t, y, args: y), ValueError, r"`diffrax.ODETerm\(f\)`"),
+        (lambda: dfc.DAE(amplifier, mass=MASS, algebraic=akzo), ValueError, "is given as"),
+        (lambda: dfc.DAE(residual=amplifier), TypeError, "`residual` of a `DAE`"),
+        (lambda: dfc.DAE(amplifier, mass=MASS[:3]), ValueError, "`mass` of a `DAE`"),
+        (lambda: dfc.DAE(amplifier, mass=MASS * np.nan), ValueError, "not finite"),
+        (lambda: dfc.DAE(akzo, mass=MASS), TypeError, "`f` of a `DAE`"),
+        (lambda: AMPLIFIER.consistent(START[:2]), ValueError, "the state has 2|`f`"),
+        (lambda: AMPLIFIER.consistent(ONE, ONE), ValueError, "1 positional"),
+        (lambda: AMPLIFIER.consistent(START, fixed=(True, False)), ValueError, "`fixed`"),
+        (lambda: AMPLIFIER.consistent(jnp.ones(8, int)), TypeError, "floating-point"),
+        (lambda: NOWHERE.report(ONE), ValueError, "not finite"),
+        (
+            lambda: dfc.DAE(residual=lambda t, y, dy, args: dy[:1] - y[:1]).consistent(ONE),
+            ValueError,
+            "`residual` makes 1 equations for a state of 2 numbers",
+        ),
+        (  # the same equation twice
+            lambda: dfc.DAE(residual=lambda t, y, dy, args: (y[0], y[0])).consistent(ONE),
+            ValueError,
+            r"singular: `\[1\]`",
+        ),
+        (  # an unknown that no equation contains
+            lambda: dfc.DAE(residual=lambda t, y, dy, args: dy * jnp.array([1.0, 0])).report(ONE),
+            ValueError,
+            r"singular: `\[1\]`",
+        ),
+        (
+            lambda: jax.jit(lambda m: dfc.DAE(amplifier, mass=m).term.vf(0.0, START, None))(MASS),
+            TypeError,
+            r"a function `mass\(t, y, args\)`",
+        ),
+    ],
+)
+def test_mistakes_are_named(make, error, match):
+    with pytest.raises(error, match=match):
+        make()
