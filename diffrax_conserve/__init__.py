@@ -27,7 +27,6 @@ accurate: measure its error too.
 from . import learned as learned
 from . import systems as systems
 from ._dae.dae import DAE as DAE
-from ._dae.dae import DAEReport as DAEReport
 from ._dae.radau import Radau as Radau
 from ._diagnostics.check_invariance import check_invariance as check_invariance
 from ._diagnostics.compare import compare as compare
