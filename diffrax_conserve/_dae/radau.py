@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import check_state, option
@@ -67,19 +68,20 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         import diffrax_conserve as dfc
         import jax.numpy as jnp
 
-        def van_der_pol(t, y, args):
-            return jnp.stack([y[1], args * (1 - y[0] ** 2) * y[1] - y[0]])
+        def robertson(t, y, args):
+            slow, back, fast = 0.04 * y[0], 1e4 * y[1] * y[2], 3e7 * y[1] ** 2
+            return jnp.stack([back - slow, slow - back - fast, fast])
 
-        steps = diffrax.PIDController(rtol=1e-4, atol=1e-4)
+        steps = diffrax.PIDController(rtol=1e-4, atol=1e-9)
         sol = diffrax.diffeqsolve(
-            diffrax.ODETerm(van_der_pol), dfc.Radau(), 0.0, 2000.0, 1e-2, jnp.array([2.0, 0.0]),
-            args=1000.0, stepsize_controller=steps,
+            diffrax.ODETerm(robertson), dfc.Radau(), 0.0, 1e4, 1e-3, jnp.array([1.0, 0.0, 0.0]),
+            stepsize_controller=steps,
         )
-        print(sol.stats["num_steps"] < 500)
+        print(sol.stats["num_steps"] < 100, jnp.round(sol.ys[-1, 0], 2))
         ```
 
         ```text
-        True
+        True 0.11
         ```
 
     ??? cite "Reference"
@@ -175,8 +177,9 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
             new = y + change
             now_size = size(change, new)
             rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
-            small = now_size < 10 * jnp.finfo(start.dtype).eps
-            settled = small | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
+            # A change by the roundoff of the state cannot become smaller.
+            rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
+            settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
             return keep_done(counter, (new, now_size), now), after_step(settled, rate < 2, counter)
 
         def newton(guess: Array) -> Solved:
