@@ -17,7 +17,6 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._manifold import Constraint, slope_like
 from .._options import check_function
-from .._printing import is_traced
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo
 from .._projection.options import check_state
 from .._projection.project import project
@@ -82,10 +81,11 @@ class DAE(eqx.Module):
     solves the ordinary differential equation that follows from the last; that is good for equations
     that are not stiff.
 
-    Which equations are differentiated is found once, from numbers in general position: the guess of
-    `consistent`, or where it is not called before, random numbers in the place of states and
-    arguments that JAX traces. So call `consistent` first if zeros in `args` decide about the index.
-    For the same functions and shapes, what the last call of `consistent` has found counts.
+    Which equations are differentiated is found once for the same functions and shapes, from numbers
+    in general position: the guess of the first `consistent`, or where that is not called before,
+    random numbers in the place of states and arguments that JAX traces. So call `consistent` first
+    if zeros in `args` decide about the index. With other zeros, for which an equation that had no
+    slopes has some, a solve fails: make another `DAE` of new functions.
 
     !!! example
 
@@ -205,11 +205,11 @@ class DAE(eqx.Module):
         time, an error if no consistent state is found.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args, by_numbers=True)
-        if structure.index == 0:
-            return y
+        structure = _structure(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
-        if fixed is None and structure.index == 1:
+        if structure.index == 0:
+            found, ok = y, tree_all_finite(_Slopes(self)(t, y, args))
+        elif fixed is None and structure.index == 1:
             found = unravel(_solved_for(self, t, y, args), y)
             ok = tree_all_finite(found)
         else:
@@ -251,14 +251,14 @@ class DAE(eqx.Module):
         As `consistent`.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args, by_numbers=True)
+        structure = _structure(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
         times = [
             sum(i in structure.left(k) for k in range(structure.index))
             for i in range(len(equations))
         ]
-        off = _Constraints(self)(t, y, args)
+        off = _Constraints(self)(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
@@ -370,22 +370,19 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The structures that were found, by the functions and the shapes, and the zeros in functions and
-# `args` for which they were. Inside a solve the numbers are not known any more.
-_FOUND: dict[Any, tuple[Structure, tuple[bytes, ...]]] = {}
+# The structures that were found, by the functions and the shapes.
+_FOUND: dict[Any, Structure] = {}
 
 
-def _structure(
-    dae: DAE, t: RealScalarLike, y: Y, args: Args, *, by_numbers: bool = False
-) -> Structure:
-    """The structure of the equations; that for the zeros in these numbers if `by_numbers`."""
-    key, zeros = tree_key((dae, y, args)), _zeros((dae, args)) if by_numbers else None
-    if key not in _FOUND or (zeros is not None and _FOUND[key][1] != zeros):
+def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
+    """The structure of the equations. It is found once, because the numbers are not known any more
+    inside a solve, and programs that are compiled keep it."""
+    key = tree_key((dae, y, args))
+    if key not in _FOUND:
         t = jnp.asarray(t, jnp.result_type(float, t))
         mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
         try:
-            found = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
-            _FOUND[key] = found, zeros or ()
+            _FOUND[key] = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
         except Singular as error:
             names = dae._names(t, y, args)
             which = ", ".join(f"`{names[i]}`" for i in error.left)
@@ -400,13 +397,7 @@ def _structure(
                 "state where they are, and find it by `dae.consistent(guess, t=t0, args=args)`, "
                 "outside of functions that JAX traces."
             ) from None
-    return _FOUND[key][0]
-
-
-def _zeros(tree: Any) -> tuple[bytes, ...] | None:
-    """Where the arrays of a tree are zero; `None` if JAX traces one."""
-    arrays = [x for x in jtu.tree_leaves(tree) if eqx.is_array(x)]
-    return None if is_traced(arrays) else tuple((np.asarray(x) == 0).tobytes() for x in arrays)
+    return _FOUND[key]
 
 
 def _names(root: str, tree: Any) -> list[str]:
@@ -461,7 +452,7 @@ def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Arra
     """The state of equations of index 1, moved without what they differentiate; NaN if there is
     none."""
     structure, equations, t, y = _at(dae, t, state, args)
-    along, free = structure.freely_moved(equations, t, y)
+    along, free, _ = structure.freely_moved(equations, t, y)
 
     def moved(z: Array) -> Array:
         return (y + along @ (z - y[free])).at[free].set(z)
@@ -491,7 +482,8 @@ class _Constraints(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         structure, equations, t, vector = _at(self.dae, t, y, args)
-        return structure.constraints(equations, structure.index)(t, vector)
+        found = structure.constraints(equations, structure.index)(t, vector)
+        return found or [jnp.zeros_like(vector[:1])]  # every state will do
 
 
 @final

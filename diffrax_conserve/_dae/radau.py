@@ -201,7 +201,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         success, failure = dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
         result = dfx.RESULTS.where(found.ok, success, failure)  # pyright: ignore
         y1 = unravel(y[2], y0)
-        dense_info = dict(y0=y0, y1=y1, coefficients=coefficients)
+        dense_info = dict(y0=y0, coefficients=coefficients)
         state = lax.stop_gradient(_Last(coefficients, length))
         return y1, unravel(error, y0), dense_info, state, result
 
@@ -239,7 +239,6 @@ class CollocationInterpolation(dfx.AbstractLocalInterpolation):
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: Y
-    y1: Y
     coefficients: Float[Array, "3 n"]
 
     def evaluate(

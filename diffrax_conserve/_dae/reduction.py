@@ -25,7 +25,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER
 from .._step.implicit import root
@@ -100,10 +100,11 @@ class Structure:
 
     def freely_moved(
         self, equations: Implicit, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+    ) -> tuple[Float[Array, "n m"], np.ndarray, Bool[Array, ""]]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
-        what the equations differentiate, such as the charges of condensers; and which unknowns are
-        the coordinates along it."""
+        what the equations differentiate, such as the charges of condensers; which unknowns are the
+        coordinates along it; and whether the equations that are left contain no slopes with the
+        numbers at hand, which may be others than those with which the structure was found."""
         rows, columns = (np.array(x, int) for x in self.rounds[0])
         free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
         if self.mass is not None:
@@ -111,11 +112,16 @@ class Structure:
             along[free] = np.eye(free.size)
             inner = matrix[np.ix_(rows, columns)]
             along[columns] = -np.linalg.solve(inner, matrix[np.ix_(rows, free)])
-            return jnp.asarray(along, y.dtype), free
-        matrix = jax.jacfwd(lambda slopes: equations(t, y, slopes))(jnp.zeros_like(y))[rows]
-        others = -jnp.linalg.solve(matrix[:, columns], matrix[:, free])
+            return jnp.asarray(along, y.dtype), free, jnp.asarray(True)
+        slopes = self.slopes(equations, 0, t, y)
+        matrix = jax.jacfwd(lambda slopes: equations(t, y, slopes))(slopes)
+        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
         along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(jnp.eye(free.size))
-        return along.at[columns].set(others), free
+        along = along.at[columns].set(-jnp.linalg.solve(inner, outer))
+        left = matrix[np.array(self.left(0), int)]
+        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
+        contains = jnp.abs(left @ along) > least * (jnp.abs(left) @ jnp.abs(along))
+        return along, free, ~jnp.any(contains)
 
     def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
         """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
@@ -127,7 +133,8 @@ class Structure:
         def given(t: Array, y: Array) -> list[Array]:
             free = self.mass is not None and not np.any(self.mass[left])
             slopes = jnp.zeros_like(y) if free else self.slopes(equations, 0, t, y)
-            return [equations(t, y, slopes)[left]]
+            holds = self.freely_moved(equations, t, y)[2]
+            return [jnp.where(holds, equations(t, y, slopes)[left], jnp.nan)]
 
         def further(t: Array, y: Array) -> list[Array]:
             before = self.constraints(equations, k - 1)
@@ -249,7 +256,7 @@ def structure_of(equations: Implicit, t: Array, y: Array, mass: np.ndarray | Non
 
     def numbers() -> Structure:
         here = [_stand_in(x) for x in closed.consts]
-        there = [x * 1.5 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
+        there = [1.5 * x + 1 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
 
         def of(consts: list[Array]) -> Implicit:
             return lambda t, y, slopes: jax.core.eval_jaxpr(closed.jaxpr, consts, t, y, slopes)[0]

@@ -145,6 +145,47 @@ def test_akzo_nobel():
     assert digits(found.ys[-1], AKZO) > 5
 
 
+def test_zeros_in_args_decide_about_the_index():
+    """With those of the first `consistent` by an exact solution; with others it is no success."""
+    dae = dfc.DAE(
+        lambda t, y, a: jnp.stack([-y[0] + y[1], y[0] ** 2 - y[1]]),
+        mass=lambda t, y, a: jnp.diag(a),
+    )
+    singular, regular = jnp.array([2.0, 0.0]), jnp.array([2.0, 3.0])
+    y0 = dae.consistent(jnp.array([0.5, 0.1]), args=singular)
+    end = lambda args: solve(dae.term, dae.wrap(dfc.Radau()), 1.0, y0, args, 1e-8)  # noqa: E731
+    x = 1 / (1 + np.exp(1 / 2))  # `2 x' = x² - x`
+    assert np.allclose(end(singular).ys[-1], [x, x**2], rtol=1e-7)
+    assert end(regular).result != dfx.RESULTS.successful
+
+
+def test_what_is_fixed_stays():
+    dae = dfc.DAE(residual=lambda t, y, dy, args: (dy[0] - y[1], y[0] ** 2 + y[1] ** 2 - 1))
+    guess = jnp.array([0.6, 0.9])
+    for stays, known in ((None, [0.6, 0.8]), ([True, False], [0.6, 0.8])):
+        assert np.allclose(
+            dae.consistent(guess, fixed=stays and np.array(stays)), known, rtol=1e-15
+        )
+    found = dae.consistent(guess, fixed=np.array([False, True]))
+    assert np.allclose(found, [np.sqrt(1 - 0.9**2), 0.9], rtol=1e-14)
+
+
+def test_an_implicit_equation_that_determines_all_slopes():
+    """Not linear in the slope: `y' + y'³ = 2 - y`, with another solve in which `y'` is known."""
+    dae = dfc.DAE(residual=lambda t, y, dy, args: dy + dy**3 + y - 2)
+    y0 = dae.consistent(jnp.zeros(1))
+    assert dae.report(y0).index == 0
+    found = solve(dae.term, dae.wrap(dfc.Radau()), 1.0, y0, None, 1e-9)
+
+    def slope(t, y, args):  # Cardano's formula
+        half = (2 - y) / 2
+        root = jnp.sqrt(half**2 + 1 / 27)
+        return jnp.cbrt(half + root) + jnp.cbrt(half - root)
+
+    known = solve(dfx.ODETerm(slope), dfx.Dopri8(), 1.0, y0, None, 1e-12)
+    assert largest(found.ys[-1] - known.ys[-1]) < 1e-8
+
+
 # ---- Index 2 and 3 ----
 
 
