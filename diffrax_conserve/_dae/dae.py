@@ -296,7 +296,7 @@ class DAE(eqx.Module):
         values = jax.eval_shape(lambda: self._values(t, y, y, args))
         return [name for key, value in values.items() for name in _names(key, value)]
 
-    def equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
+    def _equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
         """The equations as a function of vectors, for states like `y`."""
         size, given = ravel(y).size, len(self._names(t, y, args))
         if given != size:
@@ -382,7 +382,7 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
         t = jnp.asarray(t, jnp.result_type(float, t))
         mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
         try:
-            _FOUND[key] = structure_of(dae.equations(t, y, args), t, ravel(y), mass)
+            _FOUND[key] = structure_of(dae._equations(t, y, args), t, ravel(y), mass)
         except Singular as error:
             names = dae._names(t, y, args)
             which = ", ".join(f"`{names[i]}`" for i in error.left)
@@ -500,4 +500,4 @@ class _Stages(eqx.Module):
 def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Implicit, Array, Array]:
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float, t))
-    return _structure(dae, t, y, args), dae.equations(t, y, args), t, ravel(y)
+    return _structure(dae, t, y, args), dae._equations(t, y, args), t, ravel(y)
