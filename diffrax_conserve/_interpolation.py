@@ -25,10 +25,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
-from ._step.implicit import certain
 from ._step.iterate import any_lane, damped
 from ._step.metric import length
-from ._tree import ravel, tree_all_finite, tree_stop_gradient, tree_sub, tree_tangents
+from ._tree import ravel, tree_stop_gradient, tree_sub
 
 
 @final
@@ -86,13 +85,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        # The derivative rule below needs the arrays over which the functions of the manifold close,
-        # such as parameters, as leaves.
-        projected, moved = (
-            eqx.filter_closure_convert(ft.partial(fn, left=left), t0)
-            for fn in (self.projected, self.moved)
-        )
-        return _evaluated(projected, moved, t0)
+        return self.projected(t0, left)
 
     def moved(self, t: RealScalarLike, left: bool) -> Y:
         """The interpolant of the wrapped solver, moved by `θ (y₁ - ŷ₁)` at the share `θ` of the
@@ -142,35 +135,11 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             # A condition that is the same for all lanes of a batch remains a branch, which is
             # skipped if no lane needs it.
             found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
-            better = better & ~ok
-            y = certain(jnp.where(better, found, y), ~better, y)
+            # Its derivative is that of the interpolant, off by its error.
+            nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
+            y = lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
         y, due = problem.state(y), self.due
         return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
-
-
-@eqx.filter_custom_jvp
-def _evaluated(projected: Callable[..., Y], moved: Callable[..., Y], t: RealScalarLike) -> Y:
-    """The value at a time. The moved interpolant is needed only for its derivative."""
-    del moved
-    return projected(t)
-
-
-@_evaluated.def_jvp
-def _evaluated_jvp(primals: Any, tangents: Any) -> Any:
-    """The slope in time is that of the projected interpolant. Where that is NaN, because gradients
-    are nearly parallel as on a circular orbit, it is the slope of the moved interpolant: the root
-    finder of an event needs a slope, but not an exact one. The derivative by anything else, such as
-    a parameter, must be exact, so it stays NaN there."""
-    (projected, moved, t), (t_projected, _, t_t) = primals, tangents
-    y = projected(t)
-    _, t_y = eqx.filter_jvp(lambda fn: fn(t), (projected,), (t_projected,))
-    t_y = tree_tangents(y, t_y)
-    if t_t is not None:
-        slope, other = (jax.jvp(fn, (t,), (jnp.ones_like(t),))[1] for fn in (projected, moved))
-        certain = tree_all_finite(slope)
-        slope = jtu.tree_map(ft.partial(jnp.where, certain), slope, other)
-        t_y = jtu.tree_map(lambda x, s: x + s * t_t.astype(s.real.dtype), t_y, slope)
-    return y, t_y
 
 
 @dataclasses.dataclass(frozen=True)

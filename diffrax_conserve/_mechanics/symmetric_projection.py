@@ -23,9 +23,9 @@ from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, start
 from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
 from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations
-from .._step.implicit import certain, root, well_conditioned
+from .._step.implicit import root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._step.linear import combined, equilibrated, gram_matrix, scaled_rows, solve, times
+from .._step.linear import combined, gram_matrix, saddle, scaled_rows, solve, times
 from .._step.metric import length
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -175,11 +175,8 @@ class SymmetricProjection(ForwardingSolver):
             residual,
             ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
             (vector, state.multiplier),
-            ft.partial(equilibrated, vector.size),
+            ft.partial(saddle, vector.size),
         )
-        # Half of the digits of its derivative are right, or it is NaN.
-        rows = scaled_rows(end.in_units(end.linearise(y1)[1]))[1]
-        y1 = certain(y1, well_conditioned(end, y1, rows, rows) | ~ok, y1)
         info = target.problem(t1, y0).report(candidate, y1, num_steps, ok=ok)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
         failed = cause_of_failure(info.ok, off, state.values, (vector, candidate, y1))

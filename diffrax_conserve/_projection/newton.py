@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 
 from .._constants import NEAREST, ROUNDOFF
 from .._step.equations import Equations
-from .._step.implicit import Along, certain, root, solution, well_conditioned
+from .._step.implicit import Along, certain, root, solution
 from .._step.iterate import Solved, damped
-from .._step.linear import equilibrated, gram_matrix, scaled_rows, solve, times
+from .._step.linear import gram_matrix, least_pivot, saddle, solve, times, unit_rows
 from .._step.metric import measured
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
@@ -44,8 +44,9 @@ class Newton(AbstractNewton):
     manifold but not nearest, and its derivative is NaN. For the close candidates of an integrator
     use [`diffrax_conserve.SimplifiedNewton`][].
 
-    The derivative follows from the implicit function theorem for both equations. It is NaN where
-    the gradients of the constraints are nearly parallel at the projected state but not everywhere.
+    The derivative follows from the implicit function theorem for both equations, without
+    constraints whose gradients are nearly parallel to others; see
+    [Derivatives near a circular orbit][derivatives-near-a-circular-orbit].
 
     !!! example
 
@@ -76,7 +77,7 @@ class Newton(AbstractNewton):
         if candidate.size + equations.magnitude.size > NEAREST:
             first = _some_point(equations, given, self.max_steps)
             y, count = given.clip(first.y), first.num_steps
-            y = certain(y, False, y)
+            y = certain(y, False)
         else:
             equations, still = tree_stop_gradient((equations, given))
             first = _some_point(equations, still, self.max_steps)
@@ -137,13 +138,11 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     equations, y = given.equations, given.clip(base)
     jacobian = equations.linearise(y)[1]
-    sizes, rows = scaled_rows(equations.in_units(jacobian))
-    gram = gram_matrix(rows, rows)
-    lengths = jnp.sqrt(jnp.diagonal(gram))
-    lengths = jnp.where(lengths > 0, lengths, 1)
-    conditions = _Conditions(given, base, sizes * lengths)
+    lengths, rows = unit_rows(equations.in_units(jacobian))
+    conditions = _Conditions(given, base, lengths)
     sizes_of = [jnp.abs(measured(x, equations.units)) for x in (base, given.candidate)]
-    fits = solve(gram, times(rows, measured(base - given.candidate, equations.units))) * lengths
+    change = measured(base - given.candidate, equations.units)
+    fits = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
     scale = equations.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 
@@ -166,9 +165,8 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
 
 
 def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:
-    """Second phase: the nearest point, and the number of steps. If there is none, or with it no
-    derivative that has digits, the derivative is NaN. The result of a failed projection is
-    discarded, and its derivative must stay finite."""
+    """Second phase: the nearest point, and the number of steps. If there is none, the derivative is
+    NaN. The result of a failed projection is discarded, and its derivative must stay finite."""
     still = tree_stop_gradient(given)
 
     def approach(now: Any) -> Any:
@@ -186,11 +184,6 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     ok = ok & still.equations.holds(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
-    found = root(
-        conditions, lambda x: Solved(x, ok, count), start, ft.partial(equilibrated, first.size)
-    )
+    found = root(conditions, lambda x: Solved(x, ok, count), start, ft.partial(saddle, first.size))
     y = conditions.state(found.y)
-    equations, there = still.equations, lax.stop_gradient(y)
-    gradients = scaled_rows(equations.in_units(equations.linearise(there)[1]))[1]
-    is_known = ok & well_conditioned(equations, there, gradients, gradients)
-    return certain(y, is_known | ~equations.holds(there), y), count
+    return certain(y, ok | ~still.equations.holds(lax.stop_gradient(y))), count

@@ -25,14 +25,14 @@ class SimplifiedNewton(AbstractNewton):
 
     Two iterations are enough for nearly every step of an integrator. If up to four constraints are
     not met after six, the plane of the corrections may miss the manifold, as on a circular orbit:
-    from then on the corrections are along the gradients at each state, and the derivative is NaN.
-    With more than four the matrix is that at the candidate, factored once, so that after a long
-    step it takes more iterations, and fails sooner. For candidates far away use
-    [`diffrax_conserve.Newton`][].
+    from then on the corrections are along the gradients at each state. With more than four the
+    matrix is that at the candidate, factored once, so that after a long step it takes more
+    iterations, and fails sooner. For candidates far away use [`diffrax_conserve.Newton`][].
 
-    The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state,
-    independent of the number of iterations. It is NaN where the gradients of up to four constraints
-    are so nearly parallel that half of its digits would be lost.
+    The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state
+    up to six iterations; after more it is that along the gradients at the candidate. A constraint
+    whose gradient is parallel to others, so nearly that half of the digits would be lost, takes no
+    part in it: see [Derivatives near a circular orbit][derivatives-near-a-circular-orbit].
 
     !!! example
 

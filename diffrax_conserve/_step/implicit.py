@@ -17,13 +17,12 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from .._constants import ROUNDOFF, WRITTEN_OUT
-from .._tree import tree_tangents, unflatten, without_pattern
+from .._tree import tree_tangents, unflatten
 from .equations import Equations, Jacobian
 from .iterate import Solved, nearby
-from .linear import combined, corrected, eliminated, gram_matrix, scaled_rows, solve, times
+from .linear import combined, corrected, gram_matrix, least_pivot, solve, times, unit_rows
 from .metric import measured
 
 
@@ -72,6 +71,15 @@ class Along(AbstractSystem):
 
     The unknowns are `y` and `λ`, and the equations `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
 
+    Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
+    derivative would divide the error of the candidate's derivative by the sine of their angle. In
+    the step of a solve it is of no use there: the candidate moves nearly along the manifold by
+    itself. So a constraint whose gradient is in the span of those before it, up to half of the
+    digits of its square, takes no part in the derivative, which then has the accuracy of the
+    wrapped solver in that direction. After more than `FROZEN_STEPS` steps the directions were those
+    at several states; the derivative is by those at the candidate all the same, which differ by
+    the size of the correction.
+
     The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
     times a tangent that is not finite would be NaN. So where nothing was found we differentiate at
     the `fallback`, by default the candidate, where the functions should be finite.
@@ -104,9 +112,10 @@ class Along(AbstractSystem):
         """Whether a state was found, and the multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, from
         which the state follows."""
         start = self._start(solved.ok)
-        sizes, rows = scaled_rows(self._along(start))
+        sizes, rows = unit_rows(self._along(start))
         change = measured(jnp.where(solved.ok, solved.y, start) - start, self.equations.units)
-        return solved.ok, solve(gram_matrix(rows, rows), times(rows, change)) / sizes
+        multiplier = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
+        return solved.ok, multiplier / sizes
 
     def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
@@ -126,58 +135,24 @@ class Along(AbstractSystem):
         t_y, t_g = (-x for x in right)
         equations, start = self.equations, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))
-        along = scaled_rows(self._along(start))[1]
-        t_y = t_y - equations.change(corrected(rows, along, t_g / heights))
-        # `more` tells whether the state is of the form above.
-        is_known = solved.more & well_conditioned(equations, y, rows, along)
-        return known_if(is_known | ~solved.ok, t_y)
-
-
-def well_conditioned(
-    equations: Equations, y: Float[Array, " n"], rows: Jacobian, along: Jacobian
-) -> Bool[Array, ""]:
-    """Whether a derivative at the state `y` that is solved for with `rows alongᵀ` has digits.
-
-    The error of the derivative is one unit of roundoff over the pivot of a constraint. So half of
-    its digits are right if no pivot is below the root of roundoff. A constraint that depends on
-    others everywhere does no harm. To tell it from one whose gradient is nearly parallel only here,
-    we look at another state, each component of which has the same sign and another size. More than
-    four constraints are not tested.
-    """
-    if len(rows) > WRITTEN_OUT:
-        return jnp.asarray(True)
-    eps = float(jnp.finfo(y.dtype).eps)
-    determined = _pivots(rows, along) >= eps**0.5
-    if len(rows) == 1:
-        return jnp.all(determined)
-    elsewhere = y * (1 + without_pattern(y.size, y.dtype) / 2)
-    beside = scaled_rows(equations.in_units(equations.linearise(elsewhere)[1]))[1]
-    return jnp.all(determined | (_pivots(beside, beside) <= ROUNDOFF * eps))
-
-
-def _pivots(rows: Any, along: Any) -> Float[Array, " m"]:
-    lengths = jnp.linalg.norm(rows, axis=1) * jnp.linalg.norm(along, axis=1)
-    pivots = eliminated(gram_matrix(rows, along), lengths, rows)[2]
-    return jnp.where(lengths > 0, jnp.abs(pivots) / jnp.where(lengths > 0, lengths, 1), 1)
-
-
-def known_if(is_known: Any, tangent: Array) -> Array:
-    """A tangent, or NaN where it is not known."""
-    return lax.stop_gradient(jnp.where(is_known, 1, jnp.nan)).astype(tangent.dtype) * tangent
+        heights, rows = unit_rows(equations.in_units(equations.linearise(y)[1]))
+        along = unit_rows(self._along(start))[1]
+        change = corrected(rows, along, t_g / heights, least=least_pivot(rows))
+        return t_y - equations.change(change)
 
 
 @jax.custom_jvp
-def certain(y: Array, is_known: Any, like: Array) -> Array:
-    """`y`, with the derivative of `like` where it is known, and NaN elsewhere."""
-    del is_known, like
+def certain(y: Array, is_known: Any) -> Array:
+    """`y`, whose derivative is NaN unless it is known."""
+    del is_known
     return y
 
 
 @certain.defjvp
 def _certain_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    y, is_known, _ = primals
-    return y, known_if(is_known, tangents[2])
+    y, is_known = primals
+    one_or_nan = lax.stop_gradient(jnp.where(is_known, 1, jnp.nan)).astype(y.dtype)
+    return y, one_or_nan * tangents[0]
 
 
 @final

@@ -46,8 +46,7 @@ class Solved(NamedTuple):
     - `y`: the unknowns. In a projection they are the state.
     - `ok`: whether they solve the equations.
     - `num_steps`: the number of steps.
-    - `more`: what else was found, without a derivative. In a projection along directions it is
-      whether the state is of the form `ŷ + S Uᵀ λ`, as its derivative needs.
+    - `more`: what else was found, without a derivative.
     """
 
     y: Any
@@ -152,7 +151,7 @@ def nearby(
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions`, or the
     gradients at the candidate; instead of the latter, those at each state after `FROZEN_STEPS`
-    steps. Then the state is not of this form: `more` tells whether it is."""
+    steps."""
     if equations.magnitude.size > WRITTEN_OUT:
         return _of_many(equations, candidate, max_steps)
     return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
@@ -193,8 +192,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         loop = written_out_loop(first_rows, advance, candidate, tests(max_steps))
     start, step, y = loop
     found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
-    frozen = (directions is not None) | (found.num_steps <= FROZEN_STEPS)
-    return found._replace(y=joined(candidate, found.y), more=frozen)
+    return found._replace(y=joined(candidate, found.y))
 
 
 @eqx.filter_jit
@@ -226,7 +224,7 @@ def _of_many(equations: Equations, candidate: Float[Array, " n"], max_steps: int
         return keep_done(counter, moved, y), counter
 
     y, ok, num_steps, _ = iterate(advance, candidate, max_steps=max_steps)
-    return Solved(y, ok & equations.holds(y), num_steps, jnp.asarray(True))
+    return Solved(y, ok & equations.holds(y), num_steps)
 
 
 # ---- For starts far away ----
@@ -254,7 +252,7 @@ def damped(
     """A state on the manifold, which is near the start if that is near the manifold.
 
     The steps are along the given `directions`, or along the gradients at each state. In the second
-    case the result depends on the path, so that its derivative is unknown, as `more` tells.
+    case the result depends on the path.
     """
 
     def advance(now: _Descent, counter: Array) -> tuple[_Descent, Array]:
@@ -279,7 +277,7 @@ def damped(
 
     begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), equations.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
-    return found._replace(y=found.y.y, more=jnp.asarray(directions is not None))
+    return found._replace(y=found.y.y)
 
 
 def damped_along(
@@ -317,7 +315,7 @@ def bounded(
         share = _share(equations, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 
-    return iterate(advance, start, max_steps=max_steps)._replace(more=jnp.asarray(True))
+    return iterate(advance, start, max_steps=max_steps)
 
 
 def _share(

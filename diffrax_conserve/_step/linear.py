@@ -7,7 +7,8 @@ contradict each other. There are three ways to solve such a system, by its size.
 - Up to four constraints are eliminated one after the other, written out in scalars. If the gradient
   of a constraint is a combination of those before it, its pivot is roundoff. We give it the
   multiplier zero: if the others hold, it holds too. Gradients that are only nearly parallel are all
-  kept, because a correction needs the direction in which they differ.
+  kept, because a correction needs the direction in which they differ. A derivative does not, and
+  would lose its digits in that direction; see `implicit`.
 - More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes.
 - A sparse matrix is factored in blocks, in the same way; see `sparse`.
 """
@@ -53,8 +54,11 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
     return rows.times(x) if isinstance(rows, SparseRows) else combined(x, rows.T)
 
 
-def corrected(rows: Any, along: Any, b: Float[Array, " m"]) -> Float[Array, " n"]:
+def corrected(
+    rows: Any, along: Any, b: Float[Array, " m"], *, least: float | None = None
+) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
+    The `least` pivot that counts is that of `eliminated`.
 
     If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
     the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
@@ -65,37 +69,37 @@ def corrected(rows: Any, along: Any, b: Float[Array, " m"]) -> Float[Array, " n"
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b), along)
-    return combined(*eliminated(gram, b, along)[:2])
+    return combined(*eliminated(gram, b, along, least=least)[:2])
 
 
-def solve(gram: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+def solve(gram: Any, b: Float[Array, " m"], *, least: float | None = None) -> Float[Array, " m"]:
     """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
     if isinstance(gram, BlockGram):
         return refined(gram.factored(), gram.times, b)
     if _is_large(gram):
         return refined(factored(gram), lambda x: combined(x, gram.T), b)
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype))[:2])
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least)[:2])
 
 
-def solve_large(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`matrix⁻¹ b` for a dense matrix of any size, by LAPACK with exchanges of rows."""
-    factors = _large_factors(matrix, jnp.ones_like(b))
-    return refined(factors, lambda x: combined(x, matrix.T), b)
+def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
+    """`matrix⁻¹ b` for equations of `n` components of the state and of multipliers,
+    `A y + B λ = b₁` and `G y = b₂`, without the multipliers whose gradients are nearly parallel;
+    see `implicit`.
 
-
-def equilibrated(n: int, matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`solve_large` in units in which nothing depends on those of the multipliers, which come after
-    `n` components of the state. The largest elements of the rows are one, without the columns of
-    the multipliers, and then those of these columns."""
-
-    def sizes(part: Array, axis: int) -> Array:
-        size = lax.stop_gradient(jnp.max(jnp.abs(part), axis=axis))
-        return jnp.where(size > 0, size, 1)
-
-    rows = sizes(matrix[:, :n], 1)
-    matrix = matrix / rows[:, None]
-    columns = sizes(matrix, 0).at[:n].set(1)
-    return solve_large(matrix / columns, b / rows) / columns
+    The state is eliminated first. The matrix `A` alone may be singular, so we add to the first
+    equations the second ones times the transpose of `G`, which does not change the solution. All
+    rows of `G` and columns of `B` are taken with the length one, so that nothing depends on the
+    units of the multipliers.
+    """
+    heights, rows = unit_rows(matrix[n:, :n])
+    widths, along = unit_rows(matrix[:n, n:].T)
+    factors = jsp.linalg.lu_factor(matrix[:n, :n] + gram_matrix(rows.T, rows.T))
+    along = jsp.linalg.lu_solve(factors, along.T).T
+    second = b[n:] / heights
+    first = jsp.linalg.lu_solve(factors, b[:n] + combined(second, rows))
+    wrong = times(rows, first) - second
+    multiplier = solve(gram_matrix(rows, along), wrong, least=least_pivot(rows))
+    return jnp.concatenate([first - combined(multiplier, along), multiplier / widths])
 
 
 class Factors(eqx.Module):
@@ -156,19 +160,19 @@ def refined(
 
 
 def eliminated(
-    gram: Float[Array, "m m"], b: Array, rows: Array
+    gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | None = None
 ) -> tuple[Array, Array, Float[Array, " m"]]:
     """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
     exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`. Also the
     pivots. Relative to the squares of the lengths of rows they are the squares of the sines of the
-    angles between the gradient of each constraint and those before it."""
-    m, least = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
+    angles between the gradient of each constraint and those before it. A pivot of at most `least`,
+    by default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
+    m, roundoff = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
     for k in range(m):
-        # If the pivot is roundoff, it counts as infinite, so that the multiplier is zero.
-        regular = jnp.abs(matrix[k][k]) > least * jnp.abs(gram[k, k])
-        pivot = jnp.where(regular, matrix[k][k], jnp.inf)
+        limit = roundoff * jnp.abs(gram[k, k]) if least is None else least
+        pivot = jnp.where(jnp.abs(matrix[k][k]) > limit, matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
             b[i], rows[i] = b[i] - below * b[k], rows[i] - beside * rows[k]
@@ -191,3 +195,20 @@ def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
     sizes = jnp.max(jnp.abs(rows), axis=1)
     sizes = jnp.where(sizes > 0, sizes, 1)
     return sizes, rows / sizes[:, None]
+
+
+def unit_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
+    """The lengths of rows, and the rows with the length one, so that their pivots are squares of
+    sines. Sparse rows are those of `scaled_rows`, because their pivots are not looked at."""
+    sizes, rows = scaled_rows(rows)
+    if isinstance(rows, SparseRows):
+        return sizes, rows
+    lengths = jnp.linalg.norm(rows, axis=1)
+    lengths = jnp.where(lengths > 0, lengths, 1)
+    return sizes * lengths, rows / lengths[:, None]
+
+
+def least_pivot(rows: Any) -> float:
+    """The least pivot of unit rows that counts in a derivative. It has an error of one unit of
+    roundoff, so that half of the digits of what is divided by it are right."""
+    return float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(rows))).eps) ** 0.5

@@ -176,10 +176,10 @@ def tangents(projection, e, direction):
     return orbit(solver, e, direction), exact
 
 
-@pytest.mark.parametrize("name", ["newton", pytest.param("simplified", marks=pytest.mark.slow)])
-def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
-    """Of the projected solve it must be close to that of the flow: the orbit differs by 1e-7, which
-    the angle between the gradients, about the eccentricity, amplifies."""
+@pytest.mark.parametrize("name", ["simplified", pytest.param("newton", marks=pytest.mark.slow)])
+def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name):
+    """The orbit differs by 1e-7. The angle between the gradients, about the eccentricity, would
+    amplify that in the derivative, up to a loss of all digits. Of `Newton` it may be NaN."""
     rng = np.random.default_rng(0)
     e = np.concatenate([[0.0], 10.0 ** rng.uniform(-14, -1, 399)])
     direction = rng.normal(size=(400, 4))
@@ -190,8 +190,9 @@ def test_a_derivative_near_parallel_gradients_is_right_or_nan(name):
     assert np.all(off[solved] < 1e-5)
     assert np.mean(solved) >= (1 if name == "newton" else 0.9)
     error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
-    assert not np.any(error[solved] > 2e-3)  # NaN is right
-    assert np.all(error[e > 1e-2] <= 1e-3)
+    assert not np.any(error > 1e-3)
+    assert np.all(error[e > 1e-3] <= 1e-4)
+    assert name == "newton" or np.all(error[e < 1e-5] <= 1e-7)
 
 
 @eqx.filter_jit
