@@ -9,6 +9,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.core
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -166,8 +167,13 @@ class DAE(eqx.Module):
 
         **Raises:**
 
-        `TypeError` if `solver` is none.
+        `TypeError` if `solver` is none, or one that is wrapped already.
         """
+        if isinstance(solver, Radau) and type(solver) is not Radau:
+            raise TypeError(
+                "`wrap` makes a projected solver of one that is not: pass "
+                "`diffrax_conserve.Radau()` itself."
+            )
         if isinstance(solver, Radau):
             solver = dataclasses.replace(solver, equations=_Stages(self))
         manifold = {"equations": Constraint(_Constraints(self))}
@@ -213,15 +219,12 @@ class DAE(eqx.Module):
             found = unravel(_solved_for(self, t, y, args), y)
             ok = tree_all_finite(found)
         else:
-            vector = ravel(y)
-            price = np.ones(vector.size)
-            price[list(structure.algebraic)] = float(jnp.finfo(vector.dtype).eps) ** 2
+            sizes = jnp.abs(lax.stop_gradient(ravel(y)))
+            units = structure.units(jnp.where(sizes == 0, 1, sizes))
             if fixed is not None:
-                price[_flags(fixed, y)] = np.inf
-            sizes = jnp.where(vector == 0, 1, jnp.abs(vector))
-            metric = unravel(jnp.asarray(price, vector.dtype) / sizes**2, y)
+                units = units.at[_flags(fixed, y)].set(0)
             manifold = {"equations": Constraint(_Constraints(self))}
-            projection = SimplifiedNewton(metric=metric, max_steps=MOST)
+            projection = SimplifiedNewton(metric=unravel(units**-2, y), max_steps=MOST)
             found, info = project(manifold, y, t=t, args=args, projection=projection)
             ok = info.ok
         return eqx.error_if(
@@ -294,16 +297,21 @@ class DAE(eqx.Module):
     def _names(self, t: RealScalarLike, y: Y, args: Args) -> list[str]:
         """The names of the equations."""
         values = jax.eval_shape(lambda: self._values(t, y, y, args))
-        return [name for key, value in values.items() for name in _names(key, value)]
+        order = ("", "f", "algebraic")  # JAX sorts the keys
+        return [name for key in order if key in values for name in _names(key, values[key])]
 
     def _equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
         """The equations as a function of vectors, for states like `y`."""
         size, given = ravel(y).size, len(self._names(t, y, args))
+        which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
+        if which == "algebraic":
+            z = ravel(y[1]).size
+            size, given = z, given - (size - z)
         if given != size:
-            which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
+            of = "`z`" if which == "algebraic" else "the state"
             raise ValueError(
-                f"`{which}` makes {given} equations for a state of {size} numbers: there must be "
-                "as many equations as unknowns."
+                f"`{which}` returns {given} numbers, but {of} has {size}: there must be as many "
+                "equations as unknowns."
             )
         matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
         if matrix is not None and len(matrix) != size:
@@ -405,32 +413,43 @@ def _names(root: str, tree: Any) -> list[str]:
     out = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         name = root + jtu.keystr(path)
-        parts = 2 if jnp.issubdtype(leaf.dtype, jnp.complexfloating) else 1
         places = (
             [""]
             if leaf.ndim == 0
             else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
         )
-        out += [name + place for place in places] * parts
+        out += [name + place for place in places] * _parts(leaf)
     return out
 
 
+def _parts(leaf: Any) -> int:
+    """How many numbers an element of a leaf is, in the order of `ravel`."""
+    return 2 if jnp.issubdtype(leaf.dtype, jnp.complexfloating) else 1
+
+
 def _flags(fixed: Any, y: Y) -> np.ndarray:
+    def spread(flag: Any, part: Any) -> Any:
+        if np.asarray(flag).dtype != bool:
+            raise ValueError(f"{flag!r} is not `True` or `False`.")
+        return jtu.tree_map(lambda x: np.broadcast_to(flag, x.shape), part)
+
     try:
-        flags = jtu.tree_map(lambda flag, x: np.broadcast_to(flag, x.shape), fixed, y)
+        flags = jtu.tree_map(spread, fixed, y)
     except ValueError as error:
         raise ValueError(
-            "`fixed` must have the structure of the state, "
-            f"{tree_shapes(y)}, with `True`, `False` or an array of them for each leaf."
+            f"`fixed` is {fixed}, but it must be `True` or `False` for the state, or for each part "
+            f"of it, or an array of them; the shapes of the state are {tree_shapes(y)}."
         ) from error
-    return np.asarray(ravel(flags), bool)
+    pairs = zip(jtu.tree_leaves(flags), jtu.tree_leaves(y), strict=True)
+    return np.concatenate([np.tile(flag.ravel(), _parts(x)) for flag, x in pairs])
 
 
 @final
 class _Return(AbstractProjection):
     """The way back to the constraints. With index 1 it keeps all that the equations differentiate,
     as the solution does: the state moves in the directions in which `F` has no slopes, and the
-    unknowns there are solved for. With a higher index the state moves to the nearest point."""
+    unknowns there are solved for. With a higher index unknowns without slopes are free, and the
+    others move to the nearest point."""
 
     dae: DAE
     metric: None = None
@@ -440,8 +459,14 @@ class _Return(AbstractProjection):
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
-        if _structure(self.dae, problem.t, state, problem.args).index != 1:
-            return SimplifiedNewton().solve(problem, candidate)
+        structure = _structure(self.dae, problem.t, state, problem.args)
+        if structure.index != 1:
+            given = problem.equations
+            sizes = given.units if isinstance(given.units, Array) else jnp.ones_like(candidate)
+            units = structure.units(sizes)
+            freely = dataclasses.replace(problem, equations=dataclasses.replace(given, units=units))
+            y, info = SimplifiedNewton().solve(freely, candidate)
+            return y, problem.report(candidate, y, info.num_steps, ok=info.ok)
         y = _solved_for(self.dae, problem.t, state, problem.args)
         # Newton's method knows the roundoff of the equations, and is NaN if it misses the root.
         return y, problem.report(candidate, y, ok=jnp.all(jnp.isfinite(y)))
@@ -491,6 +516,15 @@ class _Stages(eqx.Module):
     """The equations that [`diffrax_conserve.Radau`][] solves, of index 1 at most."""
 
     dae: DAE
+
+    def check(self, vector_fields: list[Any]) -> None:
+        """Raises if the term is that of other equations, which would be ignored."""
+        known = [x.dae for x in vector_fields if isinstance(x, _Slopes)]
+        if tree_key(self.dae) not in map(tree_key, known):
+            raise ValueError(
+                "The solver is that of a `DAE`, but the term is not: pass `dae.term` and "
+                "`dae.wrap(solver)` of the same `dae` to `diffeqsolve`."
+            )
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
         structure, equations, t, vector = _at(self.dae, t, y, args)

@@ -16,7 +16,7 @@ from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._options import check_counts
 from .._projection.options import check_state, option
-from .._solver.terms import time_direction
+from .._solver.terms import time_direction, vector_fields
 from .._step.implicit import root
 from .._step.iterate import Solved, after_step, iterate, keep_done
 from .._tree import ravel, unravel
@@ -34,9 +34,6 @@ _REAL, _PAIR = float(_EIGENVALUES[0].real), complex(_EIGENVALUES[1])
 _TO_MODES = np.linalg.inv(_VECTORS)
 # The weights of the increments in the error estimate.
 _ERROR = np.array([-13 - 7 * 6**0.5, -13 + 7 * 6**0.5, -1.0]) / 3
-
-# The equations `F(t, y, y', args) = 0`, in the time of the user, as numbers.
-Equations = Callable[[RealScalarLike, Any, Any, Args], Any]
 
 
 class _Last(NamedTuple):
@@ -92,7 +89,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
 
     root_finder: Any = option(dfx.with_stepsize_controller_tols(dfx.VeryChord)())
     root_find_max_steps: int = option(10, static=True)  # pyright: ignore
-    equations: Equations | None = eqx.field(default=None, kw_only=True)
+    equations: Any = eqx.field(default=None, kw_only=True)
 
     term_structure: ClassVar = dfx.ODETerm
 
@@ -102,6 +99,11 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
 
     def __check_init__(self):
         check_counts(root_find_max_steps=self.root_find_max_steps)
+        if not all(hasattr(self.root_finder, x) for x in ("rtol", "atol", "norm", "kappa")):
+            raise TypeError(
+                f"`root_finder` of `Radau` is {self.root_finder!r}, but it must be a "
+                "`diffrax.VeryChord`, such as `diffrax.VeryChord(rtol=1e-8, atol=1e-8)`."
+            )
 
     def order(self, terms: PyTree[dfx.AbstractTerm]) -> int:
         del terms
@@ -114,7 +116,8 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> _Last:
-        del terms, args
+        if self.equations is not None:
+            self.equations.check(vector_fields(terms))
         check_state(y0, kind=jnp.inexact)
         y = ravel(y0)
         return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
@@ -228,7 +231,7 @@ Radau.__init__.__doc__ = """**Arguments:**
     default they are those of the step size controller, which must be adaptive then.
 - `root_find_max_steps`: the largest number of iterations. If they are not enough, a shorter step is
     tried.
-- `equations`: of a `DAE`, which passes them.
+- `equations`: of a `DAE`, which passes them: `F(t, y, y', args) = 0`, in the time of the user.
 """
 
 

@@ -72,6 +72,13 @@ class Structure:
         known = self.rounds[-1].slopes if self.rounds else range(self.size)
         return tuple(j for j in range(self.size) if j not in known)
 
+    def units(self, sizes: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The units of a projection in which unknowns without slopes, such as forces, are free:
+        what they can correct moves no other unknown."""
+        free = np.isin(np.arange(self.size), self.algebraic)
+        some = jnp.where(sizes > 0, sizes, 1)
+        return jnp.where(free, some / float(jnp.finfo(sizes.dtype).eps), sizes)
+
     def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
         are not selected are zero."""

@@ -31,6 +31,10 @@ def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
     return all(isinstance(x, (dfx.ODETerm, *_COMPOSED)) for x in _nested(terms))
 
 
+def vector_fields(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:
+    return [x.vector_field for x in _nested(terms) if isinstance(x, dfx.ODETerm)]
+
+
 _COMPOSED = dfx.MultiTerm, WrapTerm, AdjointTerm
 
 

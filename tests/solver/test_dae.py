@@ -344,7 +344,7 @@ SPARE = pair(lambda t, x, z, args: x, lambda t, x, z, args: x - z)
         (lambda: pair(lambda t, y, args: y, CUBIC.algebraic), TypeError, "`f` of a"),
         (lambda: pair(CUBIC.f, 1.0), TypeError, "`algebraic` of a"),
         (lambda: CUBIC.wrap(dfx.Tsit5), TypeError, "`solver` is"),
-        (lambda: SPARE.consistent(X, jnp.array(1.0)), ValueError, "equations for a state"),
+        (lambda: SPARE.consistent(X, jnp.array(1.0)), ValueError, "numbers, but `z` has"),
         (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
         (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
     ],

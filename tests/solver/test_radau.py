@@ -168,6 +168,17 @@ def test_what_is_fixed_stays():
         )
     found = dae.consistent(guess, fixed=np.array([False, True]))
     assert np.allclose(found, [np.sqrt(1 - 0.9**2), 0.9], rtol=1e-14)
+    first = jax.jit(lambda y: dae.consistent(guess.at[1].set(y), fixed=np.array([False, True]))[0])
+    assert np.isclose(jax.grad(first)(0.9), -0.9 / np.sqrt(1 - 0.9**2), rtol=1e-12)
+
+
+def test_equations_have_the_names_of_their_functions():
+    dae = dfc.DAE(
+        lambda t, x, z, args: {"u": z, "v": -x["v"]},
+        algebraic=lambda t, x, z, args: {"flow": x["u"] - jnp.sin(t)},
+    )
+    found = dae.report({"u": jnp.array(0.0), "v": jnp.array(1.0)}, jnp.array(1.0))
+    assert found.differentiated == {"algebraic['flow']": 2}
 
 
 def test_an_implicit_equation_that_determines_all_slopes():
@@ -192,6 +203,24 @@ def test_an_implicit_equation_that_determines_all_slopes():
 def pendulum(t, y, dy, args):
     (q, v, force), (dq, dv, _) = y, dy
     return dq - v, dv + force * q - jnp.array([0.0, -9.81]), jnp.sum(q**2) - 1
+
+
+def stabilised(t, y, dy, args):
+    (q, v, force, zero), (dq, dv, *_) = y, dy
+    weight = jnp.array([0.0, -9.81])
+    return dq - v + zero * q, dv + force * q - weight, jnp.sum(q**2) - 1, jnp.sum(q * v)
+
+
+def test_a_multiplier_that_is_zero():
+    """The form of Gear, Gupta and Leimkuhler: its second multiplier has no size."""
+    dae = dfc.DAE(residual=stabilised)
+    nothing = jnp.array(0.0)
+    y0 = dae.consistent((jnp.array([1.0, 0.0]), jnp.zeros(2), nothing, nothing))
+    found = solve(dae.term, dae.wrap(dfc.Radau()), 2.0, y0, None, 1e-8)
+    given = dfc.DAE(residual=pendulum)
+    known = solve(given.term, given.wrap(dfc.Radau()), 2.0, y0[:3], None, 1e-10)
+    assert largest(found.ys[0] - known.ys[0]) < 1e-6
+    assert largest(found.ys[3]) < 1e-12
 
 
 def test_a_pendulum_in_cartesian_coordinates():
@@ -262,7 +291,7 @@ NOWHERE = dfc.DAE(residual=lambda t, y, dy, args: dy - jnp.log(-jnp.abs(y)))
         (
             lambda: dfc.DAE(residual=lambda t, y, dy, args: dy[:1] - y[:1]).consistent(ONE),
             ValueError,
-            "`residual` makes 1 equations for a state of 2 numbers",
+            "`residual` returns 1 numbers, but the state has 2",
         ),
         (  # the same equation twice
             lambda: dfc.DAE(residual=lambda t, y, dy, args: (y[0], y[0])).consistent(ONE),
@@ -274,6 +303,21 @@ NOWHERE = dfc.DAE(residual=lambda t, y, dy, args: dy - jnp.log(-jnp.abs(y)))
             ValueError,
             r"singular: `\[1\]`",
         ),
+        (
+            lambda: solve(
+                dfc.DAE(amplifier, mass=2 * MASS).term,
+                AMPLIFIER.wrap(dfc.Radau()),
+                1.0,
+                START,
+                None,
+                1e-6,
+            ),
+            ValueError,
+            "of the same `dae`",
+        ),
+        (lambda: AMPLIFIER.wrap(AMPLIFIER.wrap(dfc.Radau())), TypeError, "itself"),
+        (lambda: dfc.Radau(root_finder=3), TypeError, "VeryChord"),
+        (lambda: AMPLIFIER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
         (
             lambda: jax.jit(lambda m: dfc.DAE(amplifier, mass=m).term.vf(0.0, START, None))(MASS),
             TypeError,
