@@ -48,6 +48,7 @@ $(VENV)/.installed-%: pyproject.toml | $(BIN)/python
 
 PLOTS := $(VENV)/.installed-plots
 TEST := $(VENV)/.installed-sparse,test
+SLOW := $(VENV)/.installed-gallery,sparse,test
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 BENCH := $(VENV)/.installed-bench
@@ -83,7 +84,7 @@ lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of j
 
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
-slow: $(TEST) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
+slow: $(SLOW) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
 	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
 
