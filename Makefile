@@ -141,6 +141,7 @@ PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy m
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
 	XLA_FLAGS= $(BIN)/python benchmarks/cost/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
+	$(BIN)/python benchmarks/cost/reject.py
 	$(BIN)/python benchmarks/cost/report.py --write
 
 bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and measure them: many hours
