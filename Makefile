@@ -86,6 +86,7 @@ slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
 slow: $(SLOW) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
+	$(BIN)/python benchmarks/studies/mjx.py
 	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
 
 COVERED ?= tests
