@@ -48,6 +48,7 @@ $(VENV)/.installed-%: pyproject.toml | $(BIN)/python
 
 PLOTS := $(VENV)/.installed-plots
 TEST := $(VENV)/.installed-sparse,test
+SLOW := $(VENV)/.installed-gallery,sparse,test
 DEV := $(VENV)/.installed-dev
 DOCS := $(VENV)/.installed-docs
 BENCH := $(VENV)/.installed-bench
@@ -83,8 +84,9 @@ lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of j
 
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
-slow: $(TEST) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
+slow: $(SLOW) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
+	$(BIN)/python benchmarks/studies/mjx.py
 	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
 
 COVERED ?= tests
@@ -140,6 +142,7 @@ PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy m
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
 	XLA_FLAGS= $(BIN)/python benchmarks/cost/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
+	$(BIN)/python benchmarks/cost/reject.py
 	$(BIN)/python benchmarks/cost/report.py --write
 
 bench-learned: $(BENCH) ## train the networks of the paper and of the zoo, and measure them: many hours

@@ -2,7 +2,7 @@
 
 import functools as ft
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import NamedTuple, final
 
@@ -41,9 +41,10 @@ class Mechanism(eqx.Module):
 
     $$y' = S r(y), \qquad r_j(y) = k_j \prod_i y_i^{a_{ij}}, \qquad S_{ij} = b_{ij} - a_{ij},$$
 
-    where reaction $j$ consumes $a_{ij}$ molecules of species $i$ and produces $b_{ij}$. For all
-    rates, $w \cdot y$ is conserved for each $w$ with $w^\top S = 0$: these are the balances of
-    elements or of groups that the reactions do not split. They are computed in exact arithmetic.
+    where reaction $j$ consumes $a_{ij}$ molecules of species $i$ and produces $b_{ij}$. The rate
+    constants $k$ are numbers, or a function of `(t, y, args)`. Whatever they are, $w \cdot y$ is
+    conserved for each $w$ with $w^\top S = 0$: these are the balances of elements or of groups that
+    the reactions do not split. They are computed in exact arithmetic.
 
     !!! example
 
@@ -63,30 +64,36 @@ class Mechanism(eqx.Module):
     Source: P. Érdi and J. Tóth, "Mathematical Models of Chemical Reactions" (1989).
     """
 
-    rates: Float[Array, " reactions"]
+    rates: Float[Array, " reactions"] | Callable[..., Real[ArrayLike, " reactions"]]
     reactions: tuple[str, ...] = eqx.field(static=True)
     species: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
         reactions: Sequence[str],
-        rates: Real[ArrayLike, " reactions"] | Sequence[RealScalarLike],
+        rates: Real[ArrayLike, " reactions"]
+        | Sequence[RealScalarLike]
+        | Callable[..., Real[ArrayLike, " reactions"]],
         *,
         species: Sequence[str] | None = None,
     ):
-        self.reactions, self.rates = tuple(reactions), real(rates)
+        self.reactions = tuple(reactions)
+        self.rates = rates if callable(rates) else self._of_each_reaction(real(rates))
         found = dict.fromkeys(name for r in self.reactions for side in _sides(r) for name in side)
         self.species = tuple(found) if species is None else tuple(species)
-        if self.rates.shape != (len(self.reactions),):
-            raise ValueError(
-                f"`rates` has shape {self.rates.shape}, but there are {len(self.reactions)} "
-                "`reactions`: give each of them one rate constant."
-            )
         if set(found) - set(self.species) or len(set(self.species)) < len(self.species):
             raise ValueError(
                 f"`species` is {self.species}, but it must name each species once, among them "
                 f"those of the reactions: {', '.join(found)}."
             )
+
+    def _of_each_reaction(self, rates: Array) -> Float[Array, " reactions"]:
+        if rates.shape != (len(self.reactions),):
+            raise ValueError(
+                f"`rates` has shape {rates.shape}, but there are {len(self.reactions)} "
+                "`reactions`: give each of them one rate constant."
+            )
+        return rates
 
     @property
     def _tables(self) -> "_Tables":
@@ -119,10 +126,12 @@ class Mechanism(eqx.Module):
 
     def vector_field(self, t: RealScalarLike, y: State, args: Args) -> State:
         """The rates of change of the concentrations."""
-        del t, args
+        constants = self.rates
+        if callable(constants):
+            constants = self._of_each_reaction(jnp.asarray(constants(t, y, args)))
         # The missing factors of reactions of lower order are one.
         factors = jnp.append(y, jnp.ones((), y.dtype))[self._tables.factors]
-        rates = self.rates.astype(y.dtype) * jnp.prod(factors, axis=1)
+        rates = constants.astype(y.dtype) * jnp.prod(factors, axis=1)
         return jnp.sum(jnp.asarray(self.stoichiometry, y.dtype) * rates[None, :], axis=1)
 
     def positive_projection(self) -> ClosedForm:
@@ -149,7 +158,8 @@ Mechanism.__init__.__doc__ = """**Arguments:**
 
 - `reactions`: such as `"2 NO + O2 -> 2 NO2"`, one for each rate. An integer before a name is the
     number of molecules; a side may be empty.
-- `rates`: the rate constants $k$.
+- `rates`: the rate constants $k$, or a function of `(t, y, args)` that returns them, such as those
+    of sunlight or of a temperature.
 - `species`: the order of the species in the state. Default: the order in which the reactions name
     them.
 

@@ -91,6 +91,15 @@ def test_the_law_of_mass_action():
     np.testing.assert_array_equal(mechanism.state({"C": 2.0}), [0, 0, 2])
 
 
+def test_rates_are_a_function_of_time_state_and_arguments():
+    """Against the same reactions with these numbers as rates."""
+    reactions, y = ["2 A + B -> 3 C", "C -> "], jnp.array([0.3, 0.7, 1.1])
+    varying = Mechanism(reactions, lambda t, y, args: jnp.stack([args * t, 1 + y[1]]))
+    found = varying.vector_field(2.0, y, 5.0)
+    np.testing.assert_allclose(found, Mechanism(reactions, [10.0, 1.7]).vector_field(0.0, y, None))
+    assert list(Mechanism(["A -> 2 B"], lambda t, y, args: [t]).manifold) == ["2 A + B"]
+
+
 @pytest.mark.parametrize(
     ("make", "match"),
     [
@@ -98,6 +107,10 @@ def test_the_law_of_mass_action():
         (lambda: Mechanism(["A -> B -> C"], [1.0]), "cannot be read"),
         (lambda: Mechanism(["1.5 A -> B"], [1.0]), "cannot be read"),
         (lambda: Mechanism(["A -> B"], [1.0, 2.0]), "1 `reactions`"),
+        (
+            lambda: Mechanism(["A -> B"], lambda t, y, args: y).vector_field(0, np.ones(2), 0),
+            "1 `reactions`",
+        ),
         (lambda: Mechanism(["A -> B"], [1.0], species=["A"]), "must name each species once"),
         (lambda: Mechanism(["A -> B"], [1.0]).state({"X": 1.0}), "no species X"),
         # Its balance is A - B, which has signs.
