@@ -4,6 +4,8 @@ The table of solvers in `api/solvers.md` is the one that the tests run.
 
 A code block in a comment `<!-- check ... -->` runs with the page, and is not shown.
 
+A comment `# fmt: skip`, which is for the formatter, is not shown.
+
 Links from the docs to the objects of other packages: `` [`diffrax.diffeqsolve`][] ``.
 
 The usual way is an inventory downloaded at each build. Ours is a table, so that the build needs no
@@ -69,6 +71,7 @@ def on_config(config):
         autorefs.register_url(name, page)
 
 
+SKIP = re.compile(r"\s*<span class=\"c1\"># fmt: skip</span>")
 CHECK = re.compile(r"\n*^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)
 CONFORMANCE = ROOT / "tests" / "solver" / "conformance_table.py"
 
@@ -80,3 +83,8 @@ def on_page_markdown(markdown, **kwargs):
     table += [f"| `{solver}` | {kind} | supported |" for solver, kind in rows]
     markdown = CHECK.sub("", markdown)
     return markdown.replace("<!-- conformance table -->", "\n".join(table))
+
+
+def on_page_content(html, **kwargs):
+    del kwargs
+    return SKIP.sub("", html)

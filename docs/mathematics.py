@@ -16,7 +16,8 @@ FORMULA = re.compile(
 
 
 def mathml(match: re.Match[str]) -> str:
-    latex = unescape(match["latex"]).strip()
+    # A name of several letters is upright: slanted it reads as a product.
+    latex = re.sub(r"(?<![\\{\w])args\b", r"\\mathrm{args}", unescape(match["latex"]).strip())
     block = match["tag"] == "div"
     try:
         converted = convert(latex, display="block" if block else "inline")

@@ -81,6 +81,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
 
     $$v_{n+1/2} = v_n + \tfrac{h}{2} m^{-1} (F(q_n) + G(q_n)^\top \lambda_n), \quad
     q_{n+1} = q_n + h v_{n+1/2}, \quad g(q_{n+1}) = 0,$$
+
     $$v_{n+1} = v_{n+1/2} + \tfrac{h}{2} m^{-1} (F(q_{n+1}) + G(q_{n+1})^\top \mu_n), \quad
     \tfrac{d}{dt} g = G(q_{n+1}) v_{n+1} = 0.$$
 
