@@ -23,8 +23,9 @@ def mathml(match: re.Match[str]) -> str:
         converted = convert(latex, display="block" if block else "inline")
     except Exception as error:
         raise PluginError(f"latex2mathml cannot convert {latex!r}: {error!r}") from error
-    # latex2mathml leaves a command that it does not know as it is.
-    if "\\" in unescape(converted):
+    # latex2mathml leaves a command that it does not know as it is, and the dollars between two
+    # formulas that no empty line separates.
+    if re.search(r"[\\$]", unescape(converted)):
         raise PluginError(f"latex2mathml does not know all of {latex!r}: {converted}")
     return f'<div class="formula">{converted}</div>' if block else converted
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 ELSEWHERE = re.compile(r"(\w+:)?//", re.ASCII)
 IN_CSS = re.compile(r"(?:url\(|@import)\s*[\"']?((?:\w+:)?//[^)\"']*)", re.ASCII)
-LATEX = re.compile(r"\\[A-Za-z(\[{]|\$[^$]+\$|\$\$")
+LATEX = re.compile(r"\\[A-Za-z(\[{]|\$[^$]+\$")
 # A `<link>` of these kinds is only followed when a reader clicks.
 NOT_FETCHED = {"canonical", "prev", "next", "edit"}
 VERBATIM = {"code", "pre", "script", "style"}

@@ -90,8 +90,7 @@ def test_figures_are_shown():
     folder = ROOT / "docs" / "images"
     kept = {file.relative_to(folder).as_posix() for file in folder.rglob("*.*")}
     assert used <= kept
-    # The benchmarks write both kinds.
-    assert {name for name in kept - used if name.removesuffix(".png") + ".svg" not in used} == set()
+    assert kept - used == set()
 
 
 def commands() -> list[str]:

@@ -49,10 +49,9 @@ MAX_DRIFT = 1e-14
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes `path` with the suffixes `.png` and `.svg`."""
+    """Writes `path` with the suffix `.svg`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(LOOK):
-        figure.savefig(path.with_suffix(".png"))
         figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
 
 

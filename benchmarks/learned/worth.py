@@ -235,7 +235,6 @@ def figure(rows):
     ax.set_yticks(places, [row["field"] for row in rows])
     ax.set(xlabel="classical time over learned time, alone and in batches")
     ax.set(ylabel="force added", ylim=(-0.5, len(rows) - 0.2))
-    fig.savefig(IMAGES / "worth.png", dpi=150)
     fig.savefig(IMAGES / "worth.svg", metadata={"Date": None})
 
 
