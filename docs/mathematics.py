@@ -1,8 +1,8 @@
 """Formulas become MathML when the site is built, so that a reader needs no JavaScript for them.
 
 `pymdownx.arithmatex` marks the formulas up, in pages and in docstrings alike. A formula that
-latex2mathml cannot convert fails the build. They are set in STIX Two Math, of which the site has the
-characters that they need.
+latex2mathml cannot convert fails the build. They are set in STIX Two Math, of which the site has
+the characters that they need.
 """
 
 import importlib.resources
@@ -18,10 +18,10 @@ FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<latex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
 )
 
-# Of these a browser makes the slanted letters of the names in a formula.
-LETTERS = {*range(0x20, 0x7F), *range(0x391, 0x3D7), *range(0x1D434, 0x1D468), 0x210E}
-SLANTED_GREEK = {*range(0x1D6E2, 0x1D71C)}
-used = LETTERS | SLANTED_GREEK
+# The characters that formulas use: at first letters, and the slanted ones that a browser puts in
+# the place of those that are names.
+used = {*range(0x20, 0x7F), *range(0x391, 0x3D7), 0x210E, *range(0x1D434, 0x1D468)}
+used |= {*range(0x1D6E2, 0x1D71C)}
 
 
 def mathml(match: re.Match[str]) -> str:
