@@ -135,7 +135,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
             # A condition that is the same for all lanes of a batch remains a branch, which is
             # skipped if no lane needs it.
             found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
-            # Its derivative is that of the interpolant, off by its error.
+            # Its derivative is that of the interpolant.
             nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
             y = lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
         y, due = problem.state(y), self.due
