@@ -69,7 +69,7 @@ def corrected(
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b), along)
-    return combined(*eliminated(gram, b, along, least=least)[:2])
+    return combined(*eliminated(gram, b, along, least=least))
 
 
 def solve(gram: Any, b: Float[Array, " m"], *, least: float | None = None) -> Float[Array, " m"]:
@@ -78,7 +78,7 @@ def solve(gram: Any, b: Float[Array, " m"], *, least: float | None = None) -> Fl
         return refined(gram.factored(), gram.times, b)
     if _is_large(gram):
         return refined(factored(gram), lambda x: combined(x, gram.T), b)
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least)[:2])
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least))
 
 
 def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
@@ -130,7 +130,7 @@ def factored(gram: Any) -> Solve:
     matrix = gram * unit[:, None] * unit
     if not _is_large(gram):
         one = jnp.eye(len(gram), dtype=gram.dtype)
-        below, above, _ = eliminated(matrix, one, one)
+        below, above = eliminated(matrix, one, one)
         return Factors(below, above.T, unit)
     return _large_factors(matrix, unit)
 
@@ -161,10 +161,10 @@ def refined(
 
 def eliminated(
     gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | None = None
-) -> tuple[Array, Array, Float[Array, " m"]]:
+) -> tuple[Array, Array]:
     """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
-    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`. Also the
-    pivots. Relative to the squares of the lengths of rows they are the squares of the sines of the
+    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+    Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
     angles between the gradient of each constraint and those before it. A pivot of at most `least`,
     by default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
     m, roundoff = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
@@ -179,7 +179,7 @@ def eliminated(
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         b[k] = b[k] / pivot
-    return jnp.stack(b), jnp.stack(rows), jnp.stack([matrix[k][k] for k in range(m)])
+    return jnp.stack(b), jnp.stack(rows)
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
