@@ -315,7 +315,7 @@ class _Passing(eqx.Module):
         return self.solver.step(terms, t0, t1, y0, args, state, self.made_jump)
 
 
-@noticed_by("tests/laws/test_lanes.py", "-k", "no_gradient")
+@noticed_by("tests/solver/test_diffrax.py", "-k", "slope_at_the_projected_state")
 def keep_the_last_stage_of_the_candidate(package):
     def mutate(step):
         def mutated(self, *rest):

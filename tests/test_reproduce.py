@@ -79,15 +79,12 @@ PROJECT = tomllib.loads(Path(__file__).parents[1].joinpath("pyproject.toml").rea
 MODULE, FUNCTION = PROJECT["project"]["scripts"]["diffrax-conserve"].split(":")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "redirection"),
     [
         ("-m diffrax_conserve", "> /dev/full"),
-        pytest.param(
-            f"-c 'import sys, {MODULE} as m; sys.exit(m.{FUNCTION}())'",
-            "| head -1",
-            marks=pytest.mark.slow,
-        ),
+        (f"-c 'import sys, {MODULE} as m; sys.exit(m.{FUNCTION}())'", "| head -1"),
     ],
     ids=["module-full", "command-head"],
 )

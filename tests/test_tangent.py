@@ -94,6 +94,7 @@ def test_the_field_is_that_of_lagrange():
     assert jnp.allclose(2 * forces, -tension, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_projecting_the_free_field_is_not_enough():
     """diffrax issue 328: it succeeds, on the manifold, and is wrong however short the steps."""
     end = jax.tree.map(lambda y: y[-1], PENDULUM.reference(jnp.array([0.0, T1])))

@@ -84,6 +84,7 @@ def test_bad_lanes_of_a_batch_of_fixed_steps_change_no_other(kinds, turn):
     check(dfx.Euler(), dfx.ConstantStepSize(), y0, kinds, jnp.full(4, 1e-2))
 
 
+@pytest.mark.slow
 def test_bad_lanes_change_no_gradient():
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
 

@@ -182,7 +182,8 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     def found(y0):
         subs = dfx.SubSaveAt(ts=jnp.linspace(1.0, 0.0, 33)), dfx.SubSaveAt(steps=True)
         save = dfx.SaveAt(subs=subs, dense=True)
-        sol = dfx.diffeqsolve(TERMS, THREE, 1.0, 0.0, -0.05, y0, saveat=save)
+        options = dict(saveat=save, max_steps=32, adjoint=dfx.ForwardMode())
+        sol = dfx.diffeqsolve(TERMS, THREE, 1.0, 0.0, -0.05, y0, **options)
         (_, ts), (saved, ys) = sol.ts, sol.ys
         at_steps = jax.vmap(sol.evaluate)(ts[:20]), jax.tree.map(lambda y: y[:20], ys)
         return jax.vmap(on_it)(*saved), at_steps, sol.evaluate(0.52)[1], sol.derivative(0.52)[0]
@@ -194,6 +195,7 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     assert difference(slope, v) < 0.01
 
 
+@pytest.mark.slow
 def test_dense_output_meets_the_state_after_a_jump_of_the_force():
     save = dfx.SaveAt(t1=True, solver_state=True, dense=True)
     options = dict(saveat=save, adjoint=dfx.ForwardMode(), max_steps=1)
@@ -247,7 +249,8 @@ def test_constraints_given_several_times_change_nothing(beads, times):
     assert difference(*found) < 1e-13
 
 
-@pytest.mark.parametrize("squares", [1, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("squares", [1, 7])
 def test_one_brace_too_many_changes_nothing(squares):
     """The second diagonal of a rigid square says nothing new on the constraint, but contradicts the
     other rods a little off it. In a dense matrix, and in blocks."""

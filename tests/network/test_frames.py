@@ -30,6 +30,7 @@ def transformed(y, order=(1, 2, 0), angle=0.7, scale=1.3, shift=(0.3, -2.0)):
     return scale * (y[jnp.array(order)] @ turn.T + jnp.array(shift))
 
 
+@pytest.mark.slow
 @some_of("core, order", [("product", 0), ("concatenated", 1), ("gated", 2)], ids=CORES, period=3)
 def test_untrained_it_commutes_with_the_symmetries(core, order):
     network = framed(order, core=core)

@@ -177,6 +177,7 @@ def test_near_and_beyond_the_end_of_a_domain_all_derivatives_are_finite(manifold
             assert residual(layer, y, layer.values(0.0, start)) < 1e-14, candidate
 
 
+@pytest.mark.slow
 @some_of("steps", [None, 2], period=2)
 def test_second_derivatives_are_those_of_differences(steps):
     """Also of iterations that have not converged, as in the recipe of the paper."""

@@ -150,6 +150,7 @@ def decay(t, y, args):
     return jnp.array([-30 * y[0], 30 * y[0] - 2 * y[1], 2 * y[1]])
 
 
+@pytest.mark.slow
 def test_a_solve_stays_within_the_bounds_between_its_steps_too():
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
 

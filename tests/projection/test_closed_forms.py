@@ -121,6 +121,7 @@ def test_a_density_matrix_stays_one(name):
     assert np.min(np.linalg.eigvalsh(states)) >= -1e-16
 
 
+@pytest.mark.slow
 def test_rotations_in_a_part_of_the_state():
     """A steady rotation, 178 times around, beside another component."""
     spin = jnp.array([[0.0, -1.0, 0.5], [1.0, 0.0, 0.0], [-0.5, 0.0, 0.0]])

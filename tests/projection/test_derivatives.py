@@ -105,6 +105,7 @@ def test_a_lane_that_failed_spoils_no_other(projection):
     np.testing.assert_allclose(gradients[::3], exact[::3], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_are_linear_or_nan():
     """Linear in the tangent, also in a very small one; where the constraint has an infinite
     derivative, NaN in both modes."""
@@ -131,7 +132,7 @@ def test_derivatives_are_linear_or_nan():
 ELLIPSE = dfc.FirstIntegral(lambda t, y, args: jnp.sum((y / jnp.array([2.0, 1.0])) ** 2))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@some_of("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"], period=2)
 def test_the_nearest_point_is_one_to_roundoff_whatever_the_tolerance(dtype):
     """A tolerance is for the residuals. The units make it larger than the distances."""
 

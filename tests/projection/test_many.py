@@ -15,6 +15,7 @@ from ..thinned import some_of
 EPS = float(np.finfo(float).eps)
 
 
+@pytest.mark.slow
 def test_dependent_linear_constraints_against_their_pseudoinverse():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(130, 200))
@@ -105,15 +106,15 @@ def in_half_precision(projection, dtype):
     return solve(rotation, solver, y0, args=jnp.ones((), dtype), dt0=0.125, saveat=saveat)
 
 
+@some_of("dtype", [jnp.float16, jnp.bfloat16], ids=["float16", "bfloat16"], period=2)
 @some_of("name", WORK, ids=WORK, period=5)
-def test_it_works_in_half_precision(name):
-    for dtype in (jnp.float16, jnp.bfloat16):
-        ys = in_half_precision(WORK[name], dtype).ys
-        assert ys.dtype == dtype
-        squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
-        # The tolerance, of a scale of three times the square, and what rounding the state costs.
-        limit = (16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
-        np.testing.assert_allclose(squares, 1.25, atol=limit)
+def test_it_works_in_half_precision(name, dtype):
+    ys = in_half_precision(WORK[name], dtype).ys
+    assert ys.dtype == dtype
+    squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
+    # The tolerance, of a scale of three times the square, and what rounding the state costs.
+    limit = (16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(squares, 1.25, atol=limit)
 
 
 def test_it_is_refused_before_compilation():

@@ -23,6 +23,7 @@ BOTH = {
 START = jnp.array([0.6, -0.8]), jnp.array([0.9, 0.4, -0.3, 0.7])
 
 
+@pytest.mark.slow
 @some_of("method", [dfc.SimplifiedNewton, dfc.Newton], ids=["SimplifiedNewton", "Newton"], period=2)
 def test_a_matrix_is_the_euclidean_metric_in_other_coordinates(method: Any):
     """With `M = L Lᵀ` the nearest point is Euclidean in `z = Lᵀ v`, and its derivatives follow."""

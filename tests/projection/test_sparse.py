@@ -106,6 +106,7 @@ def _walk(name: str) -> tuple[Any, Array, Any]:
     return {"many": at(entry.fn), "z": at(ENERGY.fn)}, y, 1e-3 * jr.normal(key[1], y.shape)
 
 
+@pytest.mark.slow
 @some_of("name", ["spins", "lattice", "ring"], period=3)
 def test_derivatives_are_those_by_differences(name: str):
     """Of a projection, in both modes: blocks, coupled blocks, and an iteration."""
@@ -187,6 +188,7 @@ def test_what_is_not_sparse_is_told(monkeypatch: pytest.MonkeyPatch):
         jax.eval_shape(lambda y: dfc.project(MANIFOLDS["spins"][0], y), jnp.ones((NUM, 3)))
 
 
+@pytest.mark.slow
 def test_an_operation_of_which_no_pattern_is_known_has_a_dense_jacobian():
     inverses = dfc.Constraint(lambda t, y, args: jnp.trace(jnp.linalg.inv(y), axis1=1, axis2=2) - 2)
     y = jnp.eye(2) + 0.1 * jr.normal(jr.key(0), (NUM, 2, 2))

@@ -128,6 +128,7 @@ def along(inner, y0=TODA0, args=ONE, t1=3.0, dt0=0.05, **options):
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_energy_and_momentum_are_kept_at_every_saved_time():
     saveat = dfx.SaveAt(ts=jnp.linspace(0, 3, 50), dense=True)
     sol = along(dfx.Bosh3(), saveat=saveat, stepsize_controller=ADAPTIVE)

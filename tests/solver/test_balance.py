@@ -74,6 +74,7 @@ def test_the_balance_is_kept_to_roundoff():
     assert largest(jax.tree.map(jnp.subtract, last_of(kept), state)) < 1e-7
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     def end(y0, args):
         # Euler's method is the quickest to compile.

@@ -44,7 +44,7 @@ def test_drift_is_at_roundoff_in_single_precision(name):
     assert all(y.dtype == jnp.float32 for y in jax.tree.leaves(sol.ys))
 
 
-@pytest.mark.parametrize("bounds", [{}, {"lower": 0.0}], ids=["free", "bounds"])
+@some_of("bounds", [{}, {"lower": 0.0}], ids=["free", "bounds"], period=2)
 def test_drift_is_at_roundoff_where_a_species_almost_dies_out(bounds):
     """The prey falls from 12 to 7e-5, where its logarithm is steep. That it once moved by 12 must
     not count there."""
@@ -60,6 +60,7 @@ def test_drift_is_at_roundoff_where_a_species_almost_dies_out(bounds):
     assert largest(drift_of(sol, manifold)) <= 16 * np.finfo(float).eps
 
 
+@pytest.mark.slow
 def test_drift_does_not_grow_over_many_steps():
     system = dfc.systems.get("rigid-body")
     saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 4e3, 20))
@@ -95,6 +96,7 @@ def test_any_pytree_is_a_state(packing):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_at_and_near_a_steady_rotation():
     """About the middle axis, which is unstable: there all gradients are parallel."""
     for y0 in ([0.0, 1.5, 0.0], [1e-6, 1.5, 1e-5], [1e-3, 1.5, 0.0]):
@@ -152,6 +154,7 @@ ORDERS = {
 }
 
 
+@pytest.mark.slow
 @some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=6)
 def test_the_order_survives(solver):
     """On the Toda lattice, kept on its energy."""
@@ -186,6 +189,7 @@ def assert_same_steps(ours, theirs):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 @some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=6)
 def test_same_steps_and_dense_output(solver):
     assert_same_steps(adaptive(dfc.Unrolled(solver)), adaptive(solver))

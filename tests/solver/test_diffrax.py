@@ -110,6 +110,18 @@ def test_a_continued_solve_keeps_the_first_conserved_value():
     assert abs(float(jnp.sum(second.ys[-1] ** 2)) - 1) <= 4e-15
 
 
+def test_a_step_begins_with_the_slope_at_the_projected_state():
+    """Not at the candidate, whose last stage the solver has kept for its next step."""
+    euclidean = dfc.SimplifiedNewton(metric=1.0)
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), CIRCLE, projection=euclidean)
+
+    def end(y0, t0, t1):
+        return solve(rotation, solver, y0, t0=t0, t1=t1, dt0=1.0, max_steps=4).ys[-1]
+
+    y0 = jnp.array([1.0, 0.0])
+    np.testing.assert_allclose(end(y0, 0.0, 2.0), end(end(y0, 0.0, 1.0), 1.0, 2.0), atol=4e-16)
+
+
 def test_failure_with_adaptive_steps_is_retried_with_smaller_ones():
     """Two iterations are too few for a long step with the first-order method."""
     solver = dfc.ManifoldProjection(

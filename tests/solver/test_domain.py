@@ -137,6 +137,7 @@ def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     assert sol.result == dfx.RESULTS.max_steps_reached
 
 
+@pytest.mark.slow
 def test_derivatives():
     """Of steps of either kind, nowhere near the boundary."""
 
@@ -198,6 +199,7 @@ OTHER = dfc.systems.ConservativeLorenz(sigma=1.01)
 SOLVER = dfc.DeepONetSolver(TAYLOR)
 
 
+@pytest.mark.slow
 def test_another_parameter_is_refused(errors_raise):
     end(SOLVER, LORENZ, LORENZ.y0)
     with pytest.raises(RuntimeError, match=MESSAGE):
@@ -253,6 +255,7 @@ def test_a_shipped_flow_map_is_for_its_own_system(name):
     assert refused(name, system, states(1000, system, seed=5)) == 0
 
 
+@pytest.mark.slow
 def test_a_stiff_field_is_not_compared_where_it_changes_within_a_step():
     """States within a factor of three of those of POLLU six minutes after the emission."""
     pollu = dfc.systems.get("pollu")

@@ -65,17 +65,19 @@ def test_events(solver):
     np.testing.assert_allclose(sol.ys[-1], path(solver, float(sol.ts[-1])), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_pinn_may_start_later_and_go_back():
     later = solve(FOLLOW, PINN(0.5), t0=0.5, t1=0.1, dt0=-0.1, saveat=dfx.SaveAt(ts=[0.33, 0.1]))
     np.testing.assert_allclose(later.ys, jax.vmap(PINN)(jnp.array([0.33, 0.1])), atol=1e-10)
 
 
-@SOLVERS
+@some_of("solver", [FLOW, FOLLOW], ids=["deeponet", "pinn"], period=2)
 def test_backsolve_adjoint_explains(solver):
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=diffrax.Tsit5\(\)\)"):
         jax.grad(lambda y0: solve(solver, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0])(LORENZ.y0)
 
 
+@pytest.mark.slow
 def test_random_networks_are_on_the_manifold_or_fail(errors_raise):
     """Whatever the quality of the network."""
 
@@ -141,13 +143,17 @@ CASES = {
 
 
 # A PINN has no error estimate, and what is too long is tried again with a shorter step.
+QUICK = "another field", "no longer a number", "another start"
 ADAPTIVE = [name for name, case in CASES.items() if case[0] is not FOLLOW and name != "too long"]
 
 
 @pytest.mark.parametrize(
     ("name", "adaptive"),
     [
-        *((name, False) for name in CASES),
+        *(
+            pytest.param(name, False, marks=() if name in QUICK else pytest.mark.slow)
+            for name in CASES
+        ),
         *(pytest.param(name, True, marks=pytest.mark.slow) for name in ADAPTIVE),
     ],
 )

@@ -39,6 +39,7 @@ def test_nan_is_no_success_where_nothing_is_projected():
     assert sol.result != dfx.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_options_can_be_traced_and_batched():
     @jax.jit
     def final(rtol, max_correction):
@@ -103,6 +104,7 @@ def energies(ys):
     return jax.vmap(lambda y: rotational_energy(0.0, y, None))(ys)
 
 
+@pytest.mark.slow
 def test_subs_and_functions_of_the_state():
     ts = jnp.linspace(0, 1, 6)
     ends, steps = dfx.SubSaveAt(t0=True, t1=True), dfx.SubSaveAt(steps=2)

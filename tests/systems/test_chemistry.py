@@ -44,6 +44,7 @@ def test_references_are_those_of_the_test_set():
     np.testing.assert_allclose(found, ROBERTSON_40, rtol=1e-7)
 
 
+@pytest.mark.slow
 @some_of("system", STIFF.values(), ids=STIFF, period=2)
 def test_the_balances_are_conserved(system):
     ys = jax.vmap(system.sample)(jr.split(jr.key(0), 20)) + 1e-6

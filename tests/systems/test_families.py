@@ -12,6 +12,7 @@ from diffrax_conserve import check_invariance, systems
 from diffrax_conserve.systems import hamiltonian_vector_field, nambu_vector_field
 
 
+@pytest.mark.slow
 def test_laplace_runge_lenz_vector_is_conserved_but_redundant():
     system = systems.Kepler(mu=1.7)
     vector = dfc.FirstIntegral(system.laplace_runge_lenz)
@@ -38,6 +39,7 @@ def test_toda_traces_begin_with_henons_integral():
     np.testing.assert_allclose(traces[0], henon)
 
 
+@pytest.mark.slow
 def test_the_body_axis_turns_by_the_angular_velocity():
     system = systems.RigidBodyAttitude(inertia=(1.0, 1.0, 1.0))
     y0 = (jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.5, 0.0, 0.0]))
@@ -47,6 +49,7 @@ def test_the_body_axis_turns_by_the_angular_velocity():
     np.testing.assert_allclose(axis, expected, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_waves_conserve_at_every_state_also_with_modes_that_are_left_out():
     for points in (5, 64):
         wave = systems.KortewegDeVries(points=points)

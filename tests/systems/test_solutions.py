@@ -16,6 +16,7 @@ from ..problems import solve
 TS = np.linspace(0.0, 8.0, 5)
 
 
+@pytest.mark.slow
 def test_rigid_body_with_its_moments_in_any_order_or_some_equal():
     y0, controller = jnp.array([0.7, -1.1, 0.4]), dfx.PIDController(rtol=1e-13, atol=1e-13)
     options = dict(saveat=dfx.SaveAt(ts=TS), stepsize_controller=controller, max_steps=20_000)

@@ -56,6 +56,7 @@ def rk4(count):
     return np.linalg.matrix_power(sum(terms), count)
 
 
+@pytest.mark.slow
 def test_errors_and_substeps_are_those_of_formulas(found):
     exact = scipy.linalg.expm(STEP * np.array([[0.0, 1.0], [-1.0, 0.0]]))
     unit = np.max(np.abs(STATES @ exact.T))

@@ -92,6 +92,7 @@ def test_the_best_model_is_returned_not_the_last():
     np.testing.assert_allclose(defect(model, 40), log.criteria.min(), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_planted_nan_is_survived():
     """A vector field that is NaN where the network soon is."""
 

@@ -132,6 +132,7 @@ def test_a_flow_map_does_not_depend_on_the_units_of_components():
     np.testing.assert_allclose(losses(jnp.array([1.5e11, 1.0, 3e-20])), ones, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_recipe_goes_by_size():
     made = eqx.filter_jit(turns)  # in one program
     small = dfc.learned.second_order(made(3.0, windows=5))
