@@ -112,6 +112,7 @@ def test_no_amount_is_negative_and_every_balance_holds(kind):
     assert jnp.quantile(residual, 0.9) <= 4 * EPS
 
 
+@pytest.mark.slow
 @ONE_OF_BOTH
 def test_derivatives_are_those_of_differences(kind):
     """With a component at each bound, in a metric, and through both."""

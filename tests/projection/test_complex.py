@@ -60,14 +60,14 @@ def solve(projection, y0, vf, manifold):
 TWO = jnp.array([2.0, 5.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("complex_one", "real_one"),
     [
         (dfc.SimplifiedNewton(), dfc.SimplifiedNewton()),
-        pytest.param(
+        (
             dfc.Newton(upper=0.98, metric={"z": TWO, "x": 3.0}),
             dfc.Newton(upper=0.98, metric={"re": TWO, "im": TWO, "x": 3.0}),
-            marks=pytest.mark.slow,
         ),
     ],
     ids=["simplified", "bounded in a metric"],

@@ -145,6 +145,7 @@ def test_akzo_nobel():
     assert digits(found.ys[-1], AKZO) > 5
 
 
+@pytest.mark.slow
 def test_zeros_in_args_decide_about_the_index():
     """With those of the first `consistent` by an exact solution; with others it is no success."""
     dae = dfc.DAE(
@@ -211,6 +212,7 @@ def stabilised(t, y, dy, args):
     return dq - v + zero * q, dv + force * q - weight, jnp.sum(q**2) - 1, jnp.sum(q * v)
 
 
+@pytest.mark.slow
 def test_a_multiplier_that_is_zero():
     """The form of Gear, Gupta and Leimkuhler: its second multiplier has no size."""
     dae = dfc.DAE(residual=stabilised)
