@@ -8,6 +8,7 @@ names wherever they are. The tests that must notice run with this file as a pyte
 plants the defect before any test is imported.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -25,8 +26,10 @@ import jax
 import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from diffrax_conserve._step.equations import relative
 from diffrax_conserve._tree import ravel
 
 ROOT = Path(__file__).parents[1]
@@ -366,6 +369,117 @@ def report_unsolved_equations_as_a_success(package):
         return mutated
 
     package.function("_newton", mutate)
+
+
+# ---- What a stranger planted, who had read the package and not its tests ----
+
+
+@noticed_by("tests/test_clipped.py")
+def take_the_derivative_at_an_upper_bound_from_outside(package):
+    def mutate(clip):
+        def mutated(self, z, **options):
+            y = clip(self, z, **options)
+            return jnp.where(z == self.upper, lax.stop_gradient(y), y)
+
+        return mutated
+
+    package.method("Bounds.clip", mutate)
+
+
+@noticed_by("tests/solver/test_messages.py")
+def name_an_element_in_the_place_of_its_entry(package):
+    wrong = SimpleNamespace(**{**vars(np), "repeat": lambda _, sizes: np.arange(sum(sizes))})
+    package.in_module_of("Target", "np", wrong)
+
+
+@noticed_by("tests/solver/test_diffrax.py")
+def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
+    def mutate(projected):
+        def mutated(self, t, left):
+            moved = self.moved(t, left)
+            step = SimpleNamespace(**vars(self), moved=lambda *_: moved)
+            return projected(step, self.t1, left)
+
+        return mutated
+
+    package.method("ManifoldInterpolation.projected", mutate)
+
+
+@noticed_by("tests/solver/test_keep_linear.py")
+def forget_how_the_state_changed_in_the_last_step(package):
+    def mutate(following):
+        def mutated(self, **fields):
+            later = fields["preferred"]
+            return following(self, **fields | {"preferred": later if later is None else 0 * later})
+
+        return mutated
+
+    package.method("State.next", mutate)
+
+
+@noticed_by("tests/mechanics/test_rattle.py")
+def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
+    def mutate(linear):
+        def mutated(self, equations, t, q, args, direction, *rest):
+            return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
+
+        return mutated
+
+    package.method("RATTLE._linear", mutate)
+
+
+@noticed_by("tests/mechanics/test_symmetric_projection.py")
+def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
+    def along(equations, y, multiplier):
+        return jax.vjp(equations.residual, y)[1](multiplier)[0]
+
+    package.in_module_of("SymmetricProjection", "_along", along)
+
+
+@noticed_by("tests/solver/test_dae.py")
+def take_one_dae_for_another_of_the_same_shapes(package):
+    def key(tree):
+        leaves, treedef = jax.tree.flatten(tree)
+        return treedef, tuple(jnp.shape(x) for x in leaves if eqx.is_array_like(x))
+
+    package.function("tree_key", lambda _: key)
+
+
+@noticed_by("tests/test_check.py")
+def forget_the_sign_of_a_defect_of_an_invariant(package):
+    package.in_module_of("check_invariance", "relative", lambda *x: jnp.maximum(relative(*x), 0))
+
+
+@noticed_by("tests/test_serialisation.py")
+def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):
+    describe = package.find("_describe")
+
+    def mutate(describe_field):
+        def mutated(field, value, arrays):
+            before, left = len(arrays), []
+            with contextlib.suppress(TypeError):
+                describe(value, left)
+            found = describe_field(field, value, arrays)
+            arrays[before:] = left
+            return found
+
+        return mutated
+
+    package.function("_describe_field", mutate)
+
+
+@noticed_by("tests/systems/test_chemistry.py")
+def round_the_rates_of_reactions_to_float32(package):
+    def mutate(field):
+        def mutated(self, *arguments):
+            if not callable(self.rates):
+                rounded = self.rates.astype(jnp.float32)
+                self = eqx.tree_at(lambda m: m.rates, self, rounded)
+            return field(self, *arguments)
+
+        return mutated
+
+    package.method("Mechanism.vector_field", mutate)
 
 
 # ---- How they are planted and noticed ----
