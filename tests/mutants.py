@@ -494,9 +494,11 @@ def pytest_sessionstart():
 
 
 def unselected(name: str) -> str | None:
-    """The `-k` of a defect, if it selects no test of its file."""
+    """The `-k` of a defect, if it selects no fast test of its file."""
     file, *selection = TESTS[name]
-    tests = re.findall(r"^def (test_\w+)", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE)
+    parts = (ROOT / file).read_text(encoding="utf-8").split("\n\n\n")
+    fast = (x for x in parts if not re.search(r"^@(pytest\.mark\.slow|SLOW)$", x, re.MULTILINE))
+    tests = re.findall(r"^def (test_\w+)", "\n".join(fast), re.MULTILINE)
     word = selection[-1] if selection else "test_"
     return None if any(word in test for test in tests) else word
 
