@@ -109,7 +109,7 @@ SEED ?= 0
 soak: $(TEST) ## attack the promises COUNT times, in search of a wrong success
 	$(BIN)/python -m tests.soak --count $(COUNT) --seed $(SEED)
 
-mutants: $(TEST) ## plant defects, and see that the tests notice each
+mutants: $(TEST) ## plant defects, and see which test finds each: tests/mutants.md
 	$(BIN)/python tests/mutants.py
 
 lint: $(DEV) ## check style, formatting and spelling

@@ -1,13 +1,15 @@
 """Plants a defect in each trap of the design, one at a time, and runs tests that must notice.
 
 `make mutants`, or `python tests/mutants.py [NAME ...]`. Prints, for each defect, the first test
-that fails; exits with status 1 if any defect survives.
+that fails; exits with status 1 if any defect survives. When all are planted, `mutants.md` is
+written, with a line for each.
 
 A defect is a function that replaces functions and methods of the package, which it finds by their
 names wherever they are. The tests that must notice run with this file as a pytest plugin, which
 plants the defect before any test is imported.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -25,12 +27,16 @@ import jax
 import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from diffrax_conserve._step.equations import relative
 from diffrax_conserve._tree import ravel
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "diffrax_conserve"
+TABLE = Path(__file__).with_suffix(".md")
+TITLE = "What `make mutants` found.\n\n| defect | first test that fails |\n|---|---|\n"
 MUTANTS: dict[str, Callable[["Package"], None]] = {}
 TESTS: dict[str, tuple[str, ...]] = {}
 
@@ -368,6 +374,117 @@ def report_unsolved_equations_as_a_success(package):
     package.function("_newton", mutate)
 
 
+# ---- What a stranger planted, who had read the package and not its tests ----
+
+
+@noticed_by("tests/test_clipped.py", "-k", "from_inside")
+def take_the_derivative_at_an_upper_bound_from_outside(package):
+    def mutate(clip):
+        def mutated(self, z, **options):
+            y = clip(self, z, **options)
+            return jnp.where(z == self.upper, lax.stop_gradient(y), y)
+
+        return mutated
+
+    package.method("Bounds.clip", mutate)
+
+
+@noticed_by("tests/solver/test_failure.py", "-k", "name_the_entry")
+def name_an_element_in_the_place_of_its_entry(package):
+    wrong = SimpleNamespace(**{**vars(np), "repeat": lambda _, sizes: np.arange(sum(sizes))})
+    package.in_module_of("Target", "np", wrong)
+
+
+@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
+def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
+    def mutate(projected):
+        def mutated(self, t, left):
+            moved = self.moved(t, left)
+            step = SimpleNamespace(**vars(self), moved=lambda *_: moved)
+            return projected(step, self.t1, left)
+
+        return mutated
+
+    package.method("ManifoldInterpolation.projected", mutate)
+
+
+@noticed_by("tests/solver/test_keep_linear.py", "-k", "five_integrals")
+def forget_how_the_state_changed_in_the_last_step(package):
+    def mutate(following):
+        def mutated(self, **fields):
+            later = fields["preferred"]
+            return following(self, **fields | {"preferred": later if later is None else 0 * later})
+
+        return mutated
+
+    package.method("State.next", mutate)
+
+
+@noticed_by("tests/mechanics/test_rattle.py", "-k", "there_and_back")
+def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
+    def mutate(linear):
+        def mutated(self, equations, t, q, args, direction, *rest):
+            return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
+
+        return mutated
+
+    package.method("RATTLE._linear", mutate)
+
+
+@noticed_by("tests/mechanics/test_symmetric_projection.py", "-k", "any_metric")
+def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
+    def along(equations, y, multiplier):
+        return jax.vjp(equations.residual, y)[1](multiplier)[0]
+
+    package.in_module_of("SymmetricProjection", "_along", along)
+
+
+@noticed_by("tests/solver/test_radau.py", "-k", "names_of_their")
+def take_one_dae_for_another_of_the_same_shapes(package):
+    def key(tree):
+        leaves, treedef = jax.tree.flatten(tree)
+        return treedef, tuple(jnp.shape(x) for x in leaves if eqx.is_array_like(x))
+
+    package.function("tree_key", lambda _: key)
+
+
+@noticed_by("tests/test_check.py", "-k", "worst_state")
+def forget_the_sign_of_a_defect_of_an_invariant(package):
+    package.in_module_of("check_invariance", "relative", lambda *x: jnp.maximum(relative(*x), 0))
+
+
+@noticed_by("tests/test_serialisation.py", "-k", "given_again")
+def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):
+    describe = package.find("_describe")
+
+    def mutate(describe_field):
+        def mutated(field, value, arrays):
+            before, left = len(arrays), []
+            with contextlib.suppress(TypeError):
+                describe(value, left)
+            found = describe_field(field, value, arrays)
+            arrays[before:] = left
+            return found
+
+        return mutated
+
+    package.function("_describe_field", mutate)
+
+
+@noticed_by("tests/systems/test_chemistry.py", "-k", "rates_are")
+def round_the_rates_of_reactions_to_float32(package):
+    def mutate(field):
+        def mutated(self, *arguments):
+            if not callable(self.rates):
+                rounded = self.rates.astype(jnp.float32)
+                self = eqx.tree_at(lambda m: m.rates, self, rounded)
+            return field(self, *arguments)
+
+        return mutated
+
+    package.method("Mechanism.vector_field", mutate)
+
+
 # ---- How they are planted and noticed ----
 
 
@@ -377,17 +494,20 @@ def pytest_sessionstart():
 
 
 def unselected(name: str) -> str | None:
-    """The `-k` of a defect, if it selects no test of its file."""
+    """The `-k` of a defect, if it selects no fast test of its file."""
     file, *selection = TESTS[name]
-    tests = re.findall(r"^def (test_\w+)", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE)
+    parts = (ROOT / file).read_text(encoding="utf-8").split("\n\n\n")
+    fast = (x for x in parts if not re.search(r"^@(pytest\.mark\.slow|SLOW)$", x, re.MULTILINE))
+    tests = re.findall(r"^def (test_\w+)", "\n".join(fast), re.MULTILINE)
     word = selection[-1] if selection else "test_"
     return None if any(word in test for test in tests) else word
 
 
-def survives(name: str) -> bool:
+def found_by(name: str) -> str | None:
+    """The first fast test that fails because of a defect; `None` if the defect survives."""
     command = [sys.executable, "-m", "pytest", "-p", "tests.mutants", "-p", "no:cacheprovider"]
     run = subprocess.run(
-        [*command, "-x", "-q", "-m", "not slow", *TESTS[name]],
+        [*command, "-x", "-q", "-m", "not slow and not examples", *TESTS[name]],
         cwd=ROOT,
         env={**os.environ, "DEFECT": name, "CI": "1"},
         capture_output=True,
@@ -398,21 +518,27 @@ def survives(name: str) -> bool:
     # A defect that does not fit its place crashes every test, whatever they test.
     crashed = any(re.search(r" - (TypeError|AttributeError)", line) for line in failed)
     if run.returncode == 1 and failed and not crashed:
-        print(f"noticed   {name}: {failed[0].split(' - ')[0].removeprefix('FAILED ')}", flush=True)
-        return False
+        test = failed[0].split(" - ")[0].removeprefix("FAILED ")
+        print(f"noticed   {name}: {test}", flush=True)
+        return test
     print(
         f"SURVIVED  {name} (pytest exited with {run.returncode})\n"
         f"{run.stdout[-2000:]}{run.stderr[-2000:]}",
         flush=True,
     )
-    return True
+    return None
 
 
 def main() -> int:
-    names = sys.argv[1:] or list(MUTANTS)
-    survivors = [name for name in names if survives(name)]
-    print(f"{len(names) - len(survivors)} of {len(names)} defects noticed")
-    return 1 if survivors else 0
+    found = {name: found_by(name) for name in sys.argv[1:] or MUTANTS}
+    noticed = [test for test in found.values() if test]
+    print(f"{len(noticed)} of {len(found)} defects noticed")
+    if list(found) == list(MUTANTS):
+        rows = [
+            f"| {name} | {f'`{test}`' if test else '**none**'} |" for name, test in found.items()
+        ]
+        TABLE.write_text("\n".join([*TITLE, *rows, ""]), encoding="utf-8")
+    return 0 if len(noticed) == len(found) else 1
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Every defect that `make mutants` plants still has a place in the package, and tests to notice."""
+"""Every defect that `make mutants` plants has a place in the package, and fast tests to notice."""
 
 import pytest
 

@@ -42,11 +42,15 @@ def polar(y):
     return dfc.learned.Frame(jnp.sum(y**2)[None], jnp.stack([y, across], axis=1))
 
 
+# A file could hold it, but not the whole layer.
+OF_A_SYSTEM = dfc.FirstIntegral(dfc.systems.LotkaVolterra().first_integral)
+
+
 @pytest.mark.parametrize(
     ("given", "wrong", "match"),
     [
         (
-            dict(layer=dfc.learned.ConservativeLayer(RADIUS, steps=4)),
+            dict(layer=dfc.learned.ConservativeLayer([OF_A_SYSTEM, RADIUS], steps=4)),
             {},
             r"layer=ConservativeLayer\(manifold, steps=4\)",
         ),

@@ -48,14 +48,14 @@ def test_the_error_of_fixed_steps_leads_to_the_entry_and_a_remedy(errors_raise):
 
 
 def test_statistics_name_the_entry_that_failed():
-    """The other entry holds two integrals."""
+    """The entry before it holds two integrals."""
     kept = dfc.FirstIntegral(lambda t, y, args: y[:2])
     jump = dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y[2:], args))
     field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), rotation(t, y[2:], args)])  # noqa: E731
     y0, saveat = jnp.array([0.5, 0.25, 1.0, 0.0]), dfx.SaveAt(t1=True, solver_state=True)
-    sol = run({"first": jump, "kept": kept}, None, y0, field, throw=False, saveat=saveat)
+    sol = run({"kept": kept, "last": jump}, None, y0, field, throw=False, saveat=saveat)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
-    assert "worst            manifold['first']" in str(dfc.statistics(sol))
+    assert "worst            manifold['last']" in str(dfc.statistics(sol))
 
 
 @pytest.mark.parametrize(

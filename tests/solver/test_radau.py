@@ -174,12 +174,19 @@ def test_what_is_fixed_stays():
 
 
 def test_equations_have_the_names_of_their_functions():
-    dae = dfc.DAE(
-        lambda t, x, z, args: {"u": z, "v": -x["v"]},
-        algebraic=lambda t, x, z, args: {"flow": x["u"] - jnp.sin(t)},
-    )
-    found = dae.report({"u": jnp.array(0.0), "v": jnp.array(1.0)}, jnp.array(1.0))
-    assert found.differentiated == {"algebraic['flow']": 2}
+    """Also where those of another `DAE` of the same shapes are differentiated more often."""
+    y = {"u": jnp.array(0.0), "v": jnp.array(1.0)}, jnp.array(1.0)
+
+    def report(flow):
+        return dfc.DAE(
+            lambda t, x, z, args: {"u": z, "v": -x["v"]},
+            algebraic=lambda t, x, z, args: {"flow": flow(t, x, z)},
+        ).report(*y)
+
+    of_a_slope = report(lambda t, x, z: x["u"] - jnp.sin(t))
+    of_a_value = report(lambda t, x, z: z - jnp.cos(t))
+    assert of_a_slope.differentiated == {"algebraic['flow']": 2}
+    assert of_a_value.differentiated == {"algebraic['flow']": 1}
 
 
 def test_an_implicit_equation_that_determines_all_slopes():
