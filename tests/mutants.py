@@ -408,6 +408,14 @@ def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
     package.method("ManifoldInterpolation.projected", mutate)
 
 
+@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
+def integrate_rates_forwards_in_a_solve_backwards(package):
+    def mutate(integrated):
+        return lambda *given: jax.tree.map(lambda x: x * given[-1], integrated(*given))
+
+    package.function("integrated_rates", mutate)
+
+
 @noticed_by("tests/solver/test_keep_linear.py", "-k", "five_integrals")
 def forget_how_the_state_changed_in_the_last_step(package):
     def mutate(following):

@@ -57,14 +57,17 @@ def last_of(solution):
 
 
 def test_the_balance_is_kept_to_roundoff():
-    """Between the steps too. `E(t) - E(0)` is the work: by its quadrature, and as a third component
-    of an accurate solve."""
+    """Between the steps too, and on the way back. `E(t) - E(0)` is the work: by its quadrature, and
+    as a third component of an accurate solve."""
     kept, plain = solve(**PRECISE), solve(manifold=None, **PRECISE)
     assert worst(kept) <= 16 * EPS
     assert worst(plain) > 1e3 * EPS
     times = jnp.linspace(0.0, 2.0, 201)
     dense = eqx.tree_at(lambda s: (s.ts, s.ys), kept, (times, evaluated(kept, times)))
     assert worst(dense) <= 16 * EPS
+    back = solve(last_of(kept), t0=2.0, t1=0.0, dt0=-0.1, **PRECISE)
+    assert worst(back) <= 16 * EPS
+    assert largest(jax.tree.map(jnp.subtract, last_of(back), Y0)) < 1e-7
     both = lambda t, y, args: (pendulum(t, y[0], args), power(t, y[0], args))  # noqa: E731
     start = (Y0, jnp.array(0.0))
     exact = problems.solve(both, dfc.RK4(), start, t1=2.0, dt0=0.002, args=ARGS)
@@ -72,6 +75,14 @@ def test_the_balance_is_kept_to_roundoff():
     gained = energy(2.0, last_of(kept), ARGS) - energy(0.0, Y0, ARGS)
     assert abs(gained - work) < 1e-8
     assert largest(jax.tree.map(jnp.subtract, last_of(kept), state)) < 1e-7
+
+
+def test_the_quadrature_is_exact_up_to_degree_seven():
+    """Where the rate depends on time alone, the wrapped solver does not matter."""
+    grows = dfc.FirstIntegral(lambda t, y, args: y, rate=lambda t, y, args: 8 * t**7)
+    options = dict(manifold=grows, solver=dfx.Euler(), saveat=dfx.SaveAt(t1=True))
+    sol = solve(jnp.array(1.0), t1=1.0, field=lambda t, y, args: 0 * y, **options)
+    assert abs(sol.ys[0] - 2) < 1e-14
 
 
 @pytest.mark.slow
