@@ -15,7 +15,7 @@ from hypothesis import assume, example, given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
+from ..problems import KEPLER, OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
 from ..thinned import some_of
 
 EPS = np.finfo(np.float64).eps
@@ -171,3 +171,14 @@ def test_leaves_of_different_precision_are_refused():
     y = (np.array([1.0, 0.2]), np.array([0.5], np.float32))
     with pytest.raises(TypeError, match="needs one precision"):
         project(manifold, y, dfc.SimplifiedNewton(), jnp.array(1.3))
+
+
+def test_the_gradients_at_each_state_lead_to_a_circular_orbit():
+    """It is a curve, which the plane of those at the candidate may miss."""
+    rng = np.random.default_rng(0)
+    angle, away = rng.uniform(0, 2 * np.pi, 50), 1e-3 * rng.normal(size=(2, 50, 2))
+    q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    v = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+    options = dict(value=(-0.5, 1.0), projection=dfc.SimplifiedNewton())
+    ok = jax.jit(jax.vmap(lambda y: dfc.project(KEPLER, y, **options)[1].ok))
+    assert np.all(ok((q + away[0], v + away[1])))

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._training.data import as_data
 
 from ..learned import EAST, Scale, oscillator
 from ..thinned import some_of
@@ -65,11 +66,19 @@ def explosive(t, y, args):
     return y**2
 
 
+def test_every_pair_of_times_within_a_step_is_drawn_and_no_other():
+    ts = np.array([[0.0, 0.2, 0.5, 0.6]])  # the longest step is 0.5
+    pairs = as_data((ts, np.stack([ts, 2 * ts], axis=2)), network()).draw(1000, KEY)
+    drawn = np.unique(np.stack([pairs.y0s[:, 0], pairs.y1s[:, 0]], axis=1), axis=0)
+    assert drawn.tolist() == [[0.0, 0.2], [0.0, 0.5], [0.2, 0.5], [0.2, 0.6], [0.5, 0.6]]
+    np.testing.assert_array_equal(pairs.hs, (pairs.y1s - pairs.y0s)[:, 0])
+
+
 @pytest.mark.slow
 def test_trajectories_are_solutions():
     ts, ys = dfc.learned.trajectories(oscillator, Y0S[:4], TS[:4], rtol=1e-10)
     np.testing.assert_array_equal(ts, TS[:4])
-    np.testing.assert_allclose(ys, EXACT[:4], atol=1e-8)
+    np.testing.assert_allclose(ys, EXACT[:4], rtol=0, atol=1e-8)
     solve = lambda y0s: dfc.learned.trajectories(  # noqa: E731
         explosive, jnp.array(y0s), [0.0, 0.5, 1.0], solver=dfx.Tsit5()
     )
