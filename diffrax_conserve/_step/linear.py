@@ -162,16 +162,26 @@ def refined(
 def eliminated(
     gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | None = None
 ) -> tuple[Array, Array]:
-    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
-    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, in the order
+    of the elimination. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+
     Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
-    angles between the gradient of each constraint and those before it. A pivot of at most `least`,
-    by default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
+    angles between the gradient of each constraint and those before it. Next is always the
+    constraint with the largest of them: if a nearly parallel one came earlier, its roundoff would
+    be magnified in the pivots of those that could replace it. A pivot of at most `least`, by
+    default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
     m, roundoff = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
+    size = [jnp.abs(gram[k, k]) for k in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
     for k in range(m):
-        limit = roundoff * jnp.abs(gram[k, k]) if least is None else least
+        for i in range(k + 1, m) if k else ():  # at first all are equal
+            larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
+            for each in (*matrix[k:], matrix, size, b, rows):
+                first, second = each[k], each[i]
+                each[k] = jtu.tree_map(ft.partial(jnp.where, larger), second, first)
+                each[i] = jtu.tree_map(ft.partial(jnp.where, larger), first, second)
+        limit = roundoff * size[k] if least is None else least
         pivot = jnp.where(jnp.abs(matrix[k][k]) > limit, matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
