@@ -9,7 +9,8 @@ contradict each other. There are three ways to solve such a system, by its size.
   multiplier zero: if the others hold, it holds too. Gradients that are only nearly parallel are all
   kept, because a correction needs the direction in which they differ. A derivative does not, and
   would lose its digits in that direction; see `implicit`.
-- More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes.
+- More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a
+  derivative the share is the least pivot that counts: what is smaller has nearly no effect.
 - A sparse matrix is factored in blocks, in the same way; see `sparse`.
 """
 
@@ -68,7 +69,7 @@ def corrected(
     """
     gram = gram_matrix(rows, along)
     if _is_large(gram):
-        return combined(solve(gram, b), along)
+        return combined(solve(gram, b, least=least), along)
     return combined(*eliminated(gram, b, along, least=least))
 
 
@@ -77,7 +78,7 @@ def solve(gram: Any, b: Float[Array, " m"], *, least: float | None = None) -> Fl
     if isinstance(gram, BlockGram):
         return refined(gram.factored(), gram.times, b)
     if _is_large(gram):
-        return refined(factored(gram), lambda x: combined(x, gram.T), b)
+        return refined(factored(gram, least=least), lambda x: combined(x, gram.T), b)
     return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least))
 
 
@@ -120,7 +121,7 @@ class Factors(eqx.Module):
         return combined(combined(x, self.below.T), self.above.T).astype(b.dtype) * self.unit
 
 
-def factored(gram: Any) -> Solve:
+def factored(gram: Any, *, least: float | None = None) -> Solve:
     """`gram⁻¹ b` as a function of `b`. What is added to the diagonal of a large matrix is an error
     of the solution, which `solve` removes, and so do the steps of an iteration."""
     if isinstance(gram, BlockGram):
@@ -132,13 +133,15 @@ def factored(gram: Any) -> Solve:
         one = jnp.eye(len(gram), dtype=gram.dtype)
         below, above = eliminated(matrix, one, one)
         return Factors(below, above.T, unit)
-    return _large_factors(matrix, unit)
+    return _large_factors(matrix, unit, least)
 
 
-def _large_factors(matrix: Float[Array, "m m"], unit: Float[Array, " m"]) -> Factors:
+def _large_factors(
+    matrix: Float[Array, "m m"], unit: Float[Array, " m"], least: float | None
+) -> Factors:
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
-    added = eps**ADDED_POWER * len(matrix) ** 0.5
+    added = eps**ADDED_POWER * len(matrix) ** 0.5 if least is None else least
     lu, _, order = lax.linalg.lu(matrix.astype(dtype) + added * one)
     triangle = ft.partial(jsp.linalg.solve_triangular, lu)
     return Factors(triangle(one[order], lower=True, unit_diagonal=True), triangle(one), unit)
@@ -162,16 +165,26 @@ def refined(
 def eliminated(
     gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | None = None
 ) -> tuple[Array, Array]:
-    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination without
-    exchanges, which Gram matrices do not need. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, in the order
+    of the elimination. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+
     Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
-    angles between the gradient of each constraint and those before it. A pivot of at most `least`,
-    by default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
+    angles between the gradient of each constraint and those before it. Next is always the
+    constraint with the largest of them: if a nearly parallel one came earlier, its roundoff would
+    be magnified in the pivots of those that could replace it. A pivot of at most `least`, by
+    default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
     m, roundoff = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
+    size = [jnp.abs(gram[k, k]) for k in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
     for k in range(m):
-        limit = roundoff * jnp.abs(gram[k, k]) if least is None else least
+        for i in range(k + 1, m) if k else ():  # at first all are equal
+            larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
+            for each in (*matrix[k:], matrix, size, b, rows):
+                first, second = each[k], each[i]
+                each[k] = jtu.tree_map(ft.partial(jnp.where, larger), second, first)
+                each[i] = jtu.tree_map(ft.partial(jnp.where, larger), first, second)
+        limit = roundoff * size[k] if least is None else least
         pivot = jnp.where(jnp.abs(matrix[k][k]) > limit, matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot

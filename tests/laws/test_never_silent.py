@@ -169,21 +169,25 @@ def orbit(solver, e, direction):
 
 
 @eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, 0, 0))
-def tangents(projection, e, direction):
-    solver = dfc.ManifoldProjection(dfc.RK4(), KEPLER, projection=projection)
+@eqx.filter_vmap(in_axes=(None, None, 0, 0))
+def tangents(manifold, projection, e, direction):
+    solver = dfc.ManifoldProjection(dfc.RK4(), manifold, projection=projection)
     exact = orbit(dfc.RK4(), e, direction)  # up to 1e-5
     return orbit(solver, e, direction), exact
 
 
-@pytest.mark.parametrize("name", ["simplified", pytest.param("newton", marks=pytest.mark.slow)])
-def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name):
+@pytest.mark.parametrize(
+    ("name", "repeated"),
+    [("simplified", 1), ("simplified", 3), pytest.param("newton", 1, marks=pytest.mark.slow)],
+)
+def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name, repeated):
     """The orbit differs by 1e-7. The angle between the gradients, about the eccentricity, would
-    amplify that in the derivative, up to a loss of all digits. Of `Newton` it may be NaN."""
+    amplify that in the derivative, up to a loss of all digits. Of `Newton` it may be NaN. Integrals
+    that are repeated are more than four constraints, which are not eliminated in scalars."""
     rng = np.random.default_rng(0)
     e = np.concatenate([[0.0], 10.0 ** rng.uniform(-14, -1, 399)])
     direction = rng.normal(size=(400, 4))
-    (y, t), (exact, t_exact) = tangents(PROJECTIONS[name], e, direction)
+    (y, t), (exact, t_exact) = tangents([KEPLER] * repeated, PROJECTIONS[name], e, direction)
     found, expected = (np.concatenate(x, axis=-1) for x in (t, t_exact))
     off = np.abs(np.concatenate(y, -1) - np.concatenate(exact, -1)).max(axis=-1)
     solved = ~np.isnan(off)
@@ -192,7 +196,7 @@ def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name):
     error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
     assert not np.any(error > 1e-3)
     assert np.all(error[e > 1e-3] <= 1e-4)
-    assert name == "newton" or np.all(error[e < 1e-5] <= 1e-7)
+    assert name == "newton" or repeated > 1 or np.all(error[e < 1e-5] <= 1e-7)
 
 
 @eqx.filter_jit

@@ -134,6 +134,39 @@ def almost_circular(rng):
     return Case(kepler, (kepler_energy, kepler_momentum), y0, (2 * np.pi, 2 * np.pi / 80))
 
 
+def laplace_vector(t, y, args):
+    q, p = y
+    momentum = q[0] * p[1] - q[1] * p[0]
+    return momentum * jnp.stack([p[1], -p[0]]) - q / jnp.sqrt(jnp.sum(q**2))
+
+
+def with_laplace_vectors(rng):
+    """Four integrals, of which three are independent. The first two are nearly parallel."""
+    functions = kepler_energy, kepler_momentum, laplace_vector
+    return Case(kepler, functions, almost_circular(rng).y0, (5.0, 0.01), solver=dfc.RK4())
+
+
+def turning_tops(rng):
+    """Of a symmetric top, steadily or almost: its four integrals are dependent at such states."""
+    inertia, up = np.array([1.0, 1.0, 0.5]), np.array([0.0, 0.0, 1.0])
+    split = lambda y: (y[:3], y[3:], y[:3] / inertia)  # noqa: E731
+
+    def field(t, y, args):
+        momentum, axis, rate = split(y)
+        turned = jnp.cross(momentum, rate) + jnp.cross(axis, up)
+        return jnp.concatenate([turned, jnp.cross(axis, rate)])
+
+    def kept(t, y, args):
+        momentum, axis, rate = split(y)
+        energy = momentum @ rate / 2 + axis[2]
+        return jnp.stack([energy, momentum @ axis, axis @ axis, momentum[2]])
+
+    tilt, rate, zero = 0.7, 0.8, np.zeros(200)
+    steady = [0, rate * np.sin(tilt), 1 / rate + rate * np.cos(tilt), 0, np.sin(tilt), np.cos(tilt)]
+    beside = np.stack([10 ** rng.uniform(-16, -5, 200), *5 * [zero]], axis=1)
+    return Case(field, kept, np.array(steady) + beside, (10.0, 0.05), solver=dfc.RK4())
+
+
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
 # mass in electron masses.
 MOLECULES = {
@@ -250,6 +283,8 @@ CASES = {
     "slow bodies, 1e-5": (slow_bodies, {"tol": 1e-5}, 5, DOUBLE),
     "steady rotations": (steady_rotations, {}, 7, BOTH),
     "weak waves": (weak_waves, {}, 1, DOUBLE),
+    "with Laplace vectors": (with_laplace_vectors, {}, 2, DOUBLE),
+    "turning tops": (turning_tops, {}, 2, DOUBLE),
 }
 for _centre, _rests in ((0.0, 0.0), (1.0, 0.0), (-30.0, 0.0), (1.0, 10.0)):
     _given = {"centre": _centre, "rests": _rests}
