@@ -214,7 +214,7 @@ def test_the_result_is_a_manifold():
     solver = dfc.ManifoldProjection(dfc.RK4(), found)
     sol = dfx.diffeqsolve(dfx.ODETerm(pendulum), solver, 0, 9, 0.1, jnp.array([2.0, 0.0]))
     expected = dfx.diffeqsolve(dfx.ODETerm(pendulum), dfx.Dopri8(), 0, 9, 1e-2, jnp.array([2.0, 0]))
-    np.testing.assert_allclose(sol.ys, expected.ys, atol=1e-5)
+    np.testing.assert_allclose(sol.ys, expected.ys, rtol=0, atol=1e-5)
     energy = sol.ys[-1, 1] ** 2 / 2 - jnp.cos(sol.ys[-1, 0])
     np.testing.assert_allclose(energy, -jnp.cos(2.0), rtol=4e-15)
 

@@ -128,7 +128,7 @@ def test_untrained_it_has_the_order_of_its_polynomial(core, order):
     exact = LORENZ.reference(jnp.asarray(steps[::-1]))[::-1]
     ends = jax.jit(jax.vmap(network, (None, 0)))(LORENZ.y0, steps)
     slopes = np.diff(np.log2(np.linalg.norm(ends - exact, axis=1)))
-    np.testing.assert_allclose(slopes, -(order + 1), atol=0.15)
+    np.testing.assert_allclose(slopes, -(order + 1), rtol=0, atol=0.15)
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_a_solve_across_windows():
     ts = jnp.linspace(0, 4, 9)
     options = dict(t1=4.0, dt0=0.4, saveat=dfx.SaveAt(ts=ts))
     ys = solve(oscillator, dfc.PINNSolver(pinn), EAST, **options).ys
-    np.testing.assert_allclose(ys, jax.jit(jax.vmap(pinn))(ts), atol=1e-8)
+    np.testing.assert_allclose(ys, jax.jit(jax.vmap(pinn))(ts), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.1, 0.125, 0.25, 0.3, 1.0])

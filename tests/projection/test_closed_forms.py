@@ -43,9 +43,9 @@ def test_derivatives_agree_with_differences_where_eigenvalues_coincide_too(name)
     project, x = FORMULAS[name]
     v = matrices(jr.key(3), *x.shape, kind=complex if jnp.iscomplexobj(x) else float)
     y, tangent = jax.jvp(project, (x,), (v,))
-    np.testing.assert_allclose(project(y), y, atol=8 * EPS)  # idempotent
+    np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)  # idempotent
     difference = (project(x + 1e-6 * v) - project(x - 1e-6 * v)) / 2e-6
-    np.testing.assert_allclose(tangent, difference, atol=2e-9)
+    np.testing.assert_allclose(tangent, difference, rtol=0, atol=2e-9)
     adjoint = jax.vjp(project, x)[1](w := matrices(jr.key(4), *x.shape).astype(x.dtype))[0]
     np.testing.assert_allclose(jnp.sum(adjoint * v).real, jnp.sum(w * tangent).real, rtol=1e-12)
 
@@ -55,7 +55,7 @@ def test_the_nearest_rotation_against_scipy():
     for x, y in zip(xs, project(xs), strict=True):
         assert np.linalg.det(y) > 0
         if np.linalg.det(x) > 0:
-            np.testing.assert_allclose(y, polar(x)[0], atol=16 * EPS)
+            np.testing.assert_allclose(y, polar(x)[0], rtol=0, atol=16 * EPS)
     assert np.max(np.abs(project(-xs) + project(xs))) > 0.1  # one of each pair is improper
 
 
@@ -78,7 +78,7 @@ def test_large_matrices_have_positive_density_matrices_too():
     project, _ = FORMULAS["density"]
     y = project(1e4 * matrices(jr.key(6), 50, 8, 8, kind=complex))
     assert np.min(np.linalg.eigvalsh(y)) > 0
-    np.testing.assert_allclose(project(y), y, atol=8 * EPS)
+    np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)
 
 
 def lindblad(hamiltonian, decays):

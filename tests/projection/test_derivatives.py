@@ -79,7 +79,7 @@ def test_a_component_that_is_never_moved_may_have_any_unit(projection):
     for k in 1.0, 1e12, 1e28:
         y, units = jnp.array([1.01, 0.1, 0.01]), np.array([1, 1, k])
         got = found(y / units, k) / units * units[:, None]
-        np.testing.assert_allclose(got, exact(y), atol=1e-12)
+        np.testing.assert_allclose(got, exact(y), rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -151,7 +151,10 @@ def test_the_nearest_point_is_one_to_roundoff_whatever_the_tolerance(dtype):
     across = np.array([-gy, gx]) / np.hypot(gx, gy)
     curvature = 1 / (4 * np.hypot(gx, gy) ** 3)
     share = 1 / (1 + np.hypot(dx, dy) * curvature)
-    np.testing.assert_allclose(got, share * np.outer(across, across), atol=256 * eps)
+    off = abs(ELLIPSE.fn(0.0, found, None) - 1)  # the residual may be as large as its tolerance
+    limit = 256 * eps + 16 * off
+    np.testing.assert_allclose(got, share * np.outer(across, across), rtol=0, atol=limit)
+    assert off < 1e-7
 
 
 def test_beyond_the_largest_system_the_derivative_is_nan_in_everything():

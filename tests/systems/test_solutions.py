@@ -19,6 +19,8 @@ TS = np.linspace(0.0, 8.0, 5)
 @pytest.mark.slow
 def test_rigid_body_with_its_moments_in_any_order_or_some_equal():
     y0, controller = jnp.array([0.7, -1.1, 0.4]), dfx.PIDController(rtol=1e-13, atol=1e-13)
+    # Dense output is less accurate than steps.
+    controller = dfx.ClipStepSizeController(controller, step_ts=TS)
     options = dict(saveat=dfx.SaveAt(ts=TS), stepsize_controller=controller, max_steps=20_000)
 
     @jax.jit
@@ -30,12 +32,12 @@ def test_rigid_body_with_its_moments_in_any_order_or_some_equal():
         return system.solution(jnp.array(TS), y0), numerical.ys
 
     orders = [*itertools.permutations((0.1, 0.2, 0.3)), (0.2, 0.2, 0.3), (0.1, 0.3, 0.3)]
-    np.testing.assert_allclose(*both(jnp.array([*orders, (0.2, 0.5, 0.2)])), atol=1e-12)
+    np.testing.assert_allclose(*both(jnp.array([*orders, (0.2, 0.5, 0.2)])), rtol=0, atol=1e-12)
 
 
 def test_keplers_problem_has_the_published_position():
     q, _ = systems.Kepler().reference([20.0])
-    np.testing.assert_allclose(q[0], [-0.77007558, 0.78834482], atol=5e-9)
+    np.testing.assert_allclose(q[0], [-0.77007558, 0.78834482], rtol=0, atol=5e-9)
 
 
 @pytest.mark.parametrize("e", [0.0, 0.3, 0.9, 0.99])
@@ -44,8 +46,8 @@ def test_half_a_kepler_period_leads_from_perihelion_to_aphelion(e):
     p = np.sqrt(2 * (1 + e) / (1 - e))
     y0 = (jnp.array([1 - e, 0.0]), jnp.array([0.0, p]))
     q, p1 = system.reference([float(system.period(y0)) / 2], y0)
-    np.testing.assert_allclose(q[0], [-1 - e, 0.0], atol=1e-12)
-    np.testing.assert_allclose(p1[0], [0.0, -p * (1 - e) / (1 + e)], atol=1e-12)
+    np.testing.assert_allclose(q[0], [-1 - e, 0.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(p1[0], [0.0, -p * (1 - e) / (1 + e)], rtol=0, atol=1e-12)
 
 
 def test_an_unbound_kepler_orbit_is_refused(errors_raise):
@@ -61,4 +63,4 @@ def test_equal_vortices_on_an_equilateral_triangle_rotate_rigidly():
     # N equal vortices on a circle of radius r turn at the rate Γ (N - 1) / 4π r².
     turned = angles + TS[:, None] * 2 / (4 * np.pi)
     ys = systems.PointVortices().reference(TS, y0)
-    np.testing.assert_allclose(ys, np.stack([np.cos(turned), np.sin(turned)], axis=2), atol=1e-12)
+    np.testing.assert_allclose(ys, np.stack([np.cos(turned), np.sin(turned)], axis=2), 0, 1e-12)
