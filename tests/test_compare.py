@@ -274,6 +274,27 @@ def test_linear_invariants_that_nobody_declared_are_found():
     np.testing.assert_allclose(changes(found, still, sizes), [abs(found[0, 4]), 0], atol=1e-12)
 
 
+def test_linear_invariants_of_a_complex_state():
+    """The real and the imaginary part of a sum of amplitudes."""
+    rng = np.random.default_rng(0)
+    ys = rng.normal(size=(2, 4, 3)) + 1j * rng.normal(size=(2, 4, 3))
+    sizes = np.abs(ys).max(axis=(0, 1))
+
+    def exchange(t, y, args):
+        flow = (y - jnp.roll(y, 1)) ** 2
+        return flow - jnp.roll(flow, 1)
+
+    norm = dfc.FirstIntegral(lambda t, y, args: jnp.sum(jnp.abs(y) ** 2))
+    found = linear_invariants(exchange, jnp.arange(4.0), ys, sizes, None, {"norm": norm})
+    unit = sizes / np.linalg.norm(sizes)
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = expected[3:, 3:] = np.outer(unit, unit)
+    np.testing.assert_allclose(found.T @ found, expected, atol=1e-8)
+    still = np.repeat(ys[:, :1], 4, axis=1)
+    still[0, 2, 1] += 1j * sizes[1]
+    np.testing.assert_allclose(changes(found, still, sizes), [unit[1], 0], atol=1e-8)
+
+
 def test_an_entry_that_is_left_out_is_zero():
     entry = dfc.FirstIntegral(
         lambda t, y, args: {"a": y**2}, value={"a": 4.0}, rate=lambda t, y, args: {"a": y}
