@@ -177,6 +177,9 @@ def report_of(*errors, doubt=1e-13, lanes=1):
     ("errors", "doubt", "choice", "words"),
     [
         ((1e-3, 1e-4, 1e-5), 1e-9, "choice 2", ("0.01 times",)),
+        ((1e-3, 1.4e-4, 1e-4), 1e-9, "choice 1", ("0.14 times",)),
+        ((1e-3, 1.2e-3, 8.5e-4), 1e-9, "choice 2", ("0.85 times",)),
+        ((1e-3, 1.05e-3, 8.5e-4), 1e-9, "choice 2", ("0.85 times",)),
         ((1e-3, 2e-3, 1.5e-3), 1e-9, "nothing kept", ("Do not project", "choice 2", "1.5 times")),
         (
             (1e-3, 1.08e-3),
@@ -236,6 +239,8 @@ def test_of_equal_means_the_one_without_risk_is_taken():
     report = dataclasses.replace(report, rows=rows[:2])
     assert report.choice == "nothing kept"
     assert "1.9 times at worst; in 1 of them it is larger" in report.verdict
+    # The logarithms of the ratios are half of log(1.9 / 0.5) from their mean, which has this error.
+    assert "change by a factor of about 1.9," in report.verdict
 
 
 def test_the_picture_has_a_curve_for_each_and_the_choice_is_bold():
