@@ -58,15 +58,14 @@ def first_changes(
     """Two steps of Euler's method, in the place of the changes in the step before the first. A
     method of one stage has a single slope in its first step, along which what is conserved hardly
     changes, so that a correction would undo the step."""
-    n = ravel(y0).size
+    changes = jnp.zeros((2 * _CHANGES, ravel(y0).size), ravel(y0).dtype)
     if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):
-        return jnp.zeros((2 * _CHANGES, n), ravel(y0).dtype)
+        return changes
     control = terms.contr(t0, t1)
     first = terms.vf_prod(t0, y0, args, control)
     second = terms.vf_prod(t1, tree_add(y0, first), args, control)
-    changes = jnp.stack([ravel(first), ravel(second)])
-    changes = jnp.where(jnp.isfinite(changes), changes, 0)
-    return jnp.zeros((2 * _CHANGES, n), changes.dtype).at[:2].set(changes)
+    found = jnp.stack([ravel(first), ravel(second)])
+    return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
 
 
 def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
