@@ -8,9 +8,8 @@ A row has what `compare` names from one start and from eight random ones. Other 
 over an interval that is half as long again: the first by the same start, the second by eight
 others. An error is the root mean square over the components, each in a unit that the problem gives,
 and the largest over 23 times, against DOP853 of SciPy. The number behind a choice is its error over
-the least of all candidates, in the geometric mean over the starts: at most 1.5 is the target. The
-last columns are the errors of the second choice over those without projection, in the mean and at
-worst. `benchmarks/results/verdict.json` has the errors.
+the least of all candidates, in the geometric mean: at most 1.5 is the target. The last columns are
+the errors of the second choice over those without projection, in the mean and at worst.
 """
 # ruff: noqa: E731
 
@@ -88,10 +87,7 @@ def heavy_top():
 @problem(dfc.RK4(), 15.0, dt0=0.1)
 def kowalevski_top():
     """With the integral of fourth degree, in one array."""
-
-    def fourth(y):
-        return (y[0] ** 2 - y[1] ** 2 - y[3]) ** 2 + (2 * y[0] * y[1] - y[4]) ** 2
-
+    fourth = lambda y: (y[0] ** 2 - y[1] ** 2 - y[3]) ** 2 + (2 * y[0] * y[1] - y[4]) ** 2
     inertia, centre = jnp.array([2.0, 2.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
     join = lambda w, g: jnp.concatenate([w, g])
     field, kept = top(inertia, 1.0, centre, lambda y: (y[:3], y[3:]), join)
@@ -169,8 +165,8 @@ def proton_in_the_field_of_a_dipole():
     momentum = lambda y: y[0] * y[4] - y[1] * y[3] + flux(y)
     place = lambda key: jnp.array([1.9e7, 0.0, 0.0]) + 1e6 * jr.normal(key, (3,))
     draw = lambda a, b: jnp.concatenate([place(a), 1.38e7 * unit(b)])
-    kept = dict(energy=lambda y: y[3:] @ y[3:] / 2, momentum=momentum)
-    return field, kept, lambda key: draw(*jr.split(key))
+    energy = lambda y: y[3:] @ y[3:] / 2
+    return field, dict(energy=energy, momentum=momentum), lambda key: draw(*jr.split(key))
 
 
 @problem(dfc.RK4(), 4.0, dt0=0.05)
@@ -244,9 +240,6 @@ def glycolysis():
     return field, dict(adenine=lambda y: y[5] + y[7], nicotinamide=lambda y: y[4] + y[8]), draw
 
 
-# ---- The study ----
-
-
 def coordinates(made, y0):
     """The maps from a state to a vector of real numbers in units of the scale, and back."""
     scale = spread("scale", made.scale, jax.eval_shape(lambda: y0))
@@ -258,14 +251,13 @@ def exact(made, y0s, ts, tol):
     start, state = coordinates(made, jax.tree.map(lambda x: x[0], y0s))
     x0s, fields = jax.vmap(start)(y0s), jax.vmap(lambda x: start(made.field(state(x))))
     jitted = jax.jit(lambda x: fields(x.reshape(x0s.shape)).ravel())
-    field, span = lambda t, x: np.asarray(jitted(x)), (0.0, ts[-1])
-    sol = solve_ivp(field, span, np.ravel(x0s), "DOP853", t_eval=ts, rtol=tol, atol=tol)
+    field = lambda t, x: np.asarray(jitted(x))
+    sol = solve_ivp(field, (0, ts[-1]), np.ravel(x0s), "DOP853", ts, rtol=tol, atol=tol)
     return sol.y.T.reshape(len(ts), *x0s.shape).swapaxes(0, 1)
 
 
 def judged(made, rows, y0s, steps):
-    """The errors of the choices of all rows in each start, and those of the reference. An entry
-    that is left out is zero in the place of its function, so that three programs solve all."""
+    """The errors of the choices of all rows in each start, and those of the reference."""
     ts = LONGER * made.t1 * np.append(np.sort(np.random.default_rng(5).random(TIMES - 1)), 1)
     control = dfx.ConstantStepSize() if made.dt0 else dfx.PIDController(**steps)
     if made.dt0:
@@ -277,10 +269,10 @@ def judged(made, rows, y0s, steps):
 
     @eqx.filter_jit
     def solved(flags, weights):
-        """With the entries whose flag is one; `None` is without a projection."""
-        projection, solver = dfc.SimplifiedNewton(metric=weights), made.solver
+        """With entries whose flag is one, and zero in the place of others; `None` is plain."""
+        solver, kept = made.solver, dfc.FirstIntegral(values)
         if flags is not None:
-            kept = dfc.FirstIntegral(values)
+            projection = dfc.SimplifiedNewton(metric=weights)
             solver = dfc.ManifoldProjection(solver, kept, projection=projection)
 
         def one(y0):
