@@ -71,9 +71,14 @@ def compare(
     every error is larger than 0.3, nothing is judged: so chaos is told.
 
     What to take is the projection with the least error up to then, in the geometric mean over a
-    batch; of those within 10 % of it the first. No projection is taken if each is worse by more
-    than that, or is within 10 % of none and worse by half in a lane. One that gains less than 10 %
-    is said to be for what it keeps only. Of more than eight entries none is left out.
+    batch, unless one before it in the table has at most 1.5 times this error: then the first of
+    these, because errors grow faster where less is kept. Only what has an error of less than 0.9
+    times that without projection gains. If nothing does, the first is taken that has at most 1.1
+    times that error, and in no lane 1.5 times, and is said to be for what it keeps only; otherwise
+    no projection is. Of more than eight entries none is left out.
+
+    An error counts relative to the largest value of its leaf, so that of an angle which goes round
+    many times, or of a place far from the origin, counts little.
 
     A small system takes half a minute, most of it compilation. Lists that differ in what is left
     out, and metrics of weights, share programs: so the time of a solve contains the evaluation of

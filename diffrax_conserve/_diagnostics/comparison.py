@@ -17,8 +17,12 @@ _TRUSTED = 1 / 3
 _LOST = 0.3
 # A lane that can be judged for less than this share of its interval counts as not judged.
 _SHORTEST = 0.1
-# Errors that differ by less than this share count as equal. Then what keeps more is preferred.
+# A projection whose error differs by less than this share from that without one changes it little.
 _EQUAL = 0.1
+# The least error decides only if it is smaller by this factor. Otherwise the first choice is taken,
+# which keeps more: smaller differences depend on the interval and on what is measured, and errors
+# grow faster where less is kept (`benchmarks/studies/verdict.py`).
+_MARGIN = 1.5
 # Where a projection is about as accurate as none in the mean, it is not taken if a lane is worse by
 # this factor.
 _RISK = 1.5
@@ -312,8 +316,8 @@ def _mean(errors: np.ndarray) -> float:
 
 
 def _chosen(error: np.ndarray) -> int | None:
-    """Of the rows that fail in the fewest lanes, and of which the geometric mean of the errors is
-    about the least, the first with a projection, if there is one without a risk."""
+    """Of the rows that fail in the fewest lanes, the first with a projection of which the geometric
+    mean of the errors is about the least; if none gains, the first that changes little."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
     failures = np.sum(np.isinf(error), axis=1)
     able = np.flatnonzero(failures == failures.min())
@@ -321,25 +325,25 @@ def _chosen(error: np.ndarray) -> int | None:
     if not common.any():
         return None
     means = {int(i): _mean(error[i, common]) for i in able}
-    near = [i for i, mean in means.items() if mean <= (1 + _EQUAL) * min(means.values())]
+    near = [i for i, mean in means.items() if mean <= _MARGIN * min(means.values())]
     if 0 not in means:
         return near[0]
-    better = [
-        i
-        for i in near
-        if means[i] < (1 - _EQUAL) * means[0]
-        or np.max(error[i, common] / error[0, common]) <= _RISK
-    ]
-    return next((i for i in better if i > 0), 0)
+    worst = np.max(error[:, common] / error[0, common], axis=1)
+    gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
+    equal = [i for i in near if means[i] <= (1 + _EQUAL) * means[0] and worst[i] <= _RISK]
+    return next((i for i in [*gains, *equal] if i > 0), 0)
 
 
 def _compared(ratios: np.ndarray) -> str:
     found = f"the error is {_mean(ratios):.2g} times that without projection"
     if ratios.size == 1:
         return found
-    found += (
-        f" in the geometric mean of {ratios.size} lanes, and {np.max(ratios):.2g} times at worst"
-    )
+    found += f" in the geometric mean of {ratios.size} lanes"
+    with np.errstate(invalid="ignore"):
+        error = np.exp(np.std(np.log(ratios), ddof=1) / ratios.size**0.5)
+    if error > 1 + _EQUAL:
+        found += f", which other lanes would change by a factor of about {error:.2g}"
+    found += f", and {np.max(ratios):.2g} times at worst"
     larger = int(np.sum(ratios > 1))
     return found + f"; in {larger} of them it is larger" if larger else found
 

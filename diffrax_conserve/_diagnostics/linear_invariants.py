@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args
 from .._manifold import slope_of
+from .._step.metric import spread
 from .._tree import ravel, unravel
 
 # Slopes are taken at so many states for each component, and moved by this share of the size of the
@@ -34,10 +35,9 @@ def linear_invariants(
     `ys` has leading axes over lanes and times. Rows are combinations of components in units of
     their `sizes`.
     """
-    units = np.asarray(ravel(sizes))
-    times, states = _states(ts, ys, units)
-
     like = jtu.tree_map(lambda y: y[0, 0], ys)
+    units = np.asarray(spread("sizes", sizes, like))
+    times, states = _states(ts, ys, units)
     found = _measured(vector_field, entries, times, states, like, jnp.asarray(units), args)
     slopes, gradients = map(np.asarray, found)
     finite = np.isfinite(slopes).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
@@ -77,9 +77,8 @@ def changes(
     leaves = jtu.tree_leaves(ys)
     if not len(invariants):
         return np.zeros(len(leaves[0]))
-    x = np.asarray(jax.vmap(jax.vmap(ravel))(jtu.tree_map(jnp.asarray, ys))) / np.asarray(
-        ravel(sizes)
-    )
+    units = np.asarray(spread("sizes", sizes, jtu.tree_map(lambda y: y[0, 0], ys)))
+    x = np.asarray(jax.vmap(jax.vmap(ravel))(jtu.tree_map(jnp.asarray, ys))) / units
     moved = np.linalg.norm((x - x[:, :1]) @ invariants.T, axis=2)
     return moved.max(axis=1)
 

@@ -22,7 +22,7 @@ from .._projection.within_bounds import bounded_parts
 from .._step.equations import reach
 from .._step.iterate import any_lane
 from .._step.metric import length
-from .._tree import ravel, tree_sub
+from .._tree import ravel, tree_add, tree_sub
 from .diffrax_private import member
 from .state import (
     FIRST,
@@ -50,6 +50,22 @@ def changes_along(
     that they are orthogonal to each `c` with `c · f = 0`."""
     shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
     return jnp.stack([ravel(path.evaluate(t0 + share * (t1 - t0))) - ravel(y0) for share in shares])
+
+
+def first_changes(
+    terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+) -> Float[Array, "k n"]:
+    """Two steps of Euler's method, in the place of the changes in the step before the first. A
+    method of one stage has a single slope in its first step, along which what is conserved hardly
+    changes, so that a correction would undo the step."""
+    changes = jnp.zeros((2 * _CHANGES, ravel(y0).size), ravel(y0).dtype)
+    if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):
+        return changes
+    control = terms.contr(t0, t1)
+    first = terms.vf_prod(t0, y0, args, control)
+    second = terms.vf_prod(t1, tree_add(y0, first), args, control)
+    found = jnp.stack([ravel(first), ravel(second)])
+    return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
 
 
 def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
@@ -203,9 +219,7 @@ class ManifoldProjection(ForwardingSolver):
             statistics=ProjectionStatistics.zero(
                 self.manifold, values.dtype, bool(bounded_parts(self.projection))
             ),
-            preferred=jnp.zeros((2 * _CHANGES, ravel(y0).size), values.dtype)
-            if self.keep_linear
-            else None,
+            preferred=first_changes(terms, t0, t1, y0, args) if self.keep_linear else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times

@@ -86,6 +86,27 @@ def test_the_momentum_stays_beside_the_energy(solver, controller):
         assert np.abs(y - other).max() < 0.05
 
 
+def test_the_method_of_euler_moves_in_its_first_step():
+    """Along its only slope the energy hardly changes. A correction along it alone would undo the
+    step, and lose the digits of the next direction."""
+    kept = dfc.ManifoldProjection(dfx.Euler(), dfc.FirstIntegral(energy), keep_linear=True)
+
+    @jax.jit
+    def found(y0, args):
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(springs), kept, 0.0, 0.05, 0.005, y0, args,
+            saveat=dfx.SaveAt(steps=True, t0=True), max_steps=16,
+        )  # fmt: skip
+        values = [jax.vmap(f, (None, 0, None))(0.0, sol.ys, args) for f in (energy, momentum)]
+        return *(jnp.max(jnp.abs(v - v[0]), where=jnp.isfinite(v), initial=0) for v in values), sol
+
+    y0 = start(0.4)
+    kept_energy, kept_momentum, sol = found(y0, 2.0)
+    assert kept_energy < 1e-14 > kept_momentum
+    change = sol.ys[0][1] - y0[0]
+    np.testing.assert_allclose(change, 0.005 * y0[1], rtol=0.2, atol=1e-5)
+
+
 def test_a_declared_linear_invariant_is_kept_too():
     """Its gradient is orthogonal to all directions in which the solution moves."""
     manifold = {"energy": dfc.FirstIntegral(energy), "momentum": dfc.FirstIntegral(momentum)}
