@@ -1,6 +1,7 @@
-"""What it is worth to keep the balance of energy and dissipated power: a pendulum with weak friction
-to t = 1,000, and one with stronger friction that is driven. The largest errors of state and energy
-at tolerance 1e-6, and the steps.
+"""What it is worth to keep the balance of energy and dissipated power.
+
+A pendulum with weak friction to t = 1,000, and one with stronger friction that is driven: the
+largest errors of state and energy at tolerance 1e-6, and the steps.
 
 Writes `results/balance.json`.
 """

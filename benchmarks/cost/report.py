@@ -94,22 +94,20 @@ def filled(text: str, results: Results) -> str:
 # ---- The figure ----
 
 
-def scaling(results: Results) -> Figure:
+def draw(results: Results) -> None:
     """The time of a step against the size of the batch; plain solves are dashed."""
-    with mpl.rc_context({"svg.hashsalt": "diffrax-conserve", "savefig.transparent": True}):
-        with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
-            figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-            ax = figure.subplots()
-            for method, colour in (("RK4", "#CC79A7"), ("Tsit5", "#D55E00")):
-                for kind, line in (("plain", "--"), ("projected", "-")):
-                    name = f"{kind} {method}"
-                    rows = results["scaling"]["parts"]["batch"]
-                    x, y = zip(*((r["batch"], r["rows"][name]["ns"]) for r in rows), strict=True)
-                    ax.loglog(x, y, line, marker="o", color=colour, label=name)
-            ax.set(xlabel="trajectories", ylabel="ns per step and trajectory")
-            runpy.run_path(str(DOCS / "drawing.py"))["label"](ax)
-            figure.savefig(DOCS / "images" / "scaling.svg", metadata={"Date": None})
-            return figure
+    with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
+        figure = Figure()
+        ax = figure.subplots()
+        rows = results["scaling"]["parts"]["batch"]
+        for method, colour in (("RK4", "#CC79A7"), ("Tsit5", "#D55E00")):
+            for kind, line in (("plain", "--"), ("projected", "-")):
+                name = f"{kind} {method}"
+                x, y = zip(*((r["batch"], r["rows"][name]["ns"]) for r in rows), strict=True)
+                ax.loglog(x, y, line, marker="o", color=colour, label=name)
+        ax.set(xlabel="trajectories", ylabel="ns per step and trajectory")
+        runpy.run_path(str(DOCS / "drawing.py"))["label"](ax)
+        figure.savefig(DOCS / "images" / "scaling.svg", metadata={"Date": None})
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -122,7 +120,7 @@ def main(argv: list[str] | None = None) -> None:
     if options.write:
         for page in PAGES:
             page.write_text(filled(page.read_text(encoding="utf-8"), results), encoding="utf-8")
-        scaling(results)
+        draw(results)
 
 
 if __name__ == "__main__":
