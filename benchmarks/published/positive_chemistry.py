@@ -150,8 +150,12 @@ def summary(results):
 
 def table(results):
     heads = ("noise", "program", "negative, %", "fails, %", "relative error", "violation", "µs")
-    found = summary(results)
-    return common.markdown(heads, ((*k, *x.values()) for k, x in found if k[0] in (0.3, 1.0)))
+    rows = []
+    for (gamma, program), row in summary(results):
+        negative, failed, *rest = row.values()
+        if gamma in (0.3, 1.0):
+            rows.append((gamma, program, f"{negative:.2g}", f"{failed:.2g}", *rest))
+    return common.markdown(heads, rows)
 
 
 def verdicts(results):
