@@ -134,14 +134,14 @@ examples: $(TEST) ## execute the code blocks of the README, the first pages and 
 	$(BIN)/python -m pytest $(SHARED) -qq -m "examples and not slow" tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := forms overhead work_precision scaling balance dae stiff random_features
-TRAININGS := zoo paper learning_from_data equal_cost chemistry worth defaults hard_cases
-STUDIES := claims long_run metric symmetric units verdict
-PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms
+COSTS := scaling balance dae stiff
+TRAININGS := zoo paper chemistry worth
+STUDIES := long_run metric verdict
+PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms \
+  positive_chemistry pinn_issues
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done
-	XLA_FLAGS= $(BIN)/python benchmarks/cost/overhead.py --only ' 1$$' --out benchmarks/results/overhead-default-flags.json
 	$(BIN)/python benchmarks/cost/reject.py
 	$(BIN)/python benchmarks/cost/report.py --write
 
@@ -152,13 +152,13 @@ bench-studies: $(TEST) ## measure what options and claims of the pages rest on
 	set -e; for name in $(STUDIES); do $(BIN)/python benchmarks/studies/$$name.py; done
 
 # Each writes its result when it is done, and is skipped if that is there: remove it to measure anew.
-bench-published: $(BENCH) ## compare with what others published; tables of a page: 40 minutes
+bench-published: $(BENCH) ## compare with what others published; tables of a page: an hour
 	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
 	$(BIN)/python benchmarks/published/tables.py --write
 
-SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) \
-  learned/chemistry learned/equal_cost learned/defaults learned/hard_cases $(PUBLISHED:%=published/%)
-SMOKED ?= cost/balance learned/defaults studies/claims published/mechanisms
+SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) learned/chemistry \
+  $(PUBLISHED:%=published/%)
+SMOKED ?= cost/balance learned/chemistry studies/long_run published/mechanisms
 
 # At toy sizes nearly all of it is compilation, so it is compiled as in the tests, beside the option
 # that the pages recommend.

@@ -45,8 +45,8 @@ AT_BOUND = 1e-10
 NEAREST = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
-# arrays: they compiled up to two seconds faster, and took two to five times as long
-# (`benchmarks/cost/forms.py --only systems`). With 0 nothing is.
+# arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
+# nothing is.
 OPERATIONS = 2048
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).

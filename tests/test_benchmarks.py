@@ -38,8 +38,6 @@ def trained(name, table):
 
 
 TABLES = {
-    "learning from data": ("learning-from-data", lambda: lines_of("learning_from_data", "OUT")),
-    "hard cases": ("training", lambda: lines_of("hard_cases", "OUT", "tables")),
     "long run": ("performance", lambda: lines_of("long_run", "RESULTS")),
     "worth": ("../zoo", lambda: lines_of("worth", "RESULTS")),
     "zoo": ("zoo", lambda: trained("zoo", "tables")),
@@ -93,9 +91,6 @@ SMOKE = {
     "paper": lambda standard, conservative: (
         standard["plain"]["drift"] > 1e-6
         and all(x["projected"]["drift"] < 1e-14 for x in (standard, conservative))
-    ),
-    "learning_from_data": lambda found: (
-        found["known"]["0.01"]["plain"]["solved"]["projected"]["drift"] < 1e-14
     ),
     "worth": lambda cheap, dear: dear["batches"]["4"]["ratio"] > cheap["batches"]["4"]["ratio"] > 0,
 }

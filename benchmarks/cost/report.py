@@ -1,85 +1,50 @@
-"""From the results of `make bench`: the tables of the documentation, and the figures of the page on
+"""From the results of `make bench`: the tables of the documentation, and the figure of the page on
 performance.
 
-Prints the tables; `--write` puts each between its two markers and redraws the figures. A test holds
+Prints the tables; `--write` puts each between its two markers and redraws the figure. A test holds
 the tables of the pages to the results.
 """
 
 import argparse
 import re
-from pathlib import Path
+import runpy
 from typing import Any
 
-import figures
+import matplotlib as mpl
 import measuring
+from matplotlib.figure import Figure
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [
-    DOCS / "performance.md",
-    DOCS / "many-constraints.md",
-    measuring.RESULTS.parent / "README.md",
-]
-NAMES = ("overhead", "work_precision", "scaling", "many_constraints")
-
-# One trajectory without the option of XLA that the documentation recommends.
-DEFAULT_FLAGS = "overhead-default-flags"
-
-# Of each system: what is kept, the integrals, and the numbers in its state.
-SIZES = {
-    "rigid-body": ("rigid body", 2, 3),
-    "three-vortices": ("three vortices", 4, 6),
-    "ten-vortices": ("ten vortices", 4, 20),
-    "outer-solar-system": ("outer solar system", 10, 36),
-}
+PAGES = [DOCS / "performance.md", DOCS / "many-constraints.md"]
+NAMES = ("scaling", "many_constraints")
+# Of each system: the integrals that are kept, and the numbers in its state.
+SIZES = {"rigid body": (2, 3), "three vortices": (4, 6), "ten vortices": (4, 20)}
 
 Results = dict[str, dict[str, Any]]
 
 
 def read_results() -> Results:
-    return {name: measuring.read(name) for name in (*NAMES, DEFAULT_FLAGS)}
+    return {name: measuring.read(name) for name in NAMES}
 
 
 # ---- Tables ----
 
 
-def number(x: float | None) -> str:
-    if x is None:
-        return ""
-    digits = 0 if x >= 100 else 1 if x >= 10 else 2 if x >= 0.1 else 4
-    return f"{x:,.{digits}f}"
-
-
-def overhead_table(results: Results, name: str = "overhead") -> list[str]:
-    names = ("plain", "projected", "root_find by hand", "plain, C", "projected, C")
-    lines = [
-        "| system, solver | trajectories | plain | projected | by hand | plain C | projected C |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for table in results[name]["tables"]:
-        ns = [number(table["rows"].get(name, {}).get("ns")) for name in names]
-        cells = [f"{table['system']}, {table['method']}", f"{table['batch']:,}", *ns]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
-
-
 def integrals_table(results: Results) -> list[str]:
-    """Projected over plain, by the number of integrals: the times of a step, alone and in a batch,
-    and the time of compilation, alone."""
-    tables = results["overhead"]["tables"]
-    found = {(t["system"], t["method"], t["batch"]): t["ratios"] for t in tables}
+    """Projected over plain: the times of a step, alone and in a batch, and of the compilation."""
     heads = ("integrals", "numbers in the state", "system", "method")
     heads = (*heads, "alone", "batch of 1,000", "compilation")
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
-    for system, (name, integrals, numbers) in SIZES.items():
-        for method in ("RK4", "Tsit5 adaptive"):
-            one, many = (found.get((system, method, batch), {}) for batch in (1, 1_000))
-            if one or many:
-                times = [x.get("projected / plain") for x in (one, many)]
-                times.append(one.get("compilation, projected / plain"))
-                cells = ["" if x is None else f"{x:.1f}" for x in times]
-                head = [str(integrals), str(numbers), name, method]
-                lines.append(f"| {' | '.join([*head, *cells])} |")
+    rows = {(x["system"], x["batch"]): x["rows"] for x in results["scaling"]["parts"]["methods"]}
+    for system, (integrals, numbers) in SIZES.items():
+        alone, many = rows[system, 1], rows[system, 1_000]
+        for method in [name.removeprefix("plain ") for name in alone if name.startswith("plain ")]:
+            names = f"projected {method}", f"plain {method}"
+            columns = ((alone, "ns"), (many, "ns"), (alone, "compile_seconds"))
+            ratios = (of[names[0]][key] / of[names[1]][key] for of, key in columns)
+            cells = " | ".join(f"{x:.1f}" for x in ratios)
+            lines.append(f"| {integrals} | {numbers} | {system} | {method} | {cells} |")
     return lines
 
 
@@ -95,24 +60,10 @@ def many_table(results: Results) -> list[str]:
     return lines
 
 
-def times_table(results: Results, part: str) -> list[str]:
-    found = results["work_precision"]["parts"][part]
-    lines = [
-        f"| program | ms to error {found['target']:.0e} | and drift below 1e-14 |",
-        "|---|---|---|",
-    ]
-    for name, times in found["times"].items():
-        cells = ["never" if x is None else number(1e3 * x) for x in times.values()]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return lines
-
-
 def machine_lines(results: Results) -> list[str]:
-    """One line: what `make bench` ran on, and when it began."""
-    about = results["overhead"]["machine"]
-    versions = about["versions"] | results["work_precision"]["machine"]["versions"]
-    wanted = ("jax", "diffrax", "scipy", "homproj", "heyoka")
-    packages = ", ".join(f"{name} {versions[name]}" for name in wanted if name in versions)
+    """One line: what `scaling.py` ran on, and when it began."""
+    about = results["scaling"]["machine"]
+    packages = ", ".join(f"{name} {about['versions'][name]}" for name in ("jax", "diffrax"))
     device = "" if about["device"] == "cpu" else f", {about['device']}"
     return [
         f"{about['cpu']}, {about['cores']} cores{device}, {about['precision']}; Python "
@@ -124,11 +75,6 @@ def tables(results: Results) -> dict[str, list[str]]:
     """By the name in the markers of the pages."""
     return {
         "by integrals": integrals_table(results),
-        "overhead": overhead_table(results),
-        "default flags": overhead_table(results, DEFAULT_FLAGS),
-        "rigid body": times_table(results, "rigid-body"),
-        "kepler": times_table(results, "kepler"),
-        "batch": times_table(results, "batch"),
         "machine": machine_lines(results),
         "many constraints": many_table(results),
     }
@@ -144,6 +90,25 @@ def filled(text: str, results: Results) -> str:
     return text
 
 
+# ---- The figure ----
+
+
+def draw(results: Results) -> None:
+    """The time of a step against the size of the batch; plain solves are dashed."""
+    with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
+        figure = Figure()
+        ax = figure.subplots()
+        rows = results["scaling"]["parts"]["batch"]
+        for method, colour in (("RK4", "#CC79A7"), ("Tsit5", "#D55E00")):
+            for kind, line in (("plain", "--"), ("projected", "-")):
+                name = f"{kind} {method}"
+                x, y = zip(*((r["batch"], r["rows"][name]["ns"]) for r in rows), strict=True)
+                ax.loglog(x, y, line, marker="o", color=colour, label=name)
+        ax.set(xlabel="trajectories", ylabel="ns per step and trajectory")
+        runpy.run_path(str(DOCS / "drawing.py"))["label"](ax)
+        figure.savefig(DOCS / "images" / "scaling.svg", metadata={"Date": None})
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--write", action="store_true", help="the tables and figures of the pages")
@@ -154,12 +119,7 @@ def main(argv: list[str] | None = None) -> None:
     if options.write:
         for page in PAGES:
             page.write_text(filled(page.read_text(encoding="utf-8"), results), encoding="utf-8")
-        write_figures(results, ROOT / "docs" / "images")
-
-
-def write_figures(results: Results, folder: Path) -> None:
-    figures.save(figures.work_precision(results["work_precision"]), folder / "work-precision")
-    figures.save(figures.scaling(results["scaling"]), folder / "scaling")
+        draw(results)
 
 
 if __name__ == "__main__":

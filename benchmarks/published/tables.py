@@ -15,11 +15,16 @@ import heyoka_page
 import homproj_paper
 import julia_energy
 import mechanisms
+import pinn_issues
+import positive_chemistry
 import sundials
 
 PAGE = common.measuring.RESULTS.parents[1] / "docs" / "published.md"
 # In the order of the page.
-ROWS = (sundials, homproj_paper, heyoka_page, discrete_gradient, julia_energy, mechanisms)
+ROWS = (
+    *(sundials, homproj_paper, heyoka_page, discrete_gradient, julia_energy, mechanisms),
+    *(positive_chemistry, pinn_issues),
+)
 
 
 def read_results():
@@ -81,6 +86,8 @@ def tables(results):
         "boson": julia_energy.table(results[julia_energy], "quadrupole boson"),
         "default tolerances": julia_energy.loose_table(results[julia_energy]),
         "mechanisms": mechanisms.table(results[mechanisms]),
+        "concentrations": positive_chemistry.table(results[positive_chemistry]),
+        "questions": pinn_issues.table(results[pinn_issues]),
     }
 
 

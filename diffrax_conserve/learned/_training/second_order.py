@@ -122,7 +122,7 @@ def _by_triangular_factor(matrix: Array, rhs: Array, damping: Array) -> Array:
     """The same for single precision, in which the Gram matrix knows no eigenvalue below 1e-7 of the
     largest, and needs a damping above it."""
     # Less damping amplifies the roundoff in `b`. On predators and prey the error was 1e-5 with a
-    # hundred times as much or with none, and 3e-6 with this (`benchmarks/learned/hard_cases.py`).
+    # hundred times as much or with none, and 3e-6 with this.
     least = 0.01 * float(jnp.finfo(matrix.dtype).eps) * jnp.sum(jnp.square(matrix))
     damping = jnp.maximum(damping, least)
     rows, columns = matrix.shape
