@@ -1,4 +1,4 @@
-"""Is what `compare` names the best? Verdicts on twelve problems that nothing was chosen by.
+"""Is what `compare` names the best? Verdicts on twelve problems of others.
 
     python benchmarks/studies/verdict.py             # one row for each problem, ten minutes
     python benchmarks/studies/verdict.py --only top  # the problems whose names hold this text
