@@ -140,7 +140,7 @@ def slope_of(vector_field: Any, t: RealScalarLike, y: Y, args: Args) -> Y:
         return slope_like(y, vector_field(t, y, args))
 
 
-def slope_like(y: Y, slope: Any) -> Y:
+def slope_like(y: Y, slope: Any, name: str = "vector_field", of: str = "y") -> Y:
     """The value of a vector field, cast to the dtypes of the state. Raises if a leaf has another
     shape than that of the state and is no Python number, which is broadcast."""
     if jtu.tree_structure(slope) == jtu.tree_structure(y):
@@ -152,8 +152,8 @@ def slope_like(y: Y, slope: Any) -> Y:
                 lambda x, f: jnp.broadcast_to(jnp.asarray(f, x.dtype), x.shape), y, slope
             )
     raise ValueError(
-        f"`vector_field` returns the structure {tree_shapes(slope)}, but it must return a PyTree "
-        f"like `y`, which has {tree_shapes(y)}."
+        f"`{name}` returns the structure {tree_shapes(slope)}, but it must return a PyTree like "
+        f"`{of}`, which has {tree_shapes(y)}."
     )
 
 

@@ -13,17 +13,17 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._manifold import Constraint, slope_like
 from .._options import check_function
-from .._projection.base import AbstractProjection, Problem, ProjectionInfo
+from .._projection.base import AbstractProjection, Problem, ProjectionInfo, Target
 from .._projection.options import check_state
-from .._projection.project import project
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._step.implicit import root
+from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, divided
 from .radau import Radau
@@ -169,12 +169,12 @@ class DAE(eqx.Module):
 
         `TypeError` if `solver` is none, or one that is wrapped already.
         """
-        if isinstance(solver, Radau) and type(solver) is not Radau:
-            raise TypeError(
-                "`wrap` makes a projected solver of one that is not: pass "
-                "`diffrax_conserve.Radau()` itself."
-            )
-        if isinstance(solver, Radau):
+        if isinstance(solver, Radau):  # a wrapper of one too, for diffrax
+            if type(solver) is not Radau:
+                raise TypeError(
+                    "`wrap` makes a projected solver of one that is not: pass "
+                    "`diffrax_conserve.Radau()` itself."
+                )
             solver = dataclasses.replace(solver, equations=_Stages(self))
         manifold = {"equations": Constraint(_Constraints(self))}
         return ManifoldProjection(solver, manifold, projection=_Return(dae=self))
@@ -207,33 +207,22 @@ class DAE(eqx.Module):
 
         **Raises:**
 
-        `ValueError` or `TypeError` if the equations do not fit the state, or are singular; at run
-        time, an error if no consistent state is found.
+        `ValueError` or `TypeError` if the equations do not fit the state, or are singular;
+        `ValueError` if no consistent state is found, or inside of `jit` an error at run time.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args)
+        _structure(self, t, y, args)  # from numbers, which JAX does not trace yet
         t = jnp.asarray(t, jnp.result_type(float, t))
-        if structure.index == 0:
-            found, ok = y, tree_all_finite(_Slopes(self)(t, y, args))
-        elif fixed is None and structure.index == 1:
-            found = unravel(_solved_for(self, t, y, args), y)
-            ok = tree_all_finite(found)
-        else:
-            sizes = jnp.abs(lax.stop_gradient(ravel(y)))
-            units = structure.units(jnp.where(sizes == 0, 1, sizes))
-            if fixed is not None:
-                units = units.at[_flags(fixed, y)].set(0)
-            manifold = {"equations": Constraint(_Constraints(self))}
-            projection = SimplifiedNewton(metric=unravel(units**-2, y), max_steps=MOST)
-            found, info = project(manifold, y, t=t, args=args, projection=projection)
-            ok = info.ok
-        return eqx.error_if(
-            found,
-            ~ok,
+        moves = None if fixed is None else ~_flags(fixed, y)
+        found, ok = _consistent(self, t, y, args, moves)
+        message = (
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
-            "the equations that are differentiated.",
+            "the equations that are differentiated."
         )
+        if eqx.is_array(ok) and not isinstance(ok, jax.core.Tracer) and not ok:
+            raise ValueError(message)
+        return eqx.error_if(found, ~ok, message)
 
     def report(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
         """What was found out about the equations, at the state of a guess.
@@ -261,7 +250,7 @@ class DAE(eqx.Module):
             sum(i in structure.left(k) for k in range(structure.index))
             for i in range(len(equations))
         ]
-        off = _Constraints(self)(t, y, args)[: structure.index]
+        off = eqx.filter_jit(_Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
@@ -291,7 +280,7 @@ class DAE(eqx.Module):
                 "The state of a `DAE` with `algebraic` must be a pair `(x, z)`, but it is "
                 f"{tree_shapes(y)}. Pass `y0=dae.consistent(x, z)`."
             )
-        slope = slope_like(y[0], self.f(t, *y, args))
+        slope = slope_like(y[0], self.f(t, *y, args), "f", "x")
         return {"f": slope, "algebraic": self.algebraic(t, *y, args)}
 
     def _names(self, t: RealScalarLike, y: Y, args: Args) -> list[str]:
@@ -394,10 +383,16 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
         except Singular as error:
             names = dae._names(t, y, args)
             which = ", ".join(f"`{names[i]}`" for i in error.left)
+            unknowns = ", ".join(f"`{_names('y', y)[j]}`" for j in error.absent)
+            lacking = (
+                f"No equation contains {unknowns}."
+                if unknowns
+                else "So some unknown is not determined."
+            )
             raise ValueError(
                 f"The equations are singular: {which}, or a derivative of it, follows from the "
-                "other equations or contradicts them. So some unknown is not determined. Leave out "
-                "what is stated twice, and add the equation that is missing."
+                f"other equations or contradicts them. {lacking} Leave out what is stated twice, "
+                "and add the equation that is missing."
             ) from None
         except FloatingPointError:
             raise ValueError(
@@ -473,17 +468,49 @@ class _Return(AbstractProjection):
 
 
 @eqx.filter_jit
+def _consistent(
+    dae: DAE, t: Array, y: Y, args: Args, moves: Bool[np.ndarray, " n"] | None
+) -> tuple[Y, Bool[Array, ""]]:
+    """A consistent state near a guess, of which some numbers move, and whether it was found."""
+    structure = _structure(dae, t, y, args)
+    if structure.index == 0:
+        return y, tree_all_finite(_Slopes(dae)(t, y, args))
+    if moves is None and structure.index == 1:
+        found = unravel(_solved_for(dae, t, y, args), y)
+        return found, tree_all_finite(found)
+    sizes = jnp.abs(lax.stop_gradient(ravel(y)))
+    units = structure.units(jnp.where(sizes == 0, 1, sizes))
+    if moves is not None:
+        units = jnp.where(moves, units, 0)
+    manifold = {"equations": Constraint(_Constraints(dae))}
+    projection = SimplifiedNewton(metric=unravel(units**-2, y), max_steps=MOST)
+    none = jnp.zeros_like(jnp.concatenate(_Constraints(dae)(t, y, args)))
+    target = Target(projection, manifold, none, none, args, jnp.asarray(1))
+
+    def nearer(y: Y, _: None) -> tuple[Y, Bool[Array, ""]]:
+        hidden = hidden_scale(manifold, t, y, args)[2]
+        y, info = dataclasses.replace(target, hidden=hidden).project(t, y)
+        return y, info.ok
+
+    # The tolerance follows the roundoff at the guess, so the second time judges by that at the
+    # state. `project` does the same, and compiles nearly twice as much.
+    found, ok = lax.scan(nearer, y, length=2)
+    return found, ok[1]
+
+
+@eqx.filter_jit
 def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Array, " n"]:
     """The state of equations of index 1, moved without what they differentiate; NaN if there is
     none."""
     structure, equations, t, y = _at(dae, t, state, args)
-    along, free, _ = structure.freely_moved(equations, t, y)
+    along, free = structure.freely_moved(equations, t, y)
+    fits = structure.fits(equations, t, y)
 
     def moved(z: Array) -> Array:
         return (y + along @ (z - y[free])).at[free].set(z)
 
     def residual(z: Array) -> Array:
-        return structure.constraints(equations, 1)(t, moved(z))[0]
+        return jnp.where(fits, structure.constraints(equations, 1)(t, moved(z))[0], jnp.nan)
 
     return moved(root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y)
 
@@ -496,7 +523,9 @@ class _Slopes(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
         structure, equations, t, vector = _at(self.dae, t, y, args)
-        return unravel(structure.slopes(equations, structure.index, t, vector), y)
+        slopes = structure.slopes(equations, structure.index, t, vector)
+        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
+        return unravel(jnp.where(fits, slopes, jnp.nan), y)
 
 
 @final
@@ -507,8 +536,11 @@ class _Constraints(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         structure, equations, t, vector = _at(self.dae, t, y, args)
+        if not structure.index:
+            return [jnp.zeros_like(vector[:1])]  # every state will do
         found = structure.constraints(equations, structure.index)(t, vector)
-        return found or [jnp.zeros_like(vector[:1])]  # every state will do
+        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
+        return [jnp.where(fits, h, jnp.nan) for h in found]
 
 
 @final

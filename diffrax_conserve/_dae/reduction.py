@@ -16,7 +16,7 @@ is found from numbers at a single state in general position.
 import concurrent.futures
 import dataclasses
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,12 +51,15 @@ class Structure:
     - `rounds`: for each differentiation, what is solved for what before it.
     - `is_linear`: whether the equations are linear in the slopes.
     - `mass`: `∂F/∂y'`, if it is known to be constant.
+    - `apart`: whether the equations that are left first contain no slopes, not even some that
+      cancel.
     """
 
     size: int
     rounds: tuple[Round, ...]
     is_linear: bool
     mass: np.ndarray | None = None
+    apart: bool = False
 
     @property
     def index(self) -> int:
@@ -90,45 +93,55 @@ class Structure:
         if not rows.size:
             return none
         as_given = not self.rounds or not set(rows) & set(self.left(0))
-        equations = equations if as_given else self.reduced(equations, k)
-        begin = jnp.zeros(columns.size, y.dtype)
+        begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
+        if not as_given:  # once, for all slopes that are tried
+            by_both = jax.jacfwd(self.constraints(equations, k), (0, 1))(t, y)
+            by_t, by_y = zip(*by_both, strict=True)
 
         def residual(slopes: Array) -> Array:
-            return equations(t, y, none.at[columns].set(slopes))[rows]
+            slopes = none.at[columns].set(slopes)
+            rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
+            return self._replaced(equations(t, y, slopes), rates)[rows]
 
         if as_given and self.mass is not None:
             inverse = np.linalg.inv(self.mass[np.ix_(rows, columns)])
             slopes = -jnp.asarray(inverse, y.dtype) @ residual(begin)
         elif self.is_linear:
-            slopes = divided(jax.jacfwd(residual)(begin), -residual(begin))
+            both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
+            matrix, value = both(begin)
+            slopes = divided(matrix, -value)
         else:
             slopes = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
         return none.at[columns].set(slopes)
 
     def freely_moved(
         self, equations: Implicit, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray, Bool[Array, ""]]:
+    ) -> tuple[Float[Array, "n m"], np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
-        what the equations differentiate, such as the charges of condensers; which unknowns are the
-        coordinates along it; and whether the equations that are left contain no slopes with the
-        numbers at hand, which may be others than those with which the structure was found."""
+        what the equations differentiate, such as the charges of condensers; and which unknowns are
+        the coordinates along it."""
         rows, columns = (np.array(x, int) for x in self.rounds[0])
         free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
-        if self.mass is not None:
-            matrix, along = self.mass, np.zeros((self.size, free.size))
-            along[free] = np.eye(free.size)
-            inner = matrix[np.ix_(rows, columns)]
-            along[columns] = -np.linalg.solve(inner, matrix[np.ix_(rows, free)])
-            return jnp.asarray(along, y.dtype), free, jnp.asarray(True)
-        slopes = self.slopes(equations, 0, t, y)
-        matrix = jax.jacfwd(lambda slopes: equations(t, y, slopes))(slopes)
-        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
+        matrix = self.mass if self.mass is not None else self._by_slopes(equations, t, y)
+        solve = np.linalg.solve if self.mass is not None else jnp.linalg.solve
         along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(jnp.eye(free.size))
-        along = along.at[columns].set(-jnp.linalg.solve(inner, outer))
-        left = matrix[np.array(self.left(0), int)]
+        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
+        return along.at[columns].set(-solve(inner, outer)), free
+
+    def _by_slopes(self, equations: Implicit, t: Array, y: Array) -> Float[Array, "n n"]:
+        return jax.jacfwd(equations, 2)(t, y, self.slopes(equations, 0, t, y))
+
+    def fits(self, equations: Implicit, t: Array, y: Array) -> Bool[Array, ""]:
+        """Whether the equations that are left contain no slopes with the numbers at hand, which may
+        be others than those with which the structure was found."""
+        if self.mass is not None or not self.rounds:
+            return jnp.asarray(True)
+        left = self._by_slopes(equations, t, y)[np.array(self.left(0), int)]
+        if self.apart:
+            return ~jnp.any(left)
+        along, _ = self.freely_moved(equations, t, y)
         least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
-        contains = jnp.abs(left @ along) > least * (jnp.abs(left) @ jnp.abs(along))
-        return along, free, ~jnp.any(contains)
+        return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
 
     def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
         """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
@@ -138,10 +151,8 @@ class Structure:
         left = np.array(self.left(k - 1), int)
 
         def given(t: Array, y: Array) -> list[Array]:
-            free = self.mass is not None and not np.any(self.mass[left])
-            slopes = jnp.zeros_like(y) if free else self.slopes(equations, 0, t, y)
-            holds = self.freely_moved(equations, t, y)[2]
-            return [jnp.where(holds, equations(t, y, slopes)[left], jnp.nan)]
+            slopes = jnp.zeros_like(y) if self.apart else self.slopes(equations, 0, t, y)
+            return [equations(t, y, slopes)[left]]
 
         def further(t: Array, y: Array) -> list[Array]:
             before = self.constraints(equations, k - 1)
@@ -160,11 +171,17 @@ class Structure:
             return equations
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
-            before = self.reduced(equations, k - 1)(t, y, slopes)
             _, rates = _along(self.constraints(equations, k), t, y, slopes)
-            return before.at[np.array(self.left(k - 1), int)].set(rates[-1])
+            return self._replaced(equations(t, y, slopes), rates)
 
         return differentiated
+
+    def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
+        """The values of the equations, with those that are left in the first rounds replaced by the
+        rates of their constraints."""
+        for k, rate in enumerate(rates):
+            values = values.at[np.array(self.left(k), int)].set(rate)
+        return values
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
@@ -176,22 +193,25 @@ def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
 
 
 class Singular(ValueError):
-    """Equations that determine no solution, with their positions."""
+    """Equations that determine no solution: the positions of those that are to blame, and of the
+    unknowns that no equation contains."""
 
-    def __init__(self, left: tuple[int, ...]):
-        self.left = left
+    def __init__(self, left: tuple[int, ...], absent: tuple[int, ...]):
+        self.left, self.absent = left, absent
 
 
 def find_structure(
     equations: Implicit, changed: Implicit, t: Array, y: Array, mass: np.ndarray | None
 ) -> Structure:
     """The structure of concrete equations near a state, by elimination."""
-    t, y, matrix, is_linear = _general_position(equations, t, y)
+    t, y, matrix, is_linear, absent = _general_position(equations, t, y)
+    other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
-        other = jax.jit(jax.jacfwd(changed, 2))(2 * t + 1, 2 * y, y)
+        other = np.asarray(jax.jit(jax.jacfwd(changed, 2))(2 * t + 1, 2 * y, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    structure = Structure(y.size, (), is_linear, mass)
-    selected, gradients = Round((), ()), np.zeros((0, y.size))
+    selected, gradients = _extended(matrix, Round((), ())), np.zeros((0, y.size))
+    rest = np.delete(np.stack([matrix, other]), selected.equations, axis=1)
+    structure = Structure(y.size, (), is_linear, mass, apart=not np.any(rest))
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
@@ -200,7 +220,8 @@ def find_structure(
         independent = _extended(gradients, Round((), ())).equations
         if len(independent) < len(gradients):
             first = len(gradients) - len(left)
-            raise Singular(tuple(i for k, i in enumerate(left) if first + k not in independent))
+            blamed = (i for k, i in enumerate(left) if first + k not in independent)
+            raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
     return structure
 
@@ -230,15 +251,16 @@ def _extended(matrix: np.ndarray, round: Round) -> Round:
 
 def _general_position(
     equations: Implicit, t: Array, y: Array
-) -> tuple[Array, Array, np.ndarray, bool]:
+) -> tuple[Array, Array, np.ndarray, bool, tuple[int, ...]]:
     """A time and a state in general position, near the given ones, at which the equations and their
-    derivatives are finite; `∂F/∂y'` there; and whether it depends on `y'`."""
+    derivatives are finite; `∂F/∂y'` there; whether it depends on `y'`; and the unknowns that no
+    equation contains."""
     pattern = without_pattern(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
     size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
 
     @jax.jit
-    def near(share: float) -> tuple[Array, Array, Array, Array, Array]:
+    def near(share: float) -> tuple[Array, ...]:
         moved = y + share * size * (1 + pattern[: y.size] / 2)
         later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
         slopes = size * pattern[:-1].reshape(3, -1)[1:]
@@ -246,12 +268,19 @@ def _general_position(
         by_slope = jax.vmap(lambda slope: jax.jacfwd(equations, 2)(later, moved, slope))(slopes)
         value = equations(later, moved, slopes[0])
         finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
-        return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), finite
+        absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
+        return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
 
     for share in (1e-1, 1e-3, 1e-5, 0.0):
-        t, moved, by_slope, is_linear, finite = near(share)
+        t, moved, by_slope, is_linear, absent, finite = near(share)
         if finite:
-            return t, moved, np.array(by_slope), bool(is_linear)
+            return (
+                t,
+                moved,
+                np.array(by_slope),
+                bool(is_linear),
+                tuple(np.flatnonzero(absent).tolist()),
+            )
     raise FloatingPointError
 
 

@@ -32,6 +32,7 @@ def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
 
 
 def vector_fields(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:
+    """The vector fields of every `diffrax.ODETerm`."""
     return [x.vector_field for x in _nested(terms) if isinstance(x, dfx.ODETerm)]
 
 

@@ -328,8 +328,12 @@ INDEX_2 = pair(lambda t, x, z, a: z, lambda t, x, z, a: x - a)
     ids=["singular", "no root"],
 )
 def test_a_singular_state_is_refused(dae, x, z, errors_raise):
+    given = jnp.array(x), jnp.array(z), jnp.array(1.0)
+    consistent = lambda x, z, args: dae.consistent(x, z, args=args)  # noqa: E731
+    with pytest.raises(ValueError, match=r"^`consistent` found no state"):
+        consistent(*given)
     with pytest.raises(Exception, match="`consistent` found no state"):
-        dae.consistent(jnp.array(x), jnp.array(z), args=jnp.array(1.0))
+        eqx.filter_jit(consistent)(*given)
 
 
 @some_of("controller", [PRECISE, dfx.ConstantStepSize()], ids=["adaptive", "fixed"], period=2)
@@ -341,6 +345,7 @@ def test_a_solve_into_a_singular_state_fails(controller):
 
 
 X = jnp.ones(2)
+PAIRED = pair(lambda t, x, z, args: (x, x), lambda t, x, z, args: x - z)
 SPARE = pair(lambda t, x, z, args: x, lambda t, x, z, args: x - z)
 
 
@@ -353,6 +358,7 @@ SPARE = pair(lambda t, x, z, args: x, lambda t, x, z, args: x - z)
         (lambda: SPARE.consistent(X, jnp.array(1.0)), ValueError, "numbers, but `z` has"),
         (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
         (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
+        (lambda: PAIRED.consistent(X[0], X[0]), ValueError, "`f` returns .* like `x`"),
     ],
 )
 def test_mistakes_are_named(make, error, match):
