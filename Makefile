@@ -138,7 +138,7 @@ COSTS := scaling balance dae stiff
 TRAININGS := zoo paper chemistry worth
 STUDIES := long_run metric verdict
 PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms \
-  positive_chemistry pinn_issues
+  positive_chemistry sympflow pinn_issues
 
 bench: $(BENCH) ## measure cost, precision and scaling; tables and figures of the docs
 	set -e; for name in $(COSTS); do $(BIN)/python benchmarks/cost/$$name.py; done

@@ -18,12 +18,13 @@ import mechanisms
 import pinn_issues
 import positive_chemistry
 import sundials
+import sympflow
 
 PAGE = common.measuring.RESULTS.parents[1] / "docs" / "published.md"
 # In the order of the page.
 ROWS = (
     *(sundials, homproj_paper, heyoka_page, discrete_gradient, julia_energy, mechanisms),
-    *(positive_chemistry, pinn_issues),
+    *(positive_chemistry, sympflow, pinn_issues),
 )
 
 
@@ -87,6 +88,7 @@ def tables(results):
         "default tolerances": julia_energy.loose_table(results[julia_energy]),
         "mechanisms": mechanisms.table(results[mechanisms]),
         "concentrations": positive_chemistry.table(results[positive_chemistry]),
+        "sympflow": sympflow.table(results[sympflow]),
         "questions": pinn_issues.table(results[pinn_issues]),
     }
 
