@@ -14,11 +14,13 @@ import discrete_gradient
 import heyoka_page
 import homproj_paper
 import julia_energy
+import matplotlib as mpl
 import mechanisms
 import pinn_issues
 import positive_chemistry
 import sundials
 import sympflow
+from matplotlib.figure import Figure
 
 PAGE = common.measuring.RESULTS.parents[1] / "docs" / "published.md"
 # In the order of the page.
@@ -103,6 +105,30 @@ def filled(text, results):
     return text
 
 
+def figure(results):
+    """Errors of three comparisons against what they cost."""
+    pendulum = [x for x in results[sundials]["rows"] if x["problem"] == "pendulum"]
+    panels = (
+        ("pendulum of SUNDIALS", pendulum, "evaluations", ("CVODE, projected, published",
+         "Dopri8, projected", "Dopri8, projected and energy")),
+        ("Kepler, of homproj", results[homproj_paper]["kepler"], "evaluations",
+         ("homproj, H, L, A_x", "ours, plain", "ours, H, L, A_x")),
+        ("Hénon-Heiles, of SympFlow", results[sympflow]["rows"], "seconds",
+         ("SympFlow", "ours, projected", "RK4, 4 steps, projected", "Dopri8, 1 step, projected")),
+    )  # fmt: skip
+    drawn = Figure(figsize=(9.6, 4.2))
+    for ax, (title, rows, cost, programs) in zip(drawn.subplots(1, 3), panels, strict=True):
+        for program in programs:
+            points = [(x[cost], x["error"]) for x in rows if x["program"] == program]
+            style = "o-" if cost == "evaluations" else "o"  # of several seeds
+            ax.loglog(*zip(*points, strict=True), style, markersize=4, label=program)
+        ax.set(title=title, xlabel=cost, ylabel="error")
+        ax.set_xlim((1e3, 5e4) if cost == "evaluations" else None)
+        ax.xaxis.set_minor_formatter("")
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8)
+    drawn.savefig(PAGE.parent / "images" / "published.svg", metadata={"Date": None})
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--write", action="store_true", help="the tables of the page")
@@ -111,6 +137,8 @@ def main(argv=None):
     print("\n".join([*summary(results), *verdict_table(results)]))
     if options.write:
         PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), results), encoding="utf-8")
+        with mpl.rc_context(fname=PAGE.parent / "figures.mplstyle"):
+            figure(results)
 
 
 if __name__ == "__main__":
