@@ -493,7 +493,7 @@ def _consistent(
         return y, info.ok
 
     # The tolerance follows the roundoff at the guess, so the second time judges by that at the
-    # state. `project` does the same, and compiles nearly twice as much.
+    # state. `project` measures twice too, in two programs, and compiles nearly twice as much.
     found, ok = lax.scan(nearer, y, length=2)
     return found, ok[1]
 

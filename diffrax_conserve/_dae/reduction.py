@@ -274,13 +274,8 @@ def _general_position(
     for share in (1e-1, 1e-3, 1e-5, 0.0):
         t, moved, by_slope, is_linear, absent, finite = near(share)
         if finite:
-            return (
-                t,
-                moved,
-                np.array(by_slope),
-                bool(is_linear),
-                tuple(np.flatnonzero(absent).tolist()),
-            )
+            positions = tuple(np.flatnonzero(absent).tolist())
+            return t, moved, np.array(by_slope), bool(is_linear), positions
     raise FloatingPointError
 
 

@@ -133,9 +133,9 @@ class Unrolled(_Explicit, dfx.AbstractAdaptiveSolver[None]):
     diffrax keeps the stages $k_i = f(t + c_i h, y + h \sum_j a_{ij} k_j)$ of a step in one array,
     so that in a batch every stage goes through memory. Written out, the whole step is one
     expression, which XLA keeps in registers: with the same steps, error estimate and dense output,
-    up to the order of summation, a batch of small systems is about ten times as fast.
-    Compile time grows with the number of stages times the size of
-    the vector field. A large system or a single long solve gains nothing.
+    up to the order of summation, a batch of small systems is about ten times as fast. Compile time
+    grows with the number of stages times the size of the vector field. A large system or a single
+    long solve gains nothing.
 
     !!! example
 

@@ -74,11 +74,11 @@ class Along(AbstractSystem):
     Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
     derivative would divide the error of the candidate's derivative by the sine of their angle. In
     the step of a solve it is of no use there: the candidate moves nearly along the manifold by
-    itself. So a constraint whose gradient is in the span of those before it, up to half of the
-    digits of its square, takes no part in the derivative, which then has the accuracy of the
-    wrapped solver in that direction. After more than `FROZEN_STEPS` steps the directions were those
-    at several states; the derivative is by those at the candidate all the same, which differ by
-    the size of the correction.
+    itself. So a constraint whose gradient is in the span of others, up to half of the digits of its
+    square, takes no part in the derivative, or little if there are more than four; see `linear`.
+    The derivative then has the accuracy of the wrapped solver in that direction. After more than
+    `FROZEN_STEPS` steps the directions were those at several states; the derivative is by those at
+    the candidate all the same, which differ by the size of the correction.
 
     The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
     times a tangent that is not finite would be NaN. So where nothing was found we differentiate at

@@ -4,9 +4,10 @@ The matrices are singular where constraints depend on each other, as when an int
 twice. Their multipliers are then not determined, but what they move is, if the constraints do not
 contradict each other. There are three ways to solve such a system, by its size.
 
-- Up to four constraints are eliminated one after the other, written out in scalars. If the gradient
-  of a constraint is a combination of those before it, its pivot is roundoff. We give it the
-  multiplier zero: if the others hold, it holds too. Gradients that are only nearly parallel are all
+- Up to four constraints are eliminated one after the other, written out in scalars, and next always
+  the one whose gradient is farthest from a combination of those before it. Once it is such a
+  combination, its pivot is roundoff. We give it the multiplier zero: if the others hold, it holds
+  too. Gradients that are only nearly parallel are all
   kept, because a correction needs the direction in which they differ. A derivative does not, and
   would lose its digits in that direction; see `implicit`.
 - More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a

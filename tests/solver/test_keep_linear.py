@@ -44,6 +44,12 @@ def solved(solver, controller, x, stiffness, adjoint=dfx.ForwardMode(), **option
     )  # fmt: skip
 
 
+def steps(solver, y0, args, field=springs, **options):
+    """A solve that saves all of its steps."""
+    saveat = dfx.SaveAt(steps=True, t0=True)
+    return problems.solve(field, solver, y0, args=args, saveat=saveat, **options)
+
+
 FIXED, ADAPTIVE = dfx.ConstantStepSize(), dfx.PIDController(rtol=1e-5, atol=1e-5)
 
 
@@ -93,10 +99,7 @@ def test_the_method_of_euler_moves_in_its_first_step():
 
     @jax.jit
     def found(y0, args):
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(springs), kept, 0.0, 0.05, 0.005, y0, args,
-            saveat=dfx.SaveAt(steps=True, t0=True), max_steps=16,
-        )  # fmt: skip
+        sol = steps(kept, y0, args, t1=0.05, dt0=0.005, max_steps=16)
         values = [jax.vmap(f, (None, 0, None))(0.0, sol.ys, args) for f in (energy, momentum)]
         return *(jnp.max(jnp.abs(v - v[0]), where=jnp.isfinite(v), initial=0) for v in values), sol
 
@@ -114,10 +117,7 @@ def test_a_declared_linear_invariant_is_kept_too():
 
     @jax.jit
     def off(y0, args):
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(springs), solver, 0.0, 6.0, 0.1, y0, args,
-            saveat=dfx.SaveAt(steps=True, t0=True), max_steps=64,
-        )  # fmt: skip
+        sol = steps(solver, y0, args, t1=6.0, max_steps=64)
         return dfc.off_manifold(sol, manifold, args=args)
 
     assert not np.any(off(start(0.4), 2.0))
@@ -138,9 +138,9 @@ def test_five_integrals_take_the_directions_of_two_steps():
         return (jnp.sum(v**2, axis=0) + stiffness * (q[0] - q[1]) ** 2) / 2
 
     squares = jnp.arange(10.0).reshape(2, 5) ** 2
-    y0, saveat = (jnp.sin(squares), jnp.cos(squares)), dfx.SaveAt(steps=True, t0=True)
+    y0 = jnp.sin(squares), jnp.cos(squares)
     solver = dfc.ManifoldProjection(dfc.RK4(), dfc.FirstIntegral(energies), keep_linear=True)
-    _, v = problems.solve(field, solver, y0, t1=0.45, saveat=saveat, max_steps=5).ys
+    _, v = steps(solver, y0, None, field, t1=0.45, max_steps=5).ys
     first, *later = np.abs(np.diff(np.sum(v, axis=1), axis=0)).max(axis=1)
     assert first > 1e-8
     assert max(later) < 1e-3 * first
