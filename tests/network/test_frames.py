@@ -108,7 +108,6 @@ def test_mistakes_are_named(make, error, match):
 
 
 KEPLER = dfc.systems.Kepler(mu=1.7)
-Y0S = states(system=KEPLER)
 
 
 def reflected(y, angle=0.7, scale=1.3, mirror=-1.0):
@@ -122,11 +121,12 @@ def reflected(y, angle=0.7, scale=1.3, mirror=-1.0):
 @some_of("core, order", [("product", 0), ("concatenated", 1), ("gated", 2)], ids=CORES, period=3)
 def test_untrained_it_commutes_with_those_of_kepler(core, order):
     taylor = dfc.learned.Taylor(KEPLER.vector_field, order) if order else None
+    y0s = states(system=KEPLER)
     network = dfc.DeepONet(
-        Y0S, 0.1, taylor=taylor, core=core, frame=KEPLER.frame, key=jr.key(0), **SMALL
+        y0s, 0.1, taylor=taylor, core=core, frame=KEPLER.frame, key=jr.key(0), **SMALL
     )
     step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
-    found, expected = step(reflected(Y0S), 0.1 * 1.3**1.5), reflected(step(Y0S, 0.1))
+    found, expected = step(reflected(y0s), 0.1 * 1.3**1.5), reflected(step(y0s, 0.1))
     scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in expected)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * scale)

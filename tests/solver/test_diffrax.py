@@ -47,8 +47,11 @@ def rotation(t, y, args):
 
 def test_backsolve_adjoint_explains():
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=inner\)"):
-        jax.grad(lambda y0: solve(rigid_body, BALL, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0])(
-            OMEGA0
+        jax.eval_shape(
+            jax.grad(
+                lambda y0: solve(rigid_body, BALL, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0]
+            ),
+            OMEGA0,
         )
 
 

@@ -169,22 +169,29 @@ def test_the_losses():
     np.testing.assert_allclose(bounded, np.mean([0, 1 / (1 + 1 / 3), 3 / 2, 3.0]), rtol=1e-10)
 
 
-RECIPE, WITHOUT_WEIGHTS, SINGLE = dfc.learned.Recipe, Still(), in_single(flow_map())
-TERM, ONE_STATE = dfx.ODETerm(LORENZ.vector_field), dfc.DeepONet(LORENZ.y0, 0.1, key=jr.key(0))
-NO_DOMAIN, TAYLOR = Within(flow_map(), None), dict(vector_field=LORENZ.vector_field)
+RECIPE, TERM = dfc.learned.Recipe, dfx.ODETerm(LORENZ.vector_field)
+TAYLOR = dict(vector_field=LORENZ.vector_field)
 
 
 @pytest.mark.parametrize(
     ("make", "error", "match"),
     [
         (lambda: refuse(sample=LORENZ.sample), ValueError, "leave `sample` and"),
-        (lambda: refuse(NO_DOMAIN, **TAYLOR), ValueError, "pass `sample`"),
+        (lambda: refuse(Within(flow_map(), None), **TAYLOR), ValueError, "pass `sample`"),
         (lambda: refuse(vector_field=TERM), TypeError, "pass its `vector_field`"),
-        (lambda: refuse(ONE_STATE, **TAYLOR), TypeError, r"Here a state is f64\[\]. For one state"),
+        (
+            lambda: refuse(dfc.DeepONet(LORENZ.y0, 0.1, key=KEY, **SMALL), **TAYLOR),
+            TypeError,
+            r"Here a state is f64\[\]. For one state",
+        ),
         (lambda: refuse(LAYER), TypeError, "max_step"),
-        (lambda: refuse(WITHOUT_WEIGHTS, sample=LORENZ.sample), ValueError, "no weights of its"),
+        (lambda: refuse(Still(), sample=LORENZ.sample), ValueError, "no weights of its"),
         (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
-        (lambda: refuse(SINGLE, **TAYLOR), TypeError, "Train it in double precision"),
+        (
+            lambda: refuse(in_single(flow_map()), **TAYLOR),
+            TypeError,
+            "Train it in double precision",
+        ),
         (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data` out"),
         (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
         (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),
