@@ -83,9 +83,10 @@ def test_a_pinn_may_start_later_and_go_back():
 
 @some_of("name", ["deeponet", "pinn"], period=2)
 def test_backsolve_adjoint_explains(name):
+    solver = of(name)
     with pytest.raises(ValueError, match=r"BacksolveAdjoint\(solver=diffrax.Tsit5\(\)\)"):
         jax.eval_shape(
-            jax.grad(lambda y0: solve(of(name), y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0]),
+            jax.grad(lambda y0: solve(solver, y0, adjoint=dfx.BacksolveAdjoint()).ys[0, 0]),
             LORENZ.y0,
         )
 
@@ -171,8 +172,10 @@ def test_nothing_raises_in_a_batch(name, controller, errors_raise):
         pytest.skip("it has no error estimate, or is tried again with a shorter step")
     options = dict(y0=LORENZ.y0, t1=1.0, max_steps=16, throw=False) | options
 
+    solver = make()
+
     def lane(y0):
-        return solve(make(), **(options | dict(y0=y0, stepsize_controller=controller)))
+        return solve(solver, **(options | dict(y0=y0, stepsize_controller=controller)))
 
     both = jax.vmap(lane)(jnp.stack([options["y0"], LORENZ.y0]))
     result = jax.tree.map(lambda x: x[0], both.result)
