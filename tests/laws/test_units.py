@@ -251,9 +251,10 @@ def test_in_peoples_units_the_drift_is_roundoff_and_plain_is_beaten(name, dtype)
 
 def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another():
     """By the sizes and the changes of a step: `sqrt(4 · 1)` and `sqrt(2 · 0.02)`."""
-    place, speed = jnp.array([[0.0, 4.0], [3.0, 0.0]]), jnp.array([2.0, 0.0])
-    moved = (place - jnp.array([[1.0, 0.0], [0.0, 0.0]]), speed - jnp.array([0.02, 0.0]))
+    place, speed = np.array([[0.0, 4.0], [3.0, 0.0]]), np.array([2.0, 0.0])
+    moved = (place - np.array([[1.0, 0.0], [0.0, 0.0]]), speed - np.array([0.02, 0.0]))
 
+    @jax.jit
     def units(start, end):
         zero = jax.tree.map(jnp.zeros_like, start)
         state = SimpleNamespace(motion=ravel(zero))
@@ -262,6 +263,6 @@ def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another(
     eps = np.finfo(float).eps
     of_leaves = units(moved, (place, speed))
     np.testing.assert_allclose(of_leaves, [2, 2, *[3 * eps**0.5] * 2, 0.2, 0.2])
-    of_array = units(ravel(moved), ravel((place, speed)))
+    of_array = units(np.asarray(ravel(moved)), np.asarray(ravel((place, speed))))
     np.testing.assert_allclose(of_array[np.array([1, 2, 4])], [4 * eps**0.5, 3 * eps**0.5, 0.2])
     assert of_array[5] == 0

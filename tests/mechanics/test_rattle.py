@@ -330,7 +330,7 @@ def test_failures_are_results():
         (TERMS, THREE, (q + 0.1, v), 0.01, "cannot start"),
         (TERMS, THREE, (q, v + jnp.array([1.0, 0.0])), 0.01, "cannot start"),
         (broken, THREE, (q, v), 0.01, "not finite"), (TERMS, one, (q, v), 0.01, "not reached"),
-        (terms(fall), THREE, (q, v), 5.0, ""),
+        (TERMS, THREE, (q, v), 5.0, "not finite"),
     ):  # fmt: skip
         sol = solve(pair, solver, y0, 0.0, 1.0 if h < 1 else 10.0, h)
         assert not dfx.is_okay(sol.result)

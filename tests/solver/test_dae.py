@@ -26,7 +26,7 @@ PRECISE = dfx.PIDController(rtol=1e-11, atol=1e-11)
 
 
 def constant(t, z, a):
-    return 1.5 * z**2 + jnp.log(z) + a * t
+    return 1.5 * z**2 + np.log(z) + a * t
 
 
 @eqx.filter_jit
@@ -60,12 +60,12 @@ def ends(x, a, adjoint):
 @some_of("solver", [dfx.Tsit5(), dfx.Kvaerno5()], ids=["Tsit5", "Kvaerno5"], period=2)
 def test_a_known_solution(solver):
     """At saved times too, where Kvaerno5 has a dense output of order 3."""
-    a, start = jnp.array(0.7), jnp.array(2.0)
+    a, start = np.array(0.7), jnp.array(2.0)
     every = [dfx.SubSaveAt(t0=True, steps=True), dfx.SubSaveAt(ts=jnp.linspace(0, 1, 11))]
     found = solve(CUBIC, solver, start, jnp.array(1.0), a, saveat=dfx.SaveAt(subs=every))
     assert found.result == dfx.RESULTS.successful
-    (ts, _), ((_, z), saved) = found.ts, found.ys
-    ts, z = ts[jnp.isfinite(ts)], z[jnp.isfinite(ts)]
+    (ts, _), ((_, z), saved) = jax.tree.map(np.asarray, (found.ts, found.ys))
+    ts, z = ts[np.isfinite(ts)], z[np.isfinite(ts)]
     assert largest(constant(ts, z, a) - constant(0, z[0], a)) < 1e-9
     x, z = saved
     assert largest((z**3 + z - x) / x) < 4 * EPS
@@ -264,10 +264,10 @@ DIODE = pair(lambda t, x, z, args: 0 * x, lambda t, x, z, args: x - z - 1e-6 * j
 
 def test_newton_finds_the_voltage_at_a_diode():
     """From guesses at which the current is 1e80 A, or at which it is the least current."""
-    x, guess = jnp.meshgrid(jnp.linspace(-5, 5, 9), jnp.linspace(-5, 5, 11))
-    x, z = jax.vmap(DIODE.consistent)(x.ravel(), guess.ravel())
-    off = DIODE.algebraic(0, x, z, None)
-    scale = jnp.abs(x) + jnp.abs(z) + 1e-6 * jnp.exp(z / 0.025) * jnp.abs(z) / 0.025
+    x, guess = np.meshgrid(np.linspace(-5, 5, 9), np.linspace(-5, 5, 11))
+    x, z = map(np.asarray, jax.jit(jax.vmap(DIODE.consistent))(x.ravel(), guess.ravel()))
+    off = x - z - 1e-6 * np.expm1(z / 0.025)
+    scale = np.abs(x) + np.abs(z) + 1e-6 * np.exp(z / 0.025) * np.abs(z) / 0.025
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
@@ -275,8 +275,8 @@ def test_an_unknown_that_is_zero():
     """There the roundoff of the constants inside `g` is larger than all terms that its gradient
     shows."""
     dae = pair(lambda *_: 0.0, lambda t, x, z, a: a * (z + 0.1) - x)
-    for a in jnp.array([3.0, 0.3, 49.0]):
-        assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
+    root = lambda a: dae.consistent(0.1 * a, 0 * a, args=a)[1]  # noqa: E731
+    assert largest(jax.jit(jax.vmap(root))(np.array([3.0, 0.3, 49.0]))) <= EPS
 
 
 @pytest.mark.slow
@@ -306,16 +306,16 @@ def test_an_ill_conditioned_matrix():
 
 def test_units_change_nothing():
     """Equations and unknowns in other units: `A z + z³ = b`, with `A` not diagonally dominant."""
-    key = jax.random.key(1)
-    matrix, b = jax.random.normal(key, (4, 4)), jnp.arange(1.0, 5.0)
-    rows, columns = 2.0 ** jnp.array([30, 0, -30, 7]), 2.0 ** jnp.array([-40, 20, 0, 5])
+    matrix, b = np.random.default_rng(1).normal(size=(4, 4)), np.arange(1.0, 5.0)
+    rows, columns = 2.0 ** np.array([30, 0, -30, 7]), 2.0 ** np.array([-40, 20, 0, 5])
 
+    @jax.jit
     def root(rows, columns):
         g = lambda t, x, z, args: rows * (matrix @ (z * columns) + (z * columns) ** 3 - b)  # noqa: E731
         dae = pair(lambda *_: 0.0, g)
         return dae.consistent(jnp.array(0.0), 0.1 * jnp.ones(4) / columns)[1] * columns
 
-    assert np.allclose(root(rows, columns), root(jnp.ones(4), jnp.ones(4)), rtol=1e-13)
+    assert np.allclose(root(rows, columns), root(np.ones(4), np.ones(4)), rtol=1e-13)
 
 
 CIRCLE = pair(lambda t, x, z, a: a, lambda t, x, z, a: x**2 + z**2 - 1)
@@ -340,7 +340,8 @@ def test_a_singular_state_is_refused(dae, x, z, errors_raise):
 def test_a_solve_into_a_singular_state_fails(controller):
     """On a circle `z` ends at `x = 1`, which is reached at `t = 1`."""
     start = jnp.array(0.0), jnp.array(1.0), jnp.array(1.0)
-    found = solve(CIRCLE, dfx.Tsit5(), *start, t1=2.0, controller=controller, dt0=0.01)
+    options = dict(controller=controller, dt0=0.01, saveat=dfx.SaveAt(t1=True))
+    found = solve(CIRCLE, dfx.Heun(), *start, t1=2.0, **options)
     assert found.result != dfx.RESULTS.successful
 
 

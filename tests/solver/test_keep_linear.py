@@ -161,4 +161,4 @@ def test_more_constraints_than_directions_are_refused():
     many = dfc.FirstIntegral(lambda t, y, args: jnp.concatenate(y))
     solver = dfc.ManifoldProjection(dfc.RK4(), many, keep_linear=True)
     with pytest.raises(ValueError, match=r"keep_linear.*8 directions.*10 scalar.*compare"):
-        solver.init(dfx.ODETerm(springs), 0.0, 0.1, start(0.4), 2.0)
+        jax.eval_shape(lambda x: solver.init(dfx.ODETerm(springs), 0.0, 0.1, start(x), 2.0), 0.4)

@@ -71,6 +71,7 @@ def explosive(t, y, args):
 def test_every_pair_of_times_within_a_step_is_drawn_and_no_other():
     ts = np.array([[0.0, 0.2, 0.5, 0.6]])  # the longest step is 0.5
     pairs = as_data((ts, np.stack([ts, 2 * ts], axis=2)), network()).draw(1000, KEY)
+    pairs = jax.tree.map(np.asarray, pairs)
     drawn = np.unique(np.stack([pairs.y0s[:, 0], pairs.y1s[:, 0]], axis=1), axis=0)
     assert drawn.tolist() == [[0.0, 0.2], [0.0, 0.5], [0.2, 0.5], [0.2, 0.6], [0.5, 0.6]]
     np.testing.assert_array_equal(pairs.hs, (pairs.y1s - pairs.y0s)[:, 0])
