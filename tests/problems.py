@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import diffrax_conserve as dfc
 
@@ -112,6 +113,18 @@ def drift_of(sol, manifold, args=None):
 def evaluated(sol, ts):
     """The dense output at several times, in one program."""
     return jax.vmap(sol.evaluate)(ts)
+
+
+def refused(*cases):
+    """The test that each `(make, error, match)`, or `(make, match)`, is refused with a message."""
+    cases = [(make, error or (TypeError, ValueError), match) for make, *error, match in cases]
+
+    @pytest.mark.parametrize(("make", "error", "match"), cases)
+    def test_mistakes_are_named(make, error, match):
+        with pytest.raises(tuple(error), match=match):
+            make()
+
+    return test_mistakes_are_named
 
 
 def largest(tree):

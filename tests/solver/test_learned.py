@@ -15,6 +15,7 @@ import diffrax_conserve as dfc
 
 from .. import problems
 from ..learned import LORENZ, flow_map, solution, unchecked
+from ..problems import refused
 from ..thinned import some_of
 
 
@@ -202,23 +203,17 @@ def test_roundoff_in_the_times_is_not_refused():
     assert solve(tenth, t1=10.0, dt0=0.1).result == dfx.RESULTS.successful
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "text"),
-    [
-        (lambda: unchecked(lambda y0, h: y0), TypeError, None),
-        (lambda: dfc.PINNSolver(network("deeponet")), TypeError, None),
-        (lambda: FLOW(nodes=1), ValueError, "`nodes` is 1, but must be"),
-        (lambda: FLOW(corrections=-1), ValueError, "`corrections` is -1"),
-        (
-            lambda: problems.solve(lambda t, y, args: y, FOLLOW(), (LORENZ.y0, LORENZ.y0)),
-            ValueError,
-            "but the state has",
-        ),
-    ],
+test_arguments_that_are_refused = refused(
+    (lambda: unchecked(lambda y0, h: y0), TypeError, None),
+    (lambda: dfc.PINNSolver(network("deeponet")), TypeError, None),
+    (lambda: FLOW(nodes=1), ValueError, "`nodes` is 1, but must be"),
+    (lambda: FLOW(corrections=-1), ValueError, "`corrections` is -1"),
+    (
+        lambda: problems.solve(lambda t, y, args: y, FOLLOW(), (LORENZ.y0, LORENZ.y0)),
+        ValueError,
+        "but the state has",
+    ),
 )
-def test_arguments_that_are_refused(make, error, text):
-    with pytest.raises(error, match=text):
-        make()
 
 
 def test_a_pinn_has_no_error_estimate_for_adaptive_steps(errors_raise):

@@ -12,7 +12,7 @@ from scipy.special import ellipj
 
 import diffrax_conserve as dfc
 
-from ..problems import largest
+from ..problems import largest, refused
 from ..test_benchmarks import benchmark
 
 EPS = np.finfo(np.float64).eps
@@ -291,53 +291,47 @@ DOUBLED = dfc.DAE(amplifier, mass=2 * MASS)
 NOWHERE = dfc.DAE(residual=lambda t, y, dy, args: dy - jnp.log(-jnp.abs(y)))
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "match"),
-    [
-        (lambda: dfc.DAE(lambda t, y, args: y), ValueError, r"`diffrax.ODETerm\(f\)`"),
-        (lambda: dfc.DAE(amplifier, mass=MASS, algebraic=akzo), ValueError, "is given as"),
-        (lambda: dfc.DAE(residual=amplifier), TypeError, "`residual` of a `DAE`"),
-        (lambda: dfc.DAE(amplifier, mass=MASS[:3]), ValueError, "`mass` of a `DAE`"),
-        (lambda: dfc.DAE(amplifier, mass=MASS * np.nan), ValueError, "not finite"),
-        (lambda: dfc.DAE(akzo, mass=MASS), TypeError, "`f` of a `DAE`"),
-        (lambda: AMPLIFIER.consistent(START[:2]), ValueError, "the state has 2|`f`"),
-        (lambda: AMPLIFIER.consistent(ONE, ONE), ValueError, "1 positional"),
-        (lambda: AMPLIFIER.consistent(START, fixed=(True, False)), ValueError, "`fixed`"),
-        (lambda: AMPLIFIER.consistent(jnp.ones(8, int)), TypeError, "floating-point"),
-        (lambda: NOWHERE.report(ONE), ValueError, "not finite"),
-        (
-            lambda: dfc.DAE(residual=lambda t, y, dy, args: dy[:1] - y[:1]).consistent(ONE),
-            ValueError,
-            "`residual` returns 1 numbers, but the state has 2",
+test_mistakes_are_named = refused(
+    (lambda: dfc.DAE(lambda t, y, args: y), ValueError, r"`diffrax.ODETerm\(f\)`"),
+    (lambda: dfc.DAE(amplifier, mass=MASS, algebraic=akzo), ValueError, "is given as"),
+    (lambda: dfc.DAE(residual=amplifier), TypeError, "`residual` of a `DAE`"),
+    (lambda: dfc.DAE(amplifier, mass=MASS[:3]), ValueError, "`mass` of a `DAE`"),
+    (lambda: dfc.DAE(amplifier, mass=MASS * np.nan), ValueError, "not finite"),
+    (lambda: dfc.DAE(akzo, mass=MASS), TypeError, "`f` of a `DAE`"),
+    (lambda: AMPLIFIER.consistent(START[:2]), ValueError, "the state has 2|`f`"),
+    (lambda: AMPLIFIER.consistent(ONE, ONE), ValueError, "1 positional"),
+    (lambda: AMPLIFIER.consistent(START, fixed=(True, False)), ValueError, "`fixed`"),
+    (lambda: AMPLIFIER.consistent(jnp.ones(8, int)), TypeError, "floating-point"),
+    (lambda: NOWHERE.report(ONE), ValueError, "not finite"),
+    (
+        lambda: dfc.DAE(residual=lambda t, y, dy, args: dy[:1] - y[:1]).consistent(ONE),
+        ValueError,
+        "`residual` returns 1 numbers, but the state has 2",
+    ),
+    (  # the same equation twice
+        lambda: dfc.DAE(residual=lambda t, y, dy, args: (y[0], y[0])).consistent(ONE),
+        ValueError,
+        r"singular: `\[1\]`",
+    ),
+    (  # an unknown that no equation contains
+        lambda: dfc.DAE(residual=lambda t, y, dy, args: dy * jnp.array([1.0, 0])).report(ONE),
+        ValueError,
+        r"singular: `\[1\]`.*No equation contains `y\[1\]`",
+    ),
+    (
+        lambda: jax.eval_shape(
+            lambda y: solve(DOUBLED.term, AMPLIFIER.wrap(dfc.Radau()), 1.0, y, None, 1e-6),
+            START,
         ),
-        (  # the same equation twice
-            lambda: dfc.DAE(residual=lambda t, y, dy, args: (y[0], y[0])).consistent(ONE),
-            ValueError,
-            r"singular: `\[1\]`",
-        ),
-        (  # an unknown that no equation contains
-            lambda: dfc.DAE(residual=lambda t, y, dy, args: dy * jnp.array([1.0, 0])).report(ONE),
-            ValueError,
-            r"singular: `\[1\]`.*No equation contains `y\[1\]`",
-        ),
-        (
-            lambda: jax.eval_shape(
-                lambda y: solve(DOUBLED.term, AMPLIFIER.wrap(dfc.Radau()), 1.0, y, None, 1e-6),
-                START,
-            ),
-            ValueError,
-            "of the same `dae`",
-        ),
-        (lambda: AMPLIFIER.wrap(AMPLIFIER.wrap(dfc.Radau())), TypeError, "itself"),
-        (lambda: dfc.Radau(root_finder=3), TypeError, "VeryChord"),
-        (lambda: AMPLIFIER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
-        (
-            lambda: jax.jit(lambda m: dfc.DAE(amplifier, mass=m).term.vf(0.0, START, None))(MASS),
-            TypeError,
-            r"a function `mass\(t, y, args\)`",
-        ),
-    ],
+        ValueError,
+        "of the same `dae`",
+    ),
+    (lambda: AMPLIFIER.wrap(AMPLIFIER.wrap(dfc.Radau())), TypeError, "itself"),
+    (lambda: dfc.Radau(root_finder=3), TypeError, "VeryChord"),
+    (lambda: AMPLIFIER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
+    (
+        lambda: jax.jit(lambda m: dfc.DAE(amplifier, mass=m).term.vf(0.0, START, None))(MASS),
+        TypeError,
+        r"a function `mass\(t, y, args\)`",
+    ),
 )
-def test_mistakes_are_named(make, error, match):
-    with pytest.raises(error, match=match):
-        make()

@@ -14,6 +14,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from ..learned import EAST, LORENZ, RADIUS, SMALL, Still, Within, flow_map, in_single, oscillator
+from ..problems import refused
 from ..thinned import some_of
 
 # Most of these trainings are too short, and say so; no library may warn of anything.
@@ -173,43 +174,37 @@ RECIPE, TERM = dfc.learned.Recipe, dfx.ODETerm(LORENZ.vector_field)
 TAYLOR = dict(vector_field=LORENZ.vector_field)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "match"),
-    [
-        (lambda: refuse(sample=LORENZ.sample), ValueError, "leave `sample` and"),
-        (lambda: refuse(Within(flow_map(), None), **TAYLOR), ValueError, "pass `sample`"),
-        (lambda: refuse(vector_field=TERM), TypeError, "pass its `vector_field`"),
-        (
-            lambda: refuse(dfc.DeepONet(LORENZ.y0, 0.1, key=KEY, **SMALL), **TAYLOR),
-            TypeError,
-            r"Here a state is f64\[\]. For one state",
-        ),
-        (lambda: refuse(LAYER), TypeError, "max_step"),
-        (lambda: refuse(Still(), sample=LORENZ.sample), ValueError, "no weights of its"),
-        (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
-        (
-            lambda: refuse(in_single(flow_map()), **TAYLOR),
-            TypeError,
-            "Train it in double precision",
-        ),
-        (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data` out"),
-        (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
-        (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),
-        (lambda: refuse(key=0), TypeError, "`key` is "),
-        (lambda: refuse(seconds="a"), TypeError, "`seconds` is "),
-        (lambda: refuse(seconds=-1.0), ValueError, "must be positive"),
-        (lambda: refuse(target=[1e-3]), TypeError, "`target` is "),
-        (lambda: refuse(target=0.0), ValueError, "must be positive"),
-        (lambda: RECIPE(epochs=0), ValueError, "`epochs` is 0, but it must be a positive integer"),
-        (lambda: dfc.learned.second_order(circle(), epochs=0), ValueError, "`epochs` is 0, but"),
-        (lambda: RECIPE(refresh=0), ValueError, "`refresh`"),
-        (lambda: RECIPE(optimiser="adam"), TypeError, "`optimiser` is 'adam', .*one of 'spring'"),
-        (lambda: RECIPE(optimiser="spring", damping=0.0), ValueError, "`damping` .*must be"),
-    ],
+test_mistakes_are_named = refused(
+    (lambda: refuse(sample=LORENZ.sample), ValueError, "leave `sample` and"),
+    (lambda: refuse(Within(flow_map(), None), **TAYLOR), ValueError, "pass `sample`"),
+    (lambda: refuse(vector_field=TERM), TypeError, "pass its `vector_field`"),
+    (
+        lambda: refuse(dfc.DeepONet(LORENZ.y0, 0.1, key=KEY, **SMALL), **TAYLOR),
+        TypeError,
+        r"Here a state is f64\[\]. For one state",
+    ),
+    (lambda: refuse(LAYER), TypeError, "max_step"),
+    (lambda: refuse(Still(), sample=LORENZ.sample), ValueError, "no weights of its"),
+    (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
+    (
+        lambda: refuse(in_single(flow_map()), **TAYLOR),
+        TypeError,
+        "Train it in double precision",
+    ),
+    (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data` out"),
+    (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
+    (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),
+    (lambda: refuse(key=0), TypeError, "`key` is "),
+    (lambda: refuse(seconds="a"), TypeError, "`seconds` is "),
+    (lambda: refuse(seconds=-1.0), ValueError, "must be positive"),
+    (lambda: refuse(target=[1e-3]), TypeError, "`target` is "),
+    (lambda: refuse(target=0.0), ValueError, "must be positive"),
+    (lambda: RECIPE(epochs=0), ValueError, "`epochs` is 0, but it must be a positive integer"),
+    (lambda: dfc.learned.second_order(circle(), epochs=0), ValueError, "`epochs` is 0, but"),
+    (lambda: RECIPE(refresh=0), ValueError, "`refresh`"),
+    (lambda: RECIPE(optimiser="adam"), TypeError, "`optimiser` is 'adam', .*one of 'spring'"),
+    (lambda: RECIPE(optimiser="spring", damping=0.0), ValueError, "`damping` .*must be"),
 )
-def test_mistakes_are_named(make, error, match):
-    with pytest.raises(error, match=match):
-        make()
 
 
 def refuse(model=None, **options):
