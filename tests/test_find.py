@@ -151,35 +151,15 @@ NOT = {
     "two oscillators": (damped(jnp.array([1e-3, 2e-3])), 4),
     "Hénon-Heiles": (henon_heiles, 4),
     "pendulum": (lambda t, y, a: jnp.stack([y[1], -jnp.sin(y[0]) - 1e-9 * y[1]]), 2),
-    "Duffing": (lambda t, y, a: jnp.stack([y[1], y[0] - y[0] ** 3 - 1e-3 * y[1]]), 2),
-    "van der Pol": (lambda t, y, a: jnp.stack([y[1], (1 - y[0] ** 2) * y[1] - y[0]]), 2),
     "Lorenz": (
         lambda t, y, a: jnp.stack(
             [10 * (y[1] - y[0]), y[0] * (28 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]]
         ),
         3,
     ),
-    "Rössler": (
-        lambda t, y, a: jnp.stack([-y[1] - y[2], y[0] + y[1] / 5, 0.2 + y[2] * (y[0] - 5.7)]),
-        3,
-    ),
-    "Brusselator": (
-        lambda t, y, a: jnp.stack([1 + y[0] ** 2 * y[1] - 4 * y[0], 3 * y[0] - y[0] ** 2 * y[1]]),
-        2,
-    ),
-    "FitzHugh-Nagumo": (
-        lambda t, y, a: jnp.stack(
-            [y[0] - y[0] ** 3 / 3 - y[1] + 0.5, 0.08 * (y[0] + 0.7 - 0.8 * y[1])]
-        ),
-        2,
-    ),
     "logistic": (lambda t, y, a: y * (1 - y), 1),
     "heat": (lambda t, y, a: jnp.convolve(y, jnp.array([1.0, -2.0, 1.0]), "same"), 4),
     "Thomas": (lambda t, y, a: jnp.sin(jnp.roll(y, -1)) - y / 5, 3),
-    "Chua": (
-        lambda t, y, a: jnp.stack([9 * (y[1] - y[0] ** 3), y[0] - y[1] + y[2], -14 * y[1]]),
-        3,
-    ),
 }
 
 

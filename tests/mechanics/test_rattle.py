@@ -236,20 +236,6 @@ def test_derivatives_in_both_modes_against_finite_differences():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("beads", "times"), [(3, 2), (12, 4), (20, 2)])
-def test_constraints_given_several_times_change_nothing(beads, times):
-    """In a dense matrix, and in blocks."""
-    angles = 0.3 * jnp.arange(1.0, beads + 1)
-    q = jnp.cumsum(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), axis=0)
-    pair, y0, rod = terms(fall), (q, 0 * q), dfc.Constraint(rods)
-    found = [
-        final(solve(pair, dfc.RATTLE(constraint, 1.0), y0, 0.0, 0.2, 0.01))
-        for constraint in (rod, times * [rod])
-    ]
-    assert difference(*found) < 1e-13
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("squares", [1, 7])
 def test_one_brace_too_many_changes_nothing(squares):
     """The second diagonal of a rigid square says nothing new on the constraint, but contradicts the

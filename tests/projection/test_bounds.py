@@ -146,23 +146,6 @@ def test_what_cannot_be_fails(kind):
     assert not info.ok
 
 
-def decay(t, y, args):
-    """A chain of reactions so fast that Euler's method overshoots."""
-    return jnp.array([-30 * y[0], 30 * y[0] - 2 * y[1], 2 * y[1]])
-
-
-@pytest.mark.slow
-def test_a_solve_stays_within_the_bounds_between_its_steps_too():
-    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
-
-    solver = dfc.ManifoldProjection(dfx.Euler(), total, projection=dfc.SimplifiedNewton(lower=0.0))
-    y0, dt0, saveat = jnp.array([1.0, 0.0, 0.0]), 0.05, dfx.SaveAt(ts=jnp.linspace(0, 1, 101))
-    kept = one_solve(decay, solver, y0, dt0=dt0, saveat=saveat).ys
-    assert jnp.min(y0 + dt0 * decay(0.0, y0, None)) < -0.1  # the first step without bounds
-    assert jnp.min(kept) >= 0
-    assert jnp.max(jnp.abs(jnp.sum(kept, 1) - 1)) < 4e-15
-
-
 def wanted(t, within):
     """The total: one, or negative in the middle, which no state within the bounds has."""
     return jnp.where(within, 1.0, jnp.cos(2 * jnp.pi * t / 0.12))

@@ -178,84 +178,6 @@ def test_robertson_agrees_with_ida():
 
 # ---- A power system, whose network changes twice ----
 
-EMF, REACTANCE = np.array([1.05, 1.1]), np.array([0.2, 0.3])
-INERTIA, INPUT, DAMPING = np.array([0.05, 0.03]), np.array([0.8, 0.6]), 0.02
-
-
-def network(lines, fault=0.0):
-    """The admittances between two machines and a load, which a line joins to a rigid bus."""
-    matrix = np.diag([1 / 0.2j, 1 / 0.3j + fault, 1 / 0.25j + 0.9 - 0.3j])
-    for a, b, reactance in lines:
-        ends = np.ix_([a, b], [a, b])
-        matrix[ends] += np.array([[1, -1], [-1, 1]]) / (1j * reactance)
-    return matrix
-
-
-LINES = [(0, 2, 0.3), (1, 2, 0.4), (0, 1, 0.5)]
-NETWORKS = jnp.stack([network(LINES), network(LINES, -50j), network(LINES[:2])])
-TIMES = jnp.array([[0.0, 0.1], [0.1, 0.25], [0.25, 3.0]])
-
-
-def machines(t, x, v, matrix):
-    angle, speed = x
-    emf = EMF * jnp.exp(1j * angle)
-    power = jnp.real(emf * jnp.conj((emf - v[:2]) / (1j * REACTANCE)))
-    return speed, (INPUT - power - DAMPING * speed) / INERTIA
-
-
-def currents(angle):
-    return jnp.append(EMF * jnp.exp(1j * angle) / (1j * REACTANCE), 1 / 0.25j)
-
-
-def balance(t, x, z, matrix):
-    off = matrix @ jax.lax.complex(*z) - currents(x[0])
-    return off.real, off.imag
-
-
-SWING = pair(lambda t, x, z, args: machines(t, x, jax.lax.complex(*z), args), balance)
-REDUCED = dfx.ODETerm(
-    lambda t, x, args: machines(t, x, jnp.linalg.solve(args, currents(x[0])), args)
-)
-SWING0 = (jnp.array([0.57, 0.58]), jnp.zeros(2))
-FLAT = (jnp.ones(3), jnp.zeros(3))
-
-
-def through(solver, term, start, controller, x):
-    """The states at the ends of the three phases, and the steps."""
-
-    @eqx.filter_jit
-    def run(y):
-        def phase(y, given):
-            (t0, t1), matrix = given
-            found = dfx.diffeqsolve(
-                term, solver, t0, t1, None, start(y, matrix), matrix, stepsize_controller=controller
-            )
-            y = jax.tree.map(lambda y: y[-1], found.ys)
-            return y, (y, found.stats["num_steps"])
-
-        return jax.lax.scan(phase, y, (TIMES, NETWORKS))[1]
-
-    return run(x)
-
-
-@pytest.mark.slow
-def test_a_fault_of_a_power_system():
-    """As accurate as the same equations with the voltages eliminated, in about as many steps."""
-    of_x = dfx.PIDController(rtol=1e-7, atol=1e-7, norm=lambda e: optx.rms_norm(e[0]))
-    consistent = lambda y, matrix: SWING.consistent(*y, args=matrix)  # noqa: E731
-    (x, z), steps = through(SWING.wrap(dfx.Tsit5()), SWING.term, consistent, of_x, (SWING0, FLAT))
-    plain = lambda x, matrix: x  # noqa: E731
-    controllers = [dfx.PIDController(rtol=tol, atol=tol) for tol in (1e-7, 1e-13)]
-    (known, same), (exact, _) = (
-        through(solver, REDUCED, plain, controller, SWING0)
-        for solver, controller in zip((dfx.Tsit5(), dfx.Dopri8()), controllers, strict=True)
-    )
-    assert largest(steps - same) <= 2
-    errors = [largest(jax.tree.map(jnp.subtract, y, exact)) for y in (x, known)]
-    assert errors[0] <= 1.5 * errors[1]
-    off = jax.vmap(lambda x, z, args: balance(0, x, z, args))(x, z, NETWORKS)
-    assert largest(off) / largest(NETWORKS) < 4 * EPS
-
 
 # ---- Poor guesses, and failures ----
 
@@ -319,7 +241,6 @@ def test_units_change_nothing():
 
 
 CIRCLE = pair(lambda t, x, z, a: a, lambda t, x, z, a: x**2 + z**2 - 1)
-INDEX_2 = pair(lambda t, x, z, a: z, lambda t, x, z, a: x - a)
 
 
 @pytest.mark.parametrize(

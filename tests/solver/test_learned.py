@@ -92,33 +92,6 @@ def test_backsolve_adjoint_explains(name):
         )
 
 
-@pytest.mark.slow
-def test_random_networks_are_on_the_manifold_or_fail(errors_raise):
-    """Whatever the quality of the network."""
-
-    @eqx.filter_jit
-    def run(network):
-        solver = dfc.ManifoldProjection(
-            unchecked(network), LORENZ.manifold, projection=dfc.Newton()
-        )
-        sol = solve(solver, t1=5.0, saveat=dfx.SaveAt(t0=True, steps=True), throw=False)
-        drift = dfc.drift(sol, LORENZ.manifold)
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(d)) for d in drift.values()]))
-        return sol.result == dfx.RESULTS.successful, largest
-
-    outcomes = []
-    wild = flow_map()
-    for seed in range(10):
-        # From nearly nothing to wild.
-        factor = 10.0 ** (seed / 3 - 1.5)
-        key = jr.key(seed)
-        noisy = jax.tree.map(lambda x, k=key, f=factor: x + f * jr.normal(k, x.shape), wild.core)
-        ok, drift = run(eqx.tree_at(lambda n: n.core, wild, noisy))
-        outcomes.append(bool(ok))
-        assert not ok or drift <= 1e-14
-    assert sum(outcomes) >= 3
-
-
 def test_a_largest_step_that_is_an_array(errors_raise):
     class Still(eqx.Module):
         max_step: jax.Array
