@@ -52,14 +52,6 @@ def test_no_stage_is_evaluated_outside(solver):
     assert np.allclose(found, [0.25, 0.0], rtol=0, atol=1e-4)
 
 
-def test_within_the_bounds_nothing_changes():
-    field = lambda t, y, args: jnp.stack([y[1], -y[0]])  # noqa: E731
-    bounded = dfc.clipped(field, lower=-2.0, upper=jnp.full(2, 2.0))
-    y0 = jnp.array([1.0, 0.5])
-    one, two = (solve(f, dfx.Tsit5(), y0).ys for f in (field, bounded))
-    assert np.array_equal(one, two)
-
-
 test_mistakes_are_named = refused(
     (lambda: dfc.clipped(1.0, lower=0.0), TypeError, "`vector_field` is"),
     (lambda: dfc.clipped(SEEN), ValueError, "needs a bound"),
