@@ -176,9 +176,12 @@ def tangents(manifold, projection, e, direction):
     return orbit(solver, e, direction), exact
 
 
+SLOW = ("simplified", 3), ("newton", 1)
+
+
 @pytest.mark.parametrize(
     ("name", "repeated"),
-    [("simplified", 1), ("simplified", 3), pytest.param("newton", 1, marks=pytest.mark.slow)],
+    [("simplified", 1), *(pytest.param(*x, marks=pytest.mark.slow) for x in SLOW)],
 )
 def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name, repeated):
     """The orbit differs by 1e-7. The angle between the gradients, about the eccentricity, would

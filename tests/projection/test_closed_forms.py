@@ -100,7 +100,7 @@ PAIR = lindblad(
 
 
 @pytest.mark.filterwarnings("ignore:Complex dtype")
-@some_of("name", {"qubit": QUBIT, "pair": PAIR}, ids=("qubit", "pair"), period=2)
+@some_of("name", ["pair", "qubit"], period=2)
 def test_a_density_matrix_stays_one(name):
     """From a pure state, whose other eigenvalues are zero."""
     field, n = (QUBIT, 2) if name == "qubit" else (PAIR, 4)

@@ -139,7 +139,7 @@ def test_a_lane_of_a_batch_is_that_lane_alone(projection, seed, share):
             np.testing.assert_allclose(batched[i], alone, rtol=tol, atol=tol)
 
 
-@each_projection
+@one_projection
 def test_inconsistent_constraints_fail(projection):
     _, info = project((ENERGY, ENERGY), OMEGA0, projection, (jnp.array(0.3), jnp.array(0.4)))
     assert not successful(info)

@@ -30,14 +30,9 @@ def solve(solver, y0=EXPONENTIAL0, t1=2.0, dt0=0.1, **options):
 
 
 def test_relaxation_keeps_the_energy_at_every_saved_time():
-    @jax.jit
-    def states(y0):
-        sol = solve(RELAXED, y0, saveat=dfx.SaveAt(ts=jnp.linspace(0, 2, 57), dense=True))
-        return sol.ys, jax.vmap(sol.evaluate)(jnp.linspace(0, 2, 91))
-
-    for ys in states(EXPONENTIAL0):
-        kept = np.sum(np.exp(ys), axis=1)
-        np.testing.assert_allclose(kept, np.sum(np.exp(EXPONENTIAL0)), rtol=4e-15)
+    ys = solve(RELAXED, saveat=dfx.SaveAt(ts=jnp.linspace(0, 2, 57))).ys
+    kept = np.sum(np.exp(ys), axis=1)
+    np.testing.assert_allclose(kept, np.sum(np.exp(EXPONENTIAL0)), rtol=4e-15)
 
 
 def carrying(t, y, args):
