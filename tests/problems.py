@@ -67,7 +67,15 @@ def kepler_momentum(t, y, args):
 
 
 KEPLER0 = (jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0]))
-KEPLER = (dfc.FirstIntegral(kepler_energy), dfc.FirstIntegral(kepler_momentum))
+KEPLER = {
+    "energy": dfc.FirstIntegral(kepler_energy),
+    "momentum": dfc.FirstIntegral(kepler_momentum),
+}
+
+
+def oscillator(t, y, args):
+    del t, args
+    return jnp.stack([y[1], -y[0]])
 
 
 def exponential(t, y, args):
@@ -130,3 +138,20 @@ def refused(*cases):
 def largest(tree):
     """The largest absolute value in a PyTree, or NaN if any is NaN."""
     return float(np.max([np.max(np.abs(x)) for x in jax.tree.leaves(tree)]))
+
+
+def final(sol):
+    return jax.tree.map(lambda y: y[-1], sol.ys)
+
+
+def difference(a, b):
+    """The largest one between two PyTrees."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return max(largest(np.subtract(x, y)) for x, y in pairs)
+
+
+def assert_lanes(run, lanes, tolerance):
+    """That each lane of a batch is that lane alone."""
+    together = jax.vmap(run)(lanes)
+    for i, lane in enumerate(lanes):
+        assert difference(jax.tree.map(lambda y, i=i: y[i], together), run(lane)) <= tolerance

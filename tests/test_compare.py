@@ -17,7 +17,7 @@ from diffrax_conserve._diagnostics.comparison import ComparisonReport, Compariso
 from diffrax_conserve._diagnostics.linear_invariants import changes, linear_invariants
 from diffrax_conserve.reproduce import _verdict, main
 
-from .problems import KEPLER0, kepler, kepler_energy
+from .problems import KEPLER, KEPLER0, kepler
 
 STEPS, DT = 600, 0.25
 Y0 = np.array([0.3, 0.2, 0.1, -0.4])  # two positions, two velocities
@@ -94,17 +94,6 @@ def test_chaos_is_told(capsys):
     report = compared(1.0, 1.0, capsys, start, 0.5)
     assert report.last[0] < len(report.ts) - 1
     assert "as in chaos" in " ".join([*report.notes, report.verdict])
-
-
-def angular_momentum(t, y, args):
-    q, p = y
-    return q[0] * p[1] - q[1] * p[0]
-
-
-KEPLER = {
-    "energy": dfc.FirstIntegral(kepler_energy),
-    "momentum": dfc.FirstIntegral(angular_momentum),
-}
 
 
 def error_at_end(y, ts, y0):

@@ -14,7 +14,8 @@ import diffrax_conserve as dfc
 from diffrax_conserve.learned._files import read_info
 from diffrax_conserve.learned._pretrained import pretrained_path
 
-from .learned import EAST, RADIUS, SAVED, SMALL, Still, oscillator, saved, solution, states
+from .learned import EAST, RADIUS, SAVED, SMALL, Still, saved, solution, states
+from .problems import oscillator
 
 
 def same(*networks):

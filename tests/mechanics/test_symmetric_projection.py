@@ -10,25 +10,25 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
+import diffrax_conserve.testing as dct
 
 from ..problems import (
     EXPONENTIAL,
+    EXPONENTIAL0,
     INERTIA,
+    KEPLER,
     RIGID_BODY,
+    assert_lanes,
+    difference,
     exponential,
+    final,
     kepler,
-    kepler_energy,
     largest,
     rigid_body,
 )
-from ..problems import EXPONENTIAL0 as E0
 
-KEPLER = {
-    "energy": dfc.FirstIntegral(kepler_energy),
-    "momentum": dfc.FirstIntegral(lambda t, y, args: y[0][0] * y[1][1] - y[0][1] * y[1][0]),
-}
 Y0 = jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])  # e = 0.6
-H = 2 * np.pi / 200
+E0, H = EXPONENTIAL0, 2 * np.pi / 200
 SYMMETRIC = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), KEPLER)
 BODY = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), RIGID_BODY)
 EXP = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), EXPONENTIAL)
@@ -48,15 +48,6 @@ def _solve(field, solver, y0, t0, t1, h, args):
         dfx.ODETerm(field), solver, t0, t1, h, y0, args, saveat=save, max_steps=None, throw=False,
         adjoint=dfx.ForwardMode(),
     )  # fmt: skip
-
-
-def final(sol):
-    return jax.tree.map(lambda y: y[-1], sol.ys)
-
-
-def difference(a, b):
-    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return max(largest(np.subtract(x, y)) for x, y in pairs)
 
 
 def drift(y, y0):
@@ -147,27 +138,12 @@ def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
 
 @pytest.mark.slow
 def test_derivatives_in_both_modes_against_finite_differences():
-    def end(y0, scale, adjoint):
-        def field(t, y, args):
-            return args * exponential(t, y, None)
+    def end(y0, scale):
+        field = dfx.ODETerm(lambda t, y, args: args * exponential(t, y, None))
+        options = dict(max_steps=8, adjoint=dfx.DirectAdjoint())
+        return dfx.diffeqsolve(field, EXP, 0.0, 0.5, 0.1, y0, scale, **options).ys[-1]
 
-        options = dict(max_steps=8, adjoint=adjoint)
-        sol = dfx.diffeqsolve(dfx.ODETerm(field), EXP, 0.0, 0.5, 0.1, y0, scale, **options)
-        return jnp.sum(jnp.sin(sol.ys[-1]) * jnp.array([1.0, 2.0]))
-
-    @jax.jit
-    def forward(y0, scale):
-        """The value, and the derivative by `scale`."""
-        return jax.jvp(lambda s: end(y0, s, dfx.ForwardMode()), (scale,), (jnp.ones(()),))
-
-    one, e = jnp.ones(()), 1e-6
-    value = lambda y0, scale: forward(y0, scale)[0]  # noqa: E731
-    reverse = jax.grad(lambda *x: end(*x, dfx.RecursiveCheckpointAdjoint()), argnums=(0, 1))
-    by_y0, by_scale = jax.jit(reverse)(E0, one)
-    numeric = [(value(E0 + d, one) - value(E0 - d, one)) / (2 * e) for d in e * jnp.eye(2)]
-    assert difference(by_y0, jnp.stack(numeric)) < 1e-8
-    assert difference(by_scale, (value(E0, one + e) - value(E0, one - e)) / (2 * e)) < 1e-8
-    assert difference(forward(E0, one)[1], by_scale) < 1e-12
+    dct.assert_gradients(end, E0, jnp.ones(()), rtol=1e-7)
 
 
 def test_derivatives_in_any_metric():
@@ -195,17 +171,14 @@ def test_derivatives_in_any_metric():
 
 @pytest.mark.slow
 def test_a_lane_is_that_lane_alone_and_float32_works():
-    lanes = jnp.stack([W0, 2 * W0, W0[::-1]])
-
     def run(y0):
         return solve(rigid_body, BODY, y0, 0.0, 1.0, 0.1).ys[-1]
 
-    together = jax.vmap(run)(lanes)
-    assert all(difference(together[i], run(lanes[i])) < 1e-14 for i in range(3))
+    assert_lanes(run, jnp.stack([W0, 2 * W0, W0[::-1]]), 1e-14)
     sol = solve(rigid_body, BODY, W0.astype(jnp.float32), 0.0, 1.0, 0.1)
     assert dfx.is_okay(sol.result)
     assert sol.ys.dtype == jnp.float32
-    assert difference(sol.ys[-1], together[0]) < 1e-5
+    assert difference(sol.ys[-1], run(W0)) < 1e-5
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 import diffrax_conserve as dfc
 from diffrax_conserve._fast.jaxprs import jaxprs_inside
 
-from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, in_single, oscillator, solution, states
-from ..problems import refused, solve
+from ..learned import CORES, EAST, LORENZ, SMALL, flow_map, in_single, solution, states
+from ..problems import oscillator, refused, solve
 from ..thinned import some_of
 
 KEY = jr.key(0)

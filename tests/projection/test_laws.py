@@ -179,6 +179,6 @@ def test_the_gradients_at_each_state_lead_to_a_circular_orbit():
     angle, away = rng.uniform(0, 2 * np.pi, 50), 1e-3 * rng.normal(size=(2, 50, 2))
     q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     v = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    options = dict(value=(-0.5, 1.0), projection=dfc.SimplifiedNewton())
+    options = dict(value={"energy": -0.5, "momentum": 1.0}, projection=dfc.SimplifiedNewton())
     ok = jax.jit(jax.vmap(lambda y: dfc.project(KEPLER, y, **options)[1].ok))
     assert np.all(ok((q + away[0], v + away[1])))

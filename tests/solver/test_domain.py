@@ -16,8 +16,8 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .. import problems
-from ..learned import DRIVEN0, EAST, LORENZ, Still, Within, flow_map, oscillator, states, unchecked
-from ..problems import refused
+from ..learned import DRIVEN0, EAST, LORENZ, Still, Within, flow_map, states, unchecked
+from ..problems import oscillator, refused
 from ..thinned import some_of
 
 TERM = dfx.ODETerm(oscillator)

@@ -8,21 +8,17 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import solve
+from ..problems import oscillator, solve
 from ..thinned import some_of
 
 Y0, NAN, LARGE = jnp.array([1.0, 0.0]), jnp.array([1.0, jnp.nan]), jnp.array([2e19, 0], "f4")
-
-
-def rotation(t, y, args):
-    return jnp.stack([y[1], -y[0]])
 
 
 def square(t, y, args):
     return jnp.sum(y**2)
 
 
-def run(manifold, solver=None, y0=Y0, vector_field=rotation, **kwargs):
+def run(manifold, solver=None, y0=Y0, vector_field=oscillator, **kwargs):
     options = {k: kwargs.pop(k) for k in ("projection", "max_correction") if k in kwargs}
     wrapped = dfc.ManifoldProjection(solver or dfc.RK4(), manifold, **options)
     return solve(vector_field, wrapped, y0, **kwargs)
@@ -51,7 +47,7 @@ def test_statistics_name_the_entry_that_failed():
     """The entry before it holds two integrals."""
     kept = dfc.FirstIntegral(lambda t, y, args: y[:2])
     jump = dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y[2:], args))
-    field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), rotation(t, y[2:], args)])  # noqa: E731
+    field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), oscillator(t, y[2:], args)])  # noqa: E731
     y0, saveat = jnp.array([0.5, 0.25, 1.0, 0.0]), dfx.SaveAt(t1=True, solver_state=True)
     sol = run({"kept": kept, "last": jump}, None, y0, field, throw=False, saveat=saveat)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
@@ -159,7 +155,7 @@ def test_what_failed_is_nan_and_takes_no_iterations():
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
     jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
-    slow, span = lambda *args: 0.3 * rotation(*args), dict(t0=late - 20, t1=late + 20, dt0=None)
+    slow, span = lambda *args: 0.3 * oscillator(*args), dict(t0=late - 20, t1=late + 20, dt0=None)
     options = span | dict(stepsize_controller=dfx.PIDController(1e-4, 1e-4), max_steps=4096)
     sol = run(jump, dfx.Tsit5(), Y0.astype(dtype), slow, throw=False, **options)
     assert NOT_REACHED in dfx.RESULTS[sol.result]

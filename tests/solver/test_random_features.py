@@ -11,8 +11,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from .. import problems
-from ..learned import oscillator
-from ..problems import EXPONENTIAL0, exponential
+from ..problems import EXPONENTIAL0, exponential, oscillator
 
 EIGHT = dfc.RandomFeatureSolver(8)
 NORTH = jnp.array([1.0, 0.3])

@@ -13,8 +13,8 @@ import scipy.linalg
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._compare import Comparison
 
-from ..learned import RADIUS, Within, oscillator
-from ..problems import refused
+from ..learned import RADIUS, Within
+from ..problems import oscillator, refused
 from ..thinned import some_of
 
 STEP, OFF = 0.5, 1e-3

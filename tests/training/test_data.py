@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._training.data import as_data
 
-from ..learned import EAST, SMALL, Scale, oscillator
-from ..problems import refused
+from ..learned import EAST, SMALL, Scale
+from ..problems import oscillator, refused
 from ..thinned import some_of
 
 KEY = jr.key(5)

@@ -12,8 +12,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, flow_map, oscillator
-from ..problems import refused
+from ..learned import EAST, LORENZ, flow_map
+from ..problems import oscillator, refused
 
 KEY = jr.key(5)
 WRONG = "The trained `PINN` is not the solution"
