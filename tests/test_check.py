@@ -18,9 +18,7 @@ from .problems import refused
         ("rigid-body", lambda t, w, args: (w[0] ** 2 + w[1] ** 2 + w[2] ** 3) / 2),
         # The sum from 0 to N has one term too many.
         pytest.param(
-            "point-vortices",
-            lambda t, y, args: jnp.sum(y[:, 0]) + y[-1, 0],
-            marks=pytest.mark.slow,
+            "point-vortices", lambda t, y, args: jnp.sum(y[:, 0]) + y[-1, 0], marks=pytest.mark.slow
         ),
     ],
 )

@@ -76,11 +76,7 @@ test_mistakes_are_named = refused(
     (lambda: solution(t1=jnp.inf), ValueError, "they are 0.0 and inf"),
     (lambda: flow_map(max_step=0.0), ValueError, "`max_step` is 0.0, but it must be positive"),
     (lambda: flow_map(max_step=jnp.inf), ValueError, "`max_step` is infinite"),
-    (
-        lambda: flow_map(taylor=2),
-        TypeError,
-        "`taylor` is of type `int`, but it must be a `Taylor`",
-    ),
+    (lambda: flow_map(taylor=2), TypeError, "`taylor` is of type `int`, but it must be a `Taylor`"),
     (lambda: flow_map(layer=2), TypeError, "must be a `ConservativeLayer`"),
     (lambda: solution(layer=2), TypeError, "must be a `ConservativeLayer`"),
     (lambda: dfc.learned.Box(2.0, 1.0), ValueError, "must be at most `upper`"),

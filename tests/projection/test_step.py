@@ -11,12 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import (
-    EXPONENTIAL,
-    EXPONENTIAL0,
-    exponential,
-    exponential_solution,
-)
+from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution
 from ..thinned import some_of
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)

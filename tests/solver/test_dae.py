@@ -241,9 +241,7 @@ CIRCLE = pair(lambda t, x, z, a: a, lambda t, x, z, a: x**2 + z**2 - 1)
 
 
 @pytest.mark.parametrize(
-    ("dae", "x", "z"),
-    [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0)],
-    ids=["singular", "no root"],
+    ("dae", "x", "z"), [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0)], ids=["singular", "no root"]
 )
 def test_a_singular_state_is_refused(dae, x, z, errors_raise):
     given = jnp.array(x), jnp.array(z), jnp.array(1.0)

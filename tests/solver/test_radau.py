@@ -320,8 +320,7 @@ test_mistakes_are_named = refused(
     ),
     (
         lambda: jax.eval_shape(
-            lambda y: solve(DOUBLED.term, AMPLIFIER.wrap(dfc.Radau()), 1.0, y, None, 1e-6),
-            START,
+            lambda y: solve(DOUBLED.term, AMPLIFIER.wrap(dfc.Radau()), 1.0, y, None, 1e-6), START
         ),
         ValueError,
         "of the same `dae`",

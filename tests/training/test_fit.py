@@ -177,11 +177,7 @@ test_mistakes_are_named = refused(
     (lambda: refuse(LAYER), TypeError, "max_step"),
     (lambda: refuse(Still(), sample=LORENZ.sample), ValueError, "no weights of its"),
     (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
-    (
-        lambda: refuse(in_single(flow_map()), **TAYLOR),
-        TypeError,
-        "Train it in double precision",
-    ),
+    (lambda: refuse(in_single(flow_map()), **TAYLOR), TypeError, "Train it in double precision"),
     (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data` out"),
     (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
     (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),

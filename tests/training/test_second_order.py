@@ -11,10 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._networks.cores import Gated
-from diffrax_conserve.learned._training.second_order import (
-    _by_gram_matrix,
-    _by_triangular_factor,
-)
+from diffrax_conserve.learned._training.second_order import _by_gram_matrix, _by_triangular_factor
 
 from ..learned import EAST, LORENZ, SMALL, flow_map, states
 from ..problems import oscillator
