@@ -48,20 +48,13 @@ def project(kind, atoms, values, candidates, metric):
 
 def quadratic_program(atoms, value, candidate, metric):
     """By another method: SLSQP, whose first step solves one exactly if the Hessian is one."""
-    root = np.sqrt(metric)
+    root, start = np.sqrt(metric), np.sqrt(metric) * candidate
+    equal = dict(fun=lambda u: atoms @ (u / root) - value, jac=lambda u: atoms / root, type="eq")
     found = scipy.optimize.minimize(
-        lambda u: np.sum((u - root * candidate) ** 2) / 2,
-        np.maximum(root * candidate, 0),
-        jac=lambda u: u - root * candidate,
-        bounds=[(0, None)] * candidate.size,
-        constraints={
-            "type": "eq",
-            "fun": lambda u: atoms @ (u / root) - value,
-            "jac": lambda u: atoms / root,
-        },
-        method="SLSQP",
-        options={"ftol": 1e-18, "maxiter": 200},
-    )
+        lambda u: np.sum((u - start) ** 2) / 2, np.maximum(start, 0), jac=lambda u: u - start,
+        bounds=[(0, None)] * candidate.size, constraints=equal, method="SLSQP",
+        options=dict(ftol=1e-18, maxiter=200),
+    )  # fmt: skip
     return found.x / root
 
 

@@ -31,23 +31,11 @@ def constant(t, z, a):
 
 @eqx.filter_jit
 def solve(dae, solver, x, guess, args, *, t1=1.0, controller=PRECISE, **options):
-    options = (
-        dict(saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype)), max_steps=4096) | options
-    )
-    t1 = jnp.asarray(t1, jnp.result_type(x))
-    dt0 = options.pop("dt0", None)
-    return dfx.diffeqsolve(
-        dae.term,
-        dae.wrap(solver),
-        0,
-        t1,
-        dt0,
-        dae.consistent(x, guess, args=args),
-        args,
-        stepsize_controller=controller,
-        throw=False,
-        **options,
-    )
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype))
+    options = dict(saveat=saveat, max_steps=4096, dt0=None, throw=False) | options
+    t1, y0 = jnp.asarray(t1, jnp.result_type(x)), dae.consistent(x, guess, args=args)
+    options |= dict(args=args, stepsize_controller=controller)
+    return dfx.diffeqsolve(dae.term, dae.wrap(solver), 0, t1, y0=y0, **options)
 
 
 def ends(x, a, adjoint):
@@ -157,17 +145,9 @@ def test_robertson_agrees_with_ida():
     ts = jnp.array([0.0, *ROBERTSON])
     solver = dfx.Kvaerno5(root_finder=optx.Chord(rtol=1e-9, atol=1e-17))
     controller = dfx.PIDController(rtol=1e-8, atol=1e-16)
-    found = solve(
-        dae,
-        solver,
-        jnp.array([1.0, 0.0]),
-        jnp.array(0.0),
-        None,
-        t1=1e11,
-        dt0=1e-6,
-        saveat=dfx.SaveAt(ts=ts),
-        controller=dfx.ClipStepSizeController(controller, step_ts=ts),
-    )
+    options = dict(controller=dfx.ClipStepSizeController(controller, step_ts=ts), t1=1e11)
+    options |= dict(dt0=1e-6, saveat=dfx.SaveAt(ts=ts))
+    found = solve(dae, solver, jnp.array([1.0, 0.0]), jnp.array(0.0), None, **options)
     ys = np.column_stack(found.ys)[1:]
     assert largest(ys / np.array([*ROBERTSON.values()]) - 1) < 1e-6
     assert largest(np.sum(ys, axis=1) - 1) < 2 * EPS
