@@ -169,10 +169,7 @@ def turning_tops(rng):
 
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
 # mass in electron masses.
-MOLECULES = {
-    "H2": (0.1744, 1.028, 1.401, 918.1),
-    "N2": (0.3640, 1.424, 2.074, 12761.0),
-}
+MOLECULES = {"H2": (0.1744, 1.028, 1.401, 918.1), "N2": (0.3640, 1.424, 2.074, 12761.0)}
 # Hartree in joules, Bohr radius in metres, electron mass in kilograms, room temperature in hartree.
 JOULE, METRE, KILOGRAM, ROOM = 4.3597e-18, 5.2918e-11, 9.1094e-31, 9.5e-4
 

@@ -10,7 +10,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body, rotational_energy, solve
+from ..problems import OMEGA0, RIGID_BODY, drift_of, largest, rigid_body, solve
 from ..thinned import some_of
 
 STEPS = dfx.SaveAt(t0=True, steps=True, solver_state=True, dense=True)
@@ -96,28 +96,10 @@ def test_statistics_need_the_solver_state():
 
 
 SOLVER = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
-ENERGY = rotational_energy(0.0, OMEGA0, None)
 
 
 def saved(saveat, **kwargs):
     return solve(rigid_body, SOLVER, OMEGA0, saveat=saveat, **kwargs)
-
-
-@jax.jit
-def energies(ys):
-    return jax.vmap(lambda y: rotational_energy(0.0, y, None))(ys)
-
-
-@pytest.mark.slow
-def test_subs_and_functions_of_the_state():
-    ts = jnp.linspace(0, 1, 6)
-    ends, steps = dfx.SubSaveAt(t0=True, t1=True), dfx.SubSaveAt(steps=2)
-    subs = {"end": ends, "energy": dfx.SubSaveAt(ts=ts, fn=rotational_energy), "steps": steps}
-    sol = saved(dfx.SaveAt(subs=subs), max_steps=16)
-    np.testing.assert_allclose(sol.ys["energy"], ENERGY, rtol=4e-16)
-    np.testing.assert_allclose(energies(sol.ys["end"]), ENERGY, rtol=4e-16)
-    finite = jnp.isfinite(sol.ts["steps"])
-    np.testing.assert_allclose(energies(sol.ys["steps"][finite]), ENERGY, rtol=4e-16)
 
 
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)

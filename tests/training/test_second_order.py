@@ -101,19 +101,6 @@ def test_a_conservative_window_is_as_accurate_and_on_the_manifold():
 
 
 @pytest.mark.slow
-def test_no_update_in_single_precision_is_skipped():
-    here, network = jax.tree.map(
-        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x,
-        (states(), flow_map(core="concatenated")),
-    )
-    with jax.enable_x64(False):
-        chosen = dataclasses.replace(dfc.learned.second_order(network), epochs=200, points=50)
-        field = lambda t, y, args: LORENZ.vector_field(t, y, args)  # noqa: E731
-        _, log = dfc.fit(network, field, sample=here, key=jr.key(6), recipe=chosen)
-    assert log.skipped == 0
-
-
-@pytest.mark.slow
 def test_a_flow_map_does_not_depend_on_the_units_of_components():
     def losses(units):
         here = units * states()

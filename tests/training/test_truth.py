@@ -97,19 +97,6 @@ def test_a_window_that_failed_is_trained_until_it_is_right():
     assert log.error < 1e-5
 
 
-@pytest.mark.slow
-def test_a_warning_names_the_window_and_the_error():
-    """The field is steep where no network of this size can follow."""
-
-    def kick(t, y, args):
-        return oscillator(t, y, args) + jnp.exp(-1e6 * (t - 1.7) ** 2) * 500
-
-    network = pinn(windows=3)
-    with pytest.warns(UserWarning, match=rf"{WRONG}: .* Window 1 of 3, from 1 to 2") as caught:
-        _, log = dfc.fit(network, kick, key=KEY, recipe=recipe(network, 20, retries=0))
-    assert f"{log.error:.2g}" in str(caught[0].message)
-
-
 def nan_somewhere(t, y, args):
     return jnp.where(y[0] > 1.2, jnp.nan, 1.0) * y
 
