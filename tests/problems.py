@@ -21,6 +21,7 @@ class Counted:
         return self.fn(t, y, args)
 
 
+EPS = np.finfo(np.float64).eps
 INERTIA = np.array([0.1, 0.2, 0.3])
 
 

@@ -349,23 +349,6 @@ def test_float64_is_asked_for(monkeypatch):
         jax.config.update("jax_enable_x64", True)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("kepler --tol 1e-6 --dt 0.1", ("--tol", "--dt", "one of them")),
-        ("kepler --starts 0", ("--starts", "positive")),
-        ("kepler --t1=-2", ("--t1", "positive")),
-        ("robertson --dt 0.1", ("stiff", "--tol")),
-    ],
-)
-def test_what_the_command_refuses(arguments, words, capsys):
-    with pytest.raises(SystemExit) as exit:
-        main(["compare", *arguments.split()])
-    assert exit.value.code == 2
-    message = capsys.readouterr().err
-    assert [word for word in words if word not in message] == []
-
-
 def test_the_command_passes_on_what_it_is_given_and_draws(monkeypatch, tmp_path):
     given = {}
 

@@ -44,10 +44,6 @@ KEPLER_BASIS = monomials(
 LOTKA_VOLTERRA = {"u": component(0), "v": component(1), "uv": lambda y: y[0] * y[1]} | {
     f"log {name}": ft.partial(lambda y, i: jnp.log(y[i]), i=i) for i, name in enumerate("uv")
 }
-TODA = {f"p{i}": lambda y, i=i: y[1][i] for i in range(3)}
-TODA |= {f"p{i} p{j}": lambda y, i=i, j=j: y[1][i] * y[1][j] for i in range(3) for j in range(i, 3)}
-TODA |= {f"e{i}": lambda y, i=i: jnp.exp(y[0][i] - y[0][(i + 1) % 3]) for i in range(3)}
-TODA |= {f"1/e{i}": lambda y, i=i: jnp.exp(y[0][(i + 1) % 3] - y[0][i]) for i in range(3)}
 POLLU, ROBERTSON = systems.Pollu(), systems.Robertson()
 NITROGEN = systems.Mechanism(["NO + O3 -> NO2", "NO2 -> NO + O3", "2 NO2 -> N2O4"], [26.6, 0.3, 9])
 
@@ -63,10 +59,6 @@ def species(mechanism):
 
 def with_angle(key):
     return jr.normal(key, (2,)) * jnp.array([2.0, 1.0])
-
-
-def isotropic(t, y, args):
-    return jnp.concatenate([y[2:], -y[:2]])
 
 
 def two_level(t, y, args):
@@ -89,7 +81,6 @@ FOUND = {
     name: (system.vector_field, system.sample, basis, count, system.manifold)
     for name, system, basis, count in [
         ("harmonic oscillator", systems.HarmonicOscillator(), 4, 1),
-        ("Hénon-Heiles", systems.HenonHeiles(), 3, 1),
         ("rigid body", systems.RigidBody(), 4, 2),
         ("conservative Lorenz", systems.ConservativeLorenz(), 3, 2),
         ("Kepler", KEPLER, KEPLER_BASIS, 4),
@@ -98,17 +89,13 @@ FOUND = {
 }
 RUNGE_LENZ = {"A": dfc.FirstIntegral(KEPLER.laplace_runge_lenz)}
 FOUND["Kepler"] = (*FOUND["Kepler"][:4], KEPLER.manifold | RUNGE_LENZ)
-toda = systems.TodaLattice()
 FOUND |= {
-    "Toda": (toda.vector_field, toda.sample, TODA, 2, toda.manifold),
     "Robertson": (ROBERTSON.vector_field, sparse(3), 2, 1, ROBERTSON.manifold),
     "Pollu": (POLLU.vector_field, sparse(20), species(POLLU.mechanism), 3, POLLU.manifold),
     "nitrogen": (NITROGEN.vector_field, sparse(4), species(NITROGEN), 2, NITROGEN.manifold),
-    "isotropic": (isotropic, normal(4), 4, 4, {}),
     "two levels": (two_level, amplitudes, 2, 4, {}),
     "pendulum": (pendulum, with_angle, PENDULUM, 1, {}),
 }
-FOUND["Toda"] = (*FOUND["Toda"][:4], {k: toda.manifold[k] for k in ("linear momentum", "energy")})
 NUM_STATES = {"Pollu": 1000}
 
 

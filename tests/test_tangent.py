@@ -9,9 +9,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from .problems import difference, refused, solve
+from .problems import EPS, difference, refused, solve
 
-EPS = np.finfo(np.float64).eps
 KEYS = jr.split(jr.key(0), 20)
 
 

@@ -11,10 +11,10 @@ import scipy.optimize
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from ..problems import EPS
 from ..problems import solve as one_solve
 from ..thinned import some_of
 
-EPS = np.finfo(np.float64).eps
 KINDS = {"simplified": dfc.SimplifiedNewton, "newton": dfc.Newton}
 BOTH = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 ONE_OF_BOTH = some_of("kind", KINDS.values(), ids=KINDS, period=2)

@@ -11,9 +11,8 @@ from scipy.optimize import minimize
 import diffrax_conserve as dfc
 from diffrax_conserve import closed_forms
 
+from ..problems import EPS
 from ..thinned import some_of
-
-EPS = float(np.finfo(float).eps)
 
 
 def matrices(seed, *shape, kind=float):

@@ -15,10 +15,9 @@ from hypothesis import assume, example, given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import KEPLER, OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
+from ..problems import EPS, KEPLER, OMEGA0, RIGID_BODY, rotational_energy, squared_momentum
 from ..thinned import some_of
 
-EPS = np.finfo(np.float64).eps
 VALUES = {
     "energy": rotational_energy(0, OMEGA0, None),
     "momentum": squared_momentum(0, OMEGA0, None),

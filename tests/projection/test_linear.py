@@ -7,7 +7,7 @@ import pytest
 
 from diffrax_conserve._step import equations, linear
 
-EPS = np.finfo(np.float64).eps
+from ..problems import EPS
 
 
 @jax.jit

@@ -12,10 +12,8 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .. import problems
-from ..problems import drift_of, evaluated, largest
+from ..problems import EPS, drift_of, evaluated, largest
 from ..thinned import some_of
-
-EPS = np.finfo(np.float64).eps
 
 
 def pendulum(t, y, args):

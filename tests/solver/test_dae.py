@@ -10,10 +10,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import assert_lanes, largest, refused
+from ..problems import EPS, assert_lanes, largest, refused
 from ..thinned import some_of
-
-EPS = np.finfo(np.float64).eps
 
 
 def pair(f, g):

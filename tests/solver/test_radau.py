@@ -12,10 +12,8 @@ from scipy.special import ellipj
 
 import diffrax_conserve as dfc
 
-from ..problems import largest, refused
+from ..problems import EPS, largest, refused
 from ..test_benchmarks import benchmark
-
-EPS = np.finfo(np.float64).eps
 
 
 @eqx.filter_jit

@@ -88,19 +88,6 @@ def test_the_estimate_is_the_true_error_of_a_step(field, y0, shortest, longest, 
     assert np.all((ratios > 0.7) & (ratios < 1.5))
 
 
-@pytest.mark.slow
-def test_a_stiff_problem():
-    """Robertson's kinetics: rates from 1e-5 to 1e4 and more."""
-    system = dfc.systems.Robertson()
-    controller = dfx.PIDController(rtol=1e-8, atol=1e-12)
-    options = dict(solver=dfc.RandomFeatureSolver(), stepsize_controller=controller)
-    sol = solve(system.vector_field, system.y0, 4e3, **options)
-    assert int(sol.stats["num_steps"]) < 100
-    # By Kvaerno5 with tolerance 1e-11, in 6,779 steps.
-    expected = [1.83202258e-1, 8.94237125e-7, 8.16796848e-1]
-    np.testing.assert_allclose(sol.ys[-1], expected, rtol=1e-8)
-
-
 def test_a_step_decays_where_the_solution_does():
     """On `z' = λ z`, for λ in the left half plane and on its boundary."""
 
