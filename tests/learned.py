@@ -36,11 +36,6 @@ def solution(t1=2.0, layer=None, seed=0, **options):
     return dfc.PINN(LORENZ.y0, 0.0, t1, key=jr.key(seed), layer=layer, **(SMALL | options))
 
 
-def oscillator(t, y, args):
-    del t, args
-    return jnp.stack([y[1], -y[0]])
-
-
 def in_single(network):
     """Evaluated in single precision."""
     core = jax.tree.map(lambda x: x.astype(jnp.float32), network.core)

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import diffrax_conserve as dfc
 
@@ -20,6 +21,7 @@ class Counted:
         return self.fn(t, y, args)
 
 
+EPS = np.finfo(np.float64).eps
 INERTIA = np.array([0.1, 0.2, 0.3])
 
 
@@ -66,7 +68,15 @@ def kepler_momentum(t, y, args):
 
 
 KEPLER0 = (jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0]))
-KEPLER = (dfc.FirstIntegral(kepler_energy), dfc.FirstIntegral(kepler_momentum))
+KEPLER = {
+    "energy": dfc.FirstIntegral(kepler_energy),
+    "momentum": dfc.FirstIntegral(kepler_momentum),
+}
+
+
+def oscillator(t, y, args):
+    del t, args
+    return jnp.stack([y[1], -y[0]])
 
 
 def exponential(t, y, args):
@@ -114,6 +124,35 @@ def evaluated(sol, ts):
     return jax.vmap(sol.evaluate)(ts)
 
 
+def refused(*cases):
+    """The test that each `(make, error, match)`, or `(make, match)`, is refused with a message."""
+    cases = [(make, error or (TypeError, ValueError), match) for make, *error, match in cases]
+
+    @pytest.mark.parametrize(("make", "error", "match"), cases)
+    def test_mistakes_are_named(make, error, match):
+        with pytest.raises(tuple(error), match=match):
+            make()
+
+    return test_mistakes_are_named
+
+
 def largest(tree):
     """The largest absolute value in a PyTree, or NaN if any is NaN."""
     return float(np.max([np.max(np.abs(x)) for x in jax.tree.leaves(tree)]))
+
+
+def final(sol):
+    return jax.tree.map(lambda y: y[-1], sol.ys)
+
+
+def difference(a, b):
+    """The largest one between two PyTrees."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return max(largest(np.subtract(x, y)) for x, y in pairs)
+
+
+def assert_lanes(run, lanes, tolerance):
+    """That each lane of a batch is that lane alone."""
+    together = jax.vmap(run)(lanes)
+    for i, lane in enumerate(lanes):
+        assert difference(jax.tree.map(lambda y, i=i: y[i], together), run(lane)) <= tolerance

@@ -7,14 +7,12 @@ fixed when JAX starts, so each test starts its own interpreters, which run a fun
 import dataclasses
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import diffrax as dfx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.sharding import NamedSharding, PartitionSpec
@@ -50,26 +48,6 @@ def spread_over_eight_devices():
         "all-reduces": program.as_text().count(" all-reduce("),
     }
     print(json.dumps(found))
-
-
-def one_of_two_processes(port, index):
-    """Half of the lanes each, in one program; prints whether this half is that of one process."""
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.distributed.initialize(f"localhost:{port}", num_processes=2, process_id=int(index))
-    assert jax.process_count() == 2
-    assert jax.device_count() == 2
-    mesh = jax.make_mesh((2,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
-    y0s = jax.vmap(dfc.systems.RigidBody().sample)(jax.random.split(jax.random.key(0), LANES))
-    y0s = np.asarray(y0s)
-    alone = np.asarray(jax.jit(jax.vmap(solve))(y0s))
-    sharding = NamedSharding(mesh, PartitionSpec("lanes"))
-    spread = jax.make_array_from_callback(y0s.shape, sharding, lambda index: y0s[index])
-    ys = jax.jit(jax.vmap(solve))(spread)
-    (shard,) = ys.addressable_shards
-    equal = np.array_equal(np.asarray(shard.data), alone[shard.index])
-    largest = float(jax.jit(jnp.max)(ys))  # of the lanes of both processes
-    print(json.dumps({"equal": equal, "lanes": len(shard.data), "largest": largest}))
-    assert largest == np.max(alone)
 
 
 def train_over_two_devices():
@@ -128,17 +106,6 @@ def test_a_training_over_two_devices_is_that_on_one():
     np.testing.assert_allclose(spread, alone, rtol=1e-6)
     assert spread != alone  # each device summed its share
     assert "cannot share out the 31 points" in refused
-
-
-@pytest.mark.slow
-def test_a_batch_over_two_processes_is_the_batch_in_one():
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    processes = [start(1, "one_of_two_processes", port, index) for index in range(2)]
-    for found in map(answer, processes):
-        assert found["equal"]
-        assert found["lanes"] == LANES // 2
 
 
 if __name__ == "__main__":

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
 
-from ..problems import RIGID_BODY, rigid_body, solve
+from ..problems import EPS, RIGID_BODY, rigid_body, solve
 from ..thinned import some_of
 
-EPS = float(np.finfo(float).eps)
 # Of implicit methods, which keep their last stage, lanes depend on each other within the tolerance.
 # The first one keeps its last stage.
 ADAPTIVE = [dfx.Tsit5(), dfx.Heun()]

@@ -16,7 +16,7 @@ from diffrax_conserve._fast.jaxprs import jaxprs_inside
 from ..problems import kepler, kepler_energy, kepler_momentum, solve
 from ..thinned import some_of
 
-FIXED = dfx.ConstantStepSize()
+FIXED, LOOSE = dfx.ConstantStepSize(), dfx.PIDController(rtol=1e-4, atol=1e-7)
 
 
 class Case(NamedTuple):
@@ -169,12 +169,7 @@ def turning_tops(rng):
 
 # Well depth in hartree, inverse width and equilibrium length in units of the Bohr radius, reduced
 # mass in electron masses.
-MOLECULES = {
-    "H2": (0.1744, 1.028, 1.401, 918.1),
-    "N2": (0.3640, 1.424, 2.074, 12761.0),
-    "HCl": (0.1697, 0.990, 2.409, 1784.7),
-    "CO": (0.4125, 1.219, 2.132, 12498.0),
-}
+MOLECULES = {"H2": (0.1744, 1.028, 1.401, 918.1), "N2": (0.3640, 1.424, 2.074, 12761.0)}
 # Hartree in joules, Bohr radius in metres, electron mass in kilograms, room temperature in hartree.
 JOULE, METRE, KILOGRAM, ROOM = 4.3597e-18, 5.2918e-11, 9.1094e-31, 9.5e-4
 
@@ -254,11 +249,9 @@ HIDDEN = {name: pendulum_of(height) for name, height in HEIGHTS.items()} | {
     "determinant": (in_determinant, determinant_energy, 1.0, 2),
     "matrix": (
         lambda t, y, args: jnp.concatenate([y[3:], -SPRINGS @ y[:3]]),
-        lambda t, y, args: (y[3:] @ y[3:] + y[:3] @ SPRINGS @ y[:3]) / 2,
-        100.0,
-        6,
+        lambda t, y, args: (y[3:] @ y[3:] + y[:3] @ SPRINGS @ y[:3]) / 2, 100.0, 6,
     ),
-}
+}  # fmt: skip
 
 
 def hidden(rng, name):
@@ -272,15 +265,9 @@ BOTH, DOUBLE, SINGLE = (np.float64, np.float32), (np.float64,), (np.float32,)
 # What makes a case, with a seed, and the dtypes in which it is solved.
 CASES = {
     "pendulums near rest, fixed": (pendulums_near_rest, {"solver": dfc.RK4()}, 0, BOTH),
-    "pendulums near rest": (
-        pendulums_near_rest,
-        {"controller": dfx.PIDController(rtol=1e-4, atol=1e-7)},
-        0,
-        BOTH,
-    ),
+    "pendulums near rest": (pendulums_near_rest, {"controller": LOOSE}, 0, BOTH),
     "slow bodies, 1e-3": (slow_bodies, {"tol": 1e-3}, 5, DOUBLE),
     "elastic walls": (elastic_walls, {}, 3, SINGLE),
-    "slow bodies, 1e-5": (slow_bodies, {"tol": 1e-5}, 5, DOUBLE),
     "steady rotations": (steady_rotations, {}, 7, BOTH),
     "weak waves": (weak_waves, {}, 1, DOUBLE),
     "with Laplace vectors": (with_laplace_vectors, {}, 2, DOUBLE),

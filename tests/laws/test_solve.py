@@ -13,6 +13,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .. import problems
+from ..problems import final
 from ..thinned import some_of
 from .common import PARALLEL, SYSTEMS, check, every_law_on_every_system, inputs, project, within
 
@@ -30,10 +31,6 @@ def solve(system, y0, *, solver=None, field=None, t0=0.0, t1=None):
 
 def okay(*solutions):
     return jnp.stack([dfx.is_okay(sol.result) for sol in solutions])
-
-
-def final(sol):
-    return jax.tree.map(lambda y: y[-1], sol.ys)
 
 
 @within(1e-12)

@@ -3,7 +3,6 @@
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 import pytest
 from scipy.linalg import polar
@@ -12,15 +11,13 @@ from scipy.optimize import minimize
 import diffrax_conserve as dfc
 from diffrax_conserve import closed_forms
 
+from ..problems import EPS
 from ..thinned import some_of
 
-EPS = float(np.finfo(float).eps)
 
-
-def matrices(key, *shape, kind=float):
-    if kind is complex:
-        return jax.lax.complex(*jr.normal(key, (2, *shape)))
-    return jr.normal(key, shape)
+def matrices(seed, *shape, kind=float):
+    real, imaginary = np.random.default_rng(seed).normal(size=(2, *shape))
+    return real + 1j * imaginary if kind is complex else real
 
 
 def formula(projection):
@@ -28,25 +25,25 @@ def formula(projection):
 
 
 FORMULAS = {
-    "density": (formula(closed_forms.density_matrix()), matrices(jr.key(0), 4, 4, kind=complex)),
-    "mixed": (formula(closed_forms.density_matrix()), jnp.eye(3) / 3 + 0j),
-    "real": (formula(closed_forms.density_matrix()), jnp.diag(jnp.array([0.6, 0.4, -0.5]))),
-    "rotation": (formula(closed_forms.rotation_matrix()), matrices(jr.key(1), 2, 3, 3)),
-    "identity": (formula(closed_forms.rotation_matrix()), jnp.eye(3)),
-    "unit": (formula(closed_forms.unit_vector(axis=0)), matrices(jr.key(2), 3, 2)),
-    "qubit": (formula(closed_forms.unit_vector()), jnp.array([1.0, 0j])),
+    "density": (formula(closed_forms.density_matrix()), matrices(0, 4, 4, kind=complex)),
+    "mixed": (formula(closed_forms.density_matrix()), np.eye(3) / 3 + 0j),
+    "real": (formula(closed_forms.density_matrix()), np.diag([0.6, 0.4, -0.5])),
+    "rotation": (formula(closed_forms.rotation_matrix()), matrices(1, 2, 3, 3)),
+    "identity": (formula(closed_forms.rotation_matrix()), np.eye(3)),
+    "unit": (formula(closed_forms.unit_vector(axis=0)), matrices(2, 3, 2)),
+    "qubit": (formula(closed_forms.unit_vector()), np.array([1.0, 0j])),
 }
 
 
 @some_of("name", FORMULAS, ids=FORMULAS, period=4)
 def test_derivatives_agree_with_differences_where_eigenvalues_coincide_too(name):
     project, x = FORMULAS[name]
-    v = matrices(jr.key(3), *x.shape, kind=complex if jnp.iscomplexobj(x) else float)
+    v = matrices(3, *x.shape, kind=complex if np.iscomplexobj(x) else float)
     y, tangent = jax.jvp(project, (x,), (v,))
     np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)  # idempotent
     difference = (project(x + 1e-6 * v) - project(x - 1e-6 * v)) / 2e-6
     np.testing.assert_allclose(tangent, difference, rtol=0, atol=2e-9)
-    adjoint = jax.vjp(project, x)[1](w := matrices(jr.key(4), *x.shape).astype(x.dtype))[0]
+    adjoint = jax.vjp(project, x)[1](w := matrices(4, *x.shape).astype(x.dtype))[0]
     np.testing.assert_allclose(jnp.sum(adjoint * v).real, jnp.sum(w * tangent).real, rtol=1e-12)
 
 
@@ -69,14 +66,14 @@ def test_the_nearest_density_matrix_against_a_minimiser():
         return jnp.sum(jnp.abs(y / jnp.trace(y).real - x) ** 2)
 
     flat = jax.jit(jax.value_and_grad(lambda z: distance(z.reshape(2, 4, 4))))
-    start = np.asarray(jr.normal(jr.key(5), (32,)))
+    start = matrices(5, 32)
     least = minimize(flat, start, jac=True, method="BFGS", options={"gtol": 1e-8}).fun
     np.testing.assert_allclose(jnp.sum(jnp.abs(project(x) - x) ** 2), least, rtol=1e-9)
 
 
 def test_large_matrices_have_positive_density_matrices_too():
     project, _ = FORMULAS["density"]
-    y = project(1e4 * matrices(jr.key(6), 50, 8, 8, kind=complex))
+    y = project(1e4 * matrices(6, 50, 8, 8, kind=complex))
     assert np.min(np.linalg.eigvalsh(y)) > 0
     np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)
 
@@ -92,17 +89,17 @@ def lindblad(hamiltonian, decays):
     return field
 
 
-X, Z = jnp.array([[0, 1], [1, 0]]) + 0j, jnp.diag(jnp.array([1.0, -1.0])) + 0j
-DOWN, ONE = jnp.array([[0, 1], [0, 0]]) + 0j, jnp.eye(2) + 0j
+X, Z = np.array([[0, 1], [1, 0]]) + 0j, np.diag([1.0, -1.0]) + 0j
+DOWN, ONE = np.array([[0, 1], [0, 0]]) + 0j, np.eye(2) + 0j
 QUBIT = lindblad(lambda t: Z / 2 + 2 * jnp.cos(t) * X, [0.1 * DOWN])
 PAIR = lindblad(
-    lambda t: jnp.kron(Z, Z) + jnp.cos(t) * jnp.kron(X, ONE),
-    [0.3 * jnp.kron(DOWN, ONE), 0.1 * jnp.kron(ONE, DOWN)],
+    lambda t: np.kron(Z, Z) + jnp.cos(t) * np.kron(X, ONE),
+    [0.3 * np.kron(DOWN, ONE), 0.1 * np.kron(ONE, DOWN)],
 )
 
 
 @pytest.mark.filterwarnings("ignore:Complex dtype")
-@some_of("name", {"qubit": QUBIT, "pair": PAIR}, ids=("qubit", "pair"), period=2)
+@some_of("name", ["pair", "qubit"], period=2)
 def test_a_density_matrix_stays_one(name):
     """From a pure state, whose other eigenvalues are zero."""
     field, n = (QUBIT, 2) if name == "qubit" else (PAIR, 4)
@@ -145,9 +142,5 @@ def test_wrong_input_is_explained():
         formula(closed_forms.rotation_matrix())(jnp.eye(2) + 0j)
     with pytest.raises(TypeError, match="`where` is of type `str`"):
         closed_forms.unit_vector("R")
-    _, info = dfc.project(
-        dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1),
-        jnp.zeros(3),
-        projection=closed_forms.unit_vector(),
-    )
-    assert not info.ok
+    unit = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
+    assert not dfc.project(unit, jnp.zeros(3), projection=closed_forms.unit_vector())[1].ok

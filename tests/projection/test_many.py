@@ -9,10 +9,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import solve
+from ..problems import EPS, solve
 from ..thinned import some_of
-
-EPS = float(np.finfo(float).eps)
 
 
 @pytest.mark.slow

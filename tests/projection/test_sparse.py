@@ -136,10 +136,10 @@ def test_many_dependent_constraints():
     manifold = {"one": MANIFOLDS["triangles"][0], "two": _bonds(_TRIANGLES)}
     shape = jnp.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.75**0.5, 0]])
     y = jnp.tile(shape, (NUM, 1)) + 0.01 * jr.normal(jr.key(2), (3 * NUM, 3))
-    end, info = dfc.project(manifold, y, projection=dfc.SimplifiedNewton())
+    project = eqx.filter_jit(lambda manifold, y: dfc.project(manifold, y))
+    end, info = project(manifold, y)
     assert info.ok
-    once, _ = dfc.project(manifold["one"], y, projection=dfc.SimplifiedNewton())
-    assert jnp.max(jnp.abs(end - once)) < 1e-13
+    assert largest(end - project(manifold["one"], y)[0]) < 1e-13
 
 
 def test_constraints_given_twice_change_no_derivative_and_no_force():
@@ -170,8 +170,10 @@ def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
         order = np.random.default_rng(seed).permutation(NUM)
         equations = equations_of(bonds(order), jnp.zeros(NUM), 0.0, jnp.ones(NUM), None)
         dense = dataclasses.replace(equations, pattern=None)
-        x, y = jnp.arange(NUM) * 1.0, jnp.linspace(1, 2, NUM)
-        found, expected = (times(e.linearise(y)[1], x) for e in (equations, dense))
+        x, y = np.arange(NUM) * 1.0, np.linspace(1, 2, NUM)
+        found, expected = (
+            jax.jit(lambda x, y, e=e: times(e.linearise(y)[1], x))(x, y) for e in (equations, dense)
+        )
         assert equations.pattern is not None
         np.testing.assert_allclose(found, expected)
 

@@ -56,19 +56,12 @@ def compiled(case: str, solver: str, newton: bool, endless: bool, beside: bool) 
     projection = dfc.Newton() if newton else dfc.SimplifiedNewton()
 
     def solve(manifold: Any, t1: Any, y0: Any, args: Any, rtol: Any) -> Any:
-        return dfx.diffeqsolve(
-            dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])])),
-            dfc.ManifoldProjection(SOLVERS[solver], manifold, projection=projection),
-            0.0,
-            t1,
-            None,
-            y0,
-            args,
-            stepsize_controller=dfx.PIDController(rtol, rtol),
-            saveat=dfx.SaveAt(t1=True, solver_state=True),
-            max_steps=None if endless else 4096,
-            throw=False,
-        )
+        term = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])]))
+        wrapped = dfc.ManifoldProjection(SOLVERS[solver], manifold, projection=projection)
+        options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False)
+        options |= dict(max_steps=None if endless else 4096)
+        options |= dict(stepsize_controller=dfx.PIDController(rtol, rtol))
+        return dfx.diffeqsolve(term, wrapped, 0.0, t1, None, y0, args, **options)
 
     good = dfc.FirstIntegral(energy)
     # The second constraint contradicts the first, or not.

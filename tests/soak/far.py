@@ -82,14 +82,9 @@ def draw(name: str, dtype: Any, rng: np.random.Generator, lanes: int) -> dict[st
     error = log_uniform(rng, 1e-18, 1e2, lanes) * (rng.random(lanes) < 0.8)
     answer = (start * (1 + error * rng.normal(size=start.shape))).astype(dtype)
     answer[:, rng.random(lanes) < 0.02] = np.nan
-    return {
-        "start": start,
-        "candidate": candidate,
-        "a": a,
-        "value": value,
-        "answer": answer,
-        "ordinary": ordinary & np.isfinite(long(value)).all(axis=0),
-    }
+    ordinary &= np.isfinite(long(value)).all(axis=0)
+    given = dict(start=start, candidate=candidate, a=a, value=value, answer=answer)
+    return given | dict(ordinary=ordinary)
 
 
 def run(seed: int, number: int, lanes: int) -> Tally:

@@ -78,20 +78,10 @@ def compiled(name: str, solver: str, newton: bool, mode: str, adaptive: bool) ->
             lambda t, y, args, **_: y[0] - args[-1], root_finder=optx.Newton(1e-6, 1e-6)
         )
         controller = dfx.PIDController(rtol, rtol) if adaptive else dfx.ConstantStepSize()
-        sol = dfx.diffeqsolve(
-            dfx.ODETerm(vector_field),
-            wrapped,
-            jnp.zeros_like(t1),
-            t1,
-            dt,
-            y0,
-            jnp.append(a, y0[0] * 0.9),
-            saveat=saveat,
-            stepsize_controller=controller,
-            event=crossing if mode == "event" else None,
-            max_steps=MAX_STEPS,
-            throw=False,
-        )
+        options = dict(saveat=saveat, stepsize_controller=controller, throw=False)
+        options |= dict(event=crossing if mode == "event" else None, max_steps=MAX_STEPS)
+        term, args = dfx.ODETerm(vector_field), jnp.append(a, y0[0] * 0.9)
+        sol = dfx.diffeqsolve(term, wrapped, jnp.zeros_like(t1), t1, dt, y0, args, **options)
         okay = (sol.result == dfx.RESULTS.successful) | (sol.result == dfx.RESULTS.event_occurred)
         if mode == "dense":
             return okay, jnp.append(ts, t1), jnp.concatenate([jax.vmap(sol.evaluate)(ts), sol.ys])

@@ -10,10 +10,8 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import largest
+from ..problems import EPS, assert_lanes, largest, refused
 from ..thinned import some_of
-
-EPS = np.finfo(np.float64).eps
 
 
 def pair(f, g):
@@ -26,28 +24,16 @@ PRECISE = dfx.PIDController(rtol=1e-11, atol=1e-11)
 
 
 def constant(t, z, a):
-    return 1.5 * z**2 + jnp.log(z) + a * t
+    return 1.5 * z**2 + np.log(z) + a * t
 
 
 @eqx.filter_jit
 def solve(dae, solver, x, guess, args, *, t1=1.0, controller=PRECISE, **options):
-    options = (
-        dict(saveat=dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype)), max_steps=4096) | options
-    )
-    t1 = jnp.asarray(t1, jnp.result_type(x))
-    dt0 = options.pop("dt0", None)
-    return dfx.diffeqsolve(
-        dae.term,
-        dae.wrap(solver),
-        0,
-        t1,
-        dt0,
-        dae.consistent(x, guess, args=args),
-        args,
-        stepsize_controller=controller,
-        throw=False,
-        **options,
-    )
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 11, dtype=x.dtype))
+    options = dict(saveat=saveat, max_steps=4096, dt0=None, throw=False) | options
+    t1, y0 = jnp.asarray(t1, jnp.result_type(x)), dae.consistent(x, guess, args=args)
+    options |= dict(args=args, stepsize_controller=controller)
+    return dfx.diffeqsolve(dae.term, dae.wrap(solver), 0, t1, y0=y0, **options)
 
 
 def ends(x, a, adjoint):
@@ -60,12 +46,12 @@ def ends(x, a, adjoint):
 @some_of("solver", [dfx.Tsit5(), dfx.Kvaerno5()], ids=["Tsit5", "Kvaerno5"], period=2)
 def test_a_known_solution(solver):
     """At saved times too, where Kvaerno5 has a dense output of order 3."""
-    a, start = jnp.array(0.7), jnp.array(2.0)
+    a, start = np.array(0.7), jnp.array(2.0)
     every = [dfx.SubSaveAt(t0=True, steps=True), dfx.SubSaveAt(ts=jnp.linspace(0, 1, 11))]
     found = solve(CUBIC, solver, start, jnp.array(1.0), a, saveat=dfx.SaveAt(subs=every))
     assert found.result == dfx.RESULTS.successful
-    (ts, _), ((_, z), saved) = found.ts, found.ys
-    ts, z = ts[jnp.isfinite(ts)], z[jnp.isfinite(ts)]
+    (ts, _), ((_, z), saved) = jax.tree.map(np.asarray, (found.ts, found.ys))
+    ts, z = ts[np.isfinite(ts)], z[np.isfinite(ts)]
     assert largest(constant(ts, z, a) - constant(0, z[0], a)) < 1e-9
     x, z = saved
     assert largest((z**3 + z - x) / x) < 4 * EPS
@@ -106,11 +92,8 @@ def test_a_derivative_of_the_consistent_state():
 
 @pytest.mark.slow
 def test_one_lane_equals_that_lane_alone():
-    x, a = jnp.linspace(0.5, 3, 5), jnp.linspace(0.2, 1, 5)
-    both = lambda x, a: ends(x, a, dfx.ForwardMode())  # noqa: E731
-    for k in (0, 4):
-        lane = jax.tree.map(lambda y: y[k], jax.vmap(both)(x, a))  # noqa: B023
-        assert largest(jax.tree.map(jnp.subtract, lane, both(x[k], a[k]))) < 4 * EPS
+    lanes = jnp.stack([jnp.linspace(0.5, 3, 3), jnp.linspace(0.2, 1, 3)], axis=1)
+    assert_lanes(lambda lane: ends(*lane, dfx.ForwardMode()), lanes, 4 * EPS)
 
 
 @pytest.mark.slow
@@ -160,101 +143,15 @@ def test_robertson_agrees_with_ida():
     ts = jnp.array([0.0, *ROBERTSON])
     solver = dfx.Kvaerno5(root_finder=optx.Chord(rtol=1e-9, atol=1e-17))
     controller = dfx.PIDController(rtol=1e-8, atol=1e-16)
-    found = solve(
-        dae,
-        solver,
-        jnp.array([1.0, 0.0]),
-        jnp.array(0.0),
-        None,
-        t1=1e11,
-        dt0=1e-6,
-        saveat=dfx.SaveAt(ts=ts),
-        controller=dfx.ClipStepSizeController(controller, step_ts=ts),
-    )
+    options = dict(controller=dfx.ClipStepSizeController(controller, step_ts=ts), t1=1e11)
+    options |= dict(dt0=1e-6, saveat=dfx.SaveAt(ts=ts))
+    found = solve(dae, solver, jnp.array([1.0, 0.0]), jnp.array(0.0), None, **options)
     ys = np.column_stack(found.ys)[1:]
     assert largest(ys / np.array([*ROBERTSON.values()]) - 1) < 1e-6
     assert largest(np.sum(ys, axis=1) - 1) < 2 * EPS
 
 
 # ---- A power system, whose network changes twice ----
-
-EMF, REACTANCE = np.array([1.05, 1.1]), np.array([0.2, 0.3])
-INERTIA, INPUT, DAMPING = np.array([0.05, 0.03]), np.array([0.8, 0.6]), 0.02
-
-
-def network(lines, fault=0.0):
-    """The admittances between two machines and a load, which a line joins to a rigid bus."""
-    matrix = np.diag([1 / 0.2j, 1 / 0.3j + fault, 1 / 0.25j + 0.9 - 0.3j])
-    for a, b, reactance in lines:
-        ends = np.ix_([a, b], [a, b])
-        matrix[ends] += np.array([[1, -1], [-1, 1]]) / (1j * reactance)
-    return matrix
-
-
-LINES = [(0, 2, 0.3), (1, 2, 0.4), (0, 1, 0.5)]
-NETWORKS = jnp.stack([network(LINES), network(LINES, -50j), network(LINES[:2])])
-TIMES = jnp.array([[0.0, 0.1], [0.1, 0.25], [0.25, 3.0]])
-
-
-def machines(t, x, v, matrix):
-    angle, speed = x
-    emf = EMF * jnp.exp(1j * angle)
-    power = jnp.real(emf * jnp.conj((emf - v[:2]) / (1j * REACTANCE)))
-    return speed, (INPUT - power - DAMPING * speed) / INERTIA
-
-
-def currents(angle):
-    return jnp.append(EMF * jnp.exp(1j * angle) / (1j * REACTANCE), 1 / 0.25j)
-
-
-def balance(t, x, z, matrix):
-    off = matrix @ jax.lax.complex(*z) - currents(x[0])
-    return off.real, off.imag
-
-
-SWING = pair(lambda t, x, z, args: machines(t, x, jax.lax.complex(*z), args), balance)
-REDUCED = dfx.ODETerm(
-    lambda t, x, args: machines(t, x, jnp.linalg.solve(args, currents(x[0])), args)
-)
-SWING0 = (jnp.array([0.57, 0.58]), jnp.zeros(2))
-FLAT = (jnp.ones(3), jnp.zeros(3))
-
-
-def through(solver, term, start, controller, x):
-    """The states at the ends of the three phases, and the steps."""
-
-    @eqx.filter_jit
-    def run(y):
-        def phase(y, given):
-            (t0, t1), matrix = given
-            found = dfx.diffeqsolve(
-                term, solver, t0, t1, None, start(y, matrix), matrix, stepsize_controller=controller
-            )
-            y = jax.tree.map(lambda y: y[-1], found.ys)
-            return y, (y, found.stats["num_steps"])
-
-        return jax.lax.scan(phase, y, (TIMES, NETWORKS))[1]
-
-    return run(x)
-
-
-@pytest.mark.slow
-def test_a_fault_of_a_power_system():
-    """As accurate as the same equations with the voltages eliminated, in about as many steps."""
-    of_x = dfx.PIDController(rtol=1e-7, atol=1e-7, norm=lambda e: optx.rms_norm(e[0]))
-    consistent = lambda y, matrix: SWING.consistent(*y, args=matrix)  # noqa: E731
-    (x, z), steps = through(SWING.wrap(dfx.Tsit5()), SWING.term, consistent, of_x, (SWING0, FLAT))
-    plain = lambda x, matrix: x  # noqa: E731
-    controllers = [dfx.PIDController(rtol=tol, atol=tol) for tol in (1e-7, 1e-13)]
-    (known, same), (exact, _) = (
-        through(solver, REDUCED, plain, controller, SWING0)
-        for solver, controller in zip((dfx.Tsit5(), dfx.Dopri8()), controllers, strict=True)
-    )
-    assert largest(steps - same) <= 2
-    errors = [largest(jax.tree.map(jnp.subtract, y, exact)) for y in (x, known)]
-    assert errors[0] <= 1.5 * errors[1]
-    off = jax.vmap(lambda x, z, args: balance(0, x, z, args))(x, z, NETWORKS)
-    assert largest(off) / largest(NETWORKS) < 4 * EPS
 
 
 # ---- Poor guesses, and failures ----
@@ -264,10 +161,10 @@ DIODE = pair(lambda t, x, z, args: 0 * x, lambda t, x, z, args: x - z - 1e-6 * j
 
 def test_newton_finds_the_voltage_at_a_diode():
     """From guesses at which the current is 1e80 A, or at which it is the least current."""
-    x, guess = jnp.meshgrid(jnp.linspace(-5, 5, 9), jnp.linspace(-5, 5, 11))
-    x, z = jax.vmap(DIODE.consistent)(x.ravel(), guess.ravel())
-    off = DIODE.algebraic(0, x, z, None)
-    scale = jnp.abs(x) + jnp.abs(z) + 1e-6 * jnp.exp(z / 0.025) * jnp.abs(z) / 0.025
+    x, guess = np.meshgrid(np.linspace(-5, 5, 9), np.linspace(-5, 5, 11))
+    x, z = map(np.asarray, jax.jit(jax.vmap(DIODE.consistent))(x.ravel(), guess.ravel()))
+    off = x - z - 1e-6 * np.expm1(z / 0.025)
+    scale = np.abs(x) + np.abs(z) + 1e-6 * np.exp(z / 0.025) * np.abs(z) / 0.025
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
@@ -275,8 +172,8 @@ def test_an_unknown_that_is_zero():
     """There the roundoff of the constants inside `g` is larger than all terms that its gradient
     shows."""
     dae = pair(lambda *_: 0.0, lambda t, x, z, a: a * (z + 0.1) - x)
-    for a in jnp.array([3.0, 0.3, 49.0]):
-        assert abs(dae.consistent(0.1 * a, jnp.zeros(()), args=a)[1]) <= EPS
+    root = lambda a: dae.consistent(0.1 * a, 0 * a, args=a)[1]  # noqa: E731
+    assert largest(jax.jit(jax.vmap(root))(np.array([3.0, 0.3, 49.0]))) <= EPS
 
 
 @pytest.mark.slow
@@ -306,26 +203,23 @@ def test_an_ill_conditioned_matrix():
 
 def test_units_change_nothing():
     """Equations and unknowns in other units: `A z + z³ = b`, with `A` not diagonally dominant."""
-    key = jax.random.key(1)
-    matrix, b = jax.random.normal(key, (4, 4)), jnp.arange(1.0, 5.0)
-    rows, columns = 2.0 ** jnp.array([30, 0, -30, 7]), 2.0 ** jnp.array([-40, 20, 0, 5])
+    matrix, b = np.random.default_rng(1).normal(size=(4, 4)), np.arange(1.0, 5.0)
+    rows, columns = 2.0 ** np.array([30, 0, -30, 7]), 2.0 ** np.array([-40, 20, 0, 5])
 
+    @jax.jit
     def root(rows, columns):
         g = lambda t, x, z, args: rows * (matrix @ (z * columns) + (z * columns) ** 3 - b)  # noqa: E731
         dae = pair(lambda *_: 0.0, g)
         return dae.consistent(jnp.array(0.0), 0.1 * jnp.ones(4) / columns)[1] * columns
 
-    assert np.allclose(root(rows, columns), root(jnp.ones(4), jnp.ones(4)), rtol=1e-13)
+    assert np.allclose(root(rows, columns), root(np.ones(4), np.ones(4)), rtol=1e-13)
 
 
 CIRCLE = pair(lambda t, x, z, a: a, lambda t, x, z, a: x**2 + z**2 - 1)
-INDEX_2 = pair(lambda t, x, z, a: z, lambda t, x, z, a: x - a)
 
 
 @pytest.mark.parametrize(
-    ("dae", "x", "z"),
-    [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0)],
-    ids=["singular", "no root"],
+    ("dae", "x", "z"), [(CIRCLE, 1.0, 0.0), (CIRCLE, 2.0, 1.0)], ids=["singular", "no root"]
 )
 def test_a_singular_state_is_refused(dae, x, z, errors_raise):
     given = jnp.array(x), jnp.array(z), jnp.array(1.0)
@@ -340,7 +234,8 @@ def test_a_singular_state_is_refused(dae, x, z, errors_raise):
 def test_a_solve_into_a_singular_state_fails(controller):
     """On a circle `z` ends at `x = 1`, which is reached at `t = 1`."""
     start = jnp.array(0.0), jnp.array(1.0), jnp.array(1.0)
-    found = solve(CIRCLE, dfx.Tsit5(), *start, t1=2.0, controller=controller, dt0=0.01)
+    options = dict(controller=controller, dt0=0.01, saveat=dfx.SaveAt(t1=True))
+    found = solve(CIRCLE, dfx.Heun(), *start, t1=2.0, **options)
     assert found.result != dfx.RESULTS.successful
 
 
@@ -349,18 +244,12 @@ PAIRED = pair(lambda t, x, z, args: (x, x), lambda t, x, z, args: x - z)
 SPARE = pair(lambda t, x, z, args: x, lambda t, x, z, args: x - z)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "match"),
-    [
-        (lambda: pair(lambda t, y, args: y, CUBIC.algebraic), TypeError, "`f` of a"),
-        (lambda: pair(CUBIC.f, 1.0), TypeError, "`algebraic` of a"),
-        (lambda: CUBIC.wrap(dfx.Tsit5), TypeError, "`solver` is"),
-        (lambda: SPARE.consistent(X, jnp.array(1.0)), ValueError, "numbers, but `z` has"),
-        (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
-        (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
-        (lambda: PAIRED.consistent(X[0], X[0]), ValueError, "`f` returns .* like `x`"),
-    ],
+test_mistakes_are_named = refused(
+    (lambda: pair(lambda t, y, args: y, CUBIC.algebraic), TypeError, "`f` of a"),
+    (lambda: pair(CUBIC.f, 1.0), TypeError, "`algebraic` of a"),
+    (lambda: CUBIC.wrap(dfx.Tsit5), TypeError, "`solver` is"),
+    (lambda: SPARE.consistent(X, jnp.array(1.0)), ValueError, "numbers, but `z` has"),
+    (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
+    (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
+    (lambda: PAIRED.consistent(X[0], X[0]), ValueError, "`f` returns .* like `x`"),
 )
-def test_mistakes_are_named(make, error, match):
-    with pytest.raises(error, match=match):
-        make()

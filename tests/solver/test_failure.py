@@ -8,21 +8,17 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import solve
+from ..problems import oscillator, solve
 from ..thinned import some_of
 
-Y0 = jnp.array([1.0, 0.0])
-
-
-def rotation(t, y, args):
-    return jnp.stack([y[1], -y[0]])
+Y0, NAN, LARGE = jnp.array([1.0, 0.0]), jnp.array([1.0, jnp.nan]), jnp.array([2e19, 0], "f4")
 
 
 def square(t, y, args):
     return jnp.sum(y**2)
 
 
-def run(manifold, solver=None, y0=Y0, vector_field=rotation, **kwargs):
+def run(manifold, solver=None, y0=Y0, vector_field=oscillator, **kwargs):
     options = {k: kwargs.pop(k) for k in ("projection", "max_correction") if k in kwargs}
     wrapped = dfc.ManifoldProjection(solver or dfc.RK4(), manifold, **options)
     return solve(vector_field, wrapped, y0, **kwargs)
@@ -51,79 +47,97 @@ def test_statistics_name_the_entry_that_failed():
     """The entry before it holds two integrals."""
     kept = dfc.FirstIntegral(lambda t, y, args: y[:2])
     jump = dfc.FirstIntegral(lambda t, y, args: out_of_reach(t, y[2:], args))
-    field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), rotation(t, y[2:], args)])  # noqa: E731
+    field = lambda t, y, args: jnp.concatenate([jnp.zeros(2), oscillator(t, y[2:], args)])  # noqa: E731
     y0, saveat = jnp.array([0.5, 0.25, 1.0, 0.0]), dfx.SaveAt(t1=True, solver_state=True)
     sol = run({"kept": kept, "last": jump}, None, y0, field, throw=False, saveat=saveat)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
+    assert np.all(np.isnan(sol.ys[-1]))
     assert "worst            manifold['last']" in str(dfc.statistics(sol))
 
 
+def spoilt(t, y, args):
+    """The square, but not after the time `args[1]`."""
+    after, when = args
+    return square(t, y, args) * jnp.where(t > when, after, 1.0) + jnp.where(t > when, 9.0, 0.0)
+
+
+SPOILT = dfc.FirstIntegral(spoilt)
+
+
+def adaptive(manifold, *args, max_steps=4096):
+    options = dict(stepsize_controller=dfx.PIDController(1e-6, 1e-6), max_steps=max_steps)
+    return run(manifold, dfx.Tsit5(), args=jnp.array(args), throw=False, **options)
+
+
 @pytest.mark.parametrize(
-    ("manifold", "message"),
+    ("manifold", "args", "message"),
     [
-        (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), CANNOT_START),
-        (dfc.FirstIntegral(lambda t, y, args: square(t, y, args) * jnp.nan), NOT_FINITE),
-        (dfc.FirstIntegral(square, value=-1.0), NO_STATE),
+        (dfc.Constraint(lambda t, y, args: square(t, y, args) - 1.001), (), CANNOT_START),
+        (SPOILT, (jnp.nan, -1.0), NOT_FINITE),
+        (dfc.FirstIntegral(square, value=-1.0), (), NO_STATE),
     ],
     ids=["violated", "not-finite", "out-of-reach"],
 )
-def test_what_cannot_start_ends_at_once(manifold, message):
-    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
-    sol = run(manifold, dfx.Tsit5(), stepsize_controller=adaptive, max_steps=None, throw=False)
+def test_what_cannot_start_ends_at_once(manifold, args, message):
+    sol = adaptive(manifold, *args, max_steps=4096 if args else None)
     assert message in dfx.RESULTS[sol.result]
     # Where the solve can start, smaller steps are tried.
     assert sol.stats["num_steps"] <= (HOPELESS if message == NO_STATE else 1)
 
 
+@pytest.mark.parametrize("after", [jnp.nan, 5.0])
+def test_an_adaptive_solve_without_hope_ends(after):
+    sol, plain = adaptive(SPOILT, after, 0.5), adaptive(SPOILT, after, 9.0)
+    assert (NOT_FINITE if np.isnan(after) else NOT_REACHED) in dfx.RESULTS[sol.result]
+    assert dfx.is_okay(plain.result)
+    assert sol.stats["num_steps"] <= plain.stats["num_steps"] + HOPELESS
+
+
+def from_value(value, y0=Y0, lower=-9.0):
+    """By one program for all."""
+    projection = dfc.SimplifiedNewton(lower=jnp.asarray(lower, y0.dtype))
+    integral = dfc.FirstIntegral(square, value=jnp.asarray(value, y0.dtype))
+    options = dict(projection=projection, saveat=dfx.SaveAt(steps=True), max_steps=16, throw=False)
+    return run(integral, y0=y0, **options)
+
+
 @pytest.mark.parametrize(
-    ("manifold", "options", "message"),
+    ("make", "message"),
     [
-        (dfc.FirstIntegral(square), dict(y0=jnp.array([1.0, jnp.nan])), NOT_FINITE),
-        (dfc.Constraint(square), dict(y0=jnp.array([1.0, jnp.nan])), NOT_FINITE),
-        (dfc.FirstIntegral(square), dict(y0=jnp.array([2e19, 0], jnp.float32)), NOT_FINITE),
-        (dfc.FirstIntegral(square, value=-1.0), {}, NO_STATE),
-        (dfc.FirstIntegral(square), dict(projection=dfc.SimplifiedNewton(lower=1.5)), NO_STATE),
+        (lambda: from_value(1.0, NAN), NOT_FINITE),
+        (lambda: run(dfc.Constraint(square), y0=NAN, throw=False), NOT_FINITE),
+        (lambda: run(dfc.FirstIntegral(square), y0=LARGE, throw=False), NOT_FINITE),
+        (lambda: from_value(-1.0), NO_STATE),
+        (lambda: from_value(1.0, lower=1.5), NO_STATE),
     ],
     ids=["nan", "nan of a constraint", "overflow", "out of reach", "bound above the start"],
 )
-def test_the_first_of_fixed_steps_tells_what_is_wrong_with_the_start(manifold, options, message):
-    told = dfx.RESULTS[run(manifold, throw=False, **options).result]
+def test_the_first_of_fixed_steps_tells_what_is_wrong_with_the_start(make, message):
+    told = dfx.RESULTS[make().result]
     assert message in told
     assert "`project" not in told
+
+
+def test_a_first_projection_may_be_as_long_as_a_given_value_needs():
+    squares = np.sum(np.asarray(from_value(4.0).ys)[:10] ** 2, axis=1)
+    np.testing.assert_allclose(squares, 4.0, rtol=1e-14)
 
 
 @pytest.mark.slow
 def test_what_a_vector_field_does_not_conserve_is_kept_and_the_statistics_tell():
     """Whether a quantity is conserved is the question of `check_invariance`, not of the solve."""
-    adaptive = dict(stepsize_controller=dfx.PIDController(1e-6, 1e-6), t1=3.0)
-    adaptive["saveat"] = dfx.SaveAt(t1=True, solver_state=True)
+    options = dict(stepsize_controller=dfx.PIDController(1e-6, 1e-6), t1=3.0)
+    options["saveat"] = dfx.SaveAt(t1=True, solver_state=True)
     for wrong in (lambda t, y, args: y[1], lambda t, y, args: y[1] ** 2 + 1.1 * y[0] ** 2):
-        sol = run(dfc.FirstIntegral(wrong), dfx.Tsit5(), **adaptive)
+        sol = run(dfc.FirstIntegral(wrong), dfx.Tsit5(), **options)
         assert abs(wrong(0, sol.ys[-1], None) - wrong(0, Y0, None)) < 1e-15
         assert "check_invariance" in str(dfc.statistics(sol))
-    sol = run(dfc.FirstIntegral(square), dfx.Tsit5(), **adaptive)
+    sol = run(dfc.FirstIntegral(square), dfx.Tsit5(), **options)
     assert "check_invariance" not in str(dfc.statistics(sol))
-
-
-def spoilt(t, y, args):
-    return square(t, y, args) * jnp.where(t > 0.5, args, 1.0) + jnp.where(t > 0.5, 9.0, 0.0)
-
-
-@pytest.mark.parametrize("after", [jnp.nan, 5.0])
-def test_an_adaptive_solve_without_hope_ends(after):
-    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
-    options = dict(stepsize_controller=adaptive, max_steps=4096, throw=False)
-    sol = run(dfc.FirstIntegral(spoilt), dfx.Tsit5(), args=jnp.asarray(after), **options)
-    assert (NOT_FINITE if np.isnan(after) else NOT_REACHED) in dfx.RESULTS[sol.result]
-    plain = run(dfc.FirstIntegral(square), dfx.Tsit5(), **options)
-    assert sol.stats["num_steps"] <= plain.stats["num_steps"] + HOPELESS
 
 
 def test_what_failed_is_nan_and_takes_no_iterations():
     """In a batch a lane that ended is evaluated until the last one ends."""
-    sol = run(OUT_OF_REACH, throw=False)
-    assert NOT_REACHED in dfx.RESULTS[sol.result]
-    assert np.all(np.isnan(sol.ys[-1]))
     sol = run(dfc.FirstIntegral(lambda t, y, args: y[1]), max_correction=0.5, throw=False)
     assert TOO_FAR in dfx.RESULTS[sol.result]
     assert np.all(np.isnan(sol.ys[-1]))
@@ -141,7 +155,7 @@ def test_what_failed_is_nan_and_takes_no_iterations():
 def test_an_adaptive_solve_without_hope_ends_at_late_times(late, dtype):
     """There even the shortest step of time moves the state by much."""
     jump = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - jnp.where(t > late, -1, 1))
-    slow, span = lambda *args: 0.3 * rotation(*args), dict(t0=late - 20, t1=late + 20, dt0=None)
+    slow, span = lambda *args: 0.3 * oscillator(*args), dict(t0=late - 20, t1=late + 20, dt0=None)
     options = span | dict(stepsize_controller=dfx.PIDController(1e-4, 1e-4), max_steps=4096)
     sol = run(jump, dfx.Tsit5(), Y0.astype(dtype), slow, throw=False, **options)
     assert NOT_REACHED in dfx.RESULTS[sol.result]
@@ -201,9 +215,3 @@ def test_a_constraint_that_jumps_is_told_at_a_declared_jump():
     assert CANNOT_START in told
     assert "`project`, and go on" in told
     assert result(1.0) == dfx.RESULTS.successful
-
-
-def test_a_first_projection_may_be_as_long_as_a_given_value_needs():
-    sol = run(dfc.FirstIntegral(square, value=4.0), saveat=dfx.SaveAt(steps=True), max_steps=16)
-    squares = np.sum(np.asarray(sol.ys)[:10] ** 2, axis=1)
-    np.testing.assert_allclose(squares, 4.0, rtol=1e-14)

@@ -11,8 +11,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from .. import problems
-from ..learned import oscillator
-from ..problems import EXPONENTIAL0, KEPLER, KEPLER0, drift_of, exponential, kepler, largest
+from ..problems import EXPONENTIAL0, exponential, oscillator
 
 EIGHT = dfc.RandomFeatureSolver(8)
 NORTH = jnp.array([1.0, 0.3])
@@ -45,21 +44,14 @@ def relative_error(ys, expected):
     return np.linalg.norm(ys - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.slow
-def test_target_of_the_oscillator():
-    """Relative L2 error of the state over [0, 30] at most 1e-12."""
-    ts, solver = jnp.linspace(0, 30, 301), dfc.RandomFeatureSolver()
-    sol = solve(oscillator, NORTH, 30.0, solver=solver, tol=1e-12, saveat=dfx.SaveAt(ts=ts))
-    assert relative_error(sol.ys, oscillation(np.asarray(ts))) <= 1e-12
-
-
 def test_target_of_the_rigid_body():
     """Over [0, 1.75], against Jacobi's elliptic functions."""
     system = dfc.systems.RigidBody()
     ts = jnp.linspace(0, 1.75, 36)
     options = dict(solver=dfc.RandomFeatureSolver(), dt0=0.25, saveat=dfx.SaveAt(ts=ts))
     sol = solve(system.vector_field, system.y0, 1.75, **options)
-    assert relative_error(sol.ys, system.solution(ts, system.y0)) <= 1e-12
+    exact = eqx.filter_jit(system.solution)(ts, system.y0)
+    assert relative_error(np.asarray(sol.ys), np.asarray(exact)) <= 1e-12
 
 
 def step(vector_field, solver, y0, h):
@@ -94,26 +86,6 @@ def test_the_estimate_is_the_true_error_of_a_step(field, y0, shortest, longest, 
     assert np.any(counted)
     ratios = np.asarray(estimates / errors)[counted]
     assert np.all((ratios > 0.7) & (ratios < 1.5))
-
-
-@pytest.mark.slow
-def test_a_stiff_problem():
-    """Robertson's kinetics: rates from 1e-5 to 1e4 and more."""
-
-    def robertson(t, y, args):
-        a, b, c = y
-        slow, fast, back = 0.04 * a, 3e7 * b**2, 1e4 * b * c
-        return jnp.stack([back - slow, slow - back - fast, fast])
-
-    y0 = jnp.array([1.0, 0.0, 0.0])
-    controller = dfx.PIDController(rtol=1e-8, atol=1e-12)
-    sol = solve(
-        robertson, y0, 4e3, solver=dfc.RandomFeatureSolver(), stepsize_controller=controller
-    )
-    assert int(sol.stats["num_steps"]) < 100
-    # By Kvaerno5 with tolerance 1e-11, in 6,779 steps.
-    expected = [1.83202258e-1, 8.94237125e-7, 8.16796848e-1]
-    np.testing.assert_allclose(sol.ys[-1], expected, rtol=1e-8)
 
 
 def test_a_step_decays_where_the_solution_does():
@@ -183,19 +155,6 @@ def test_a_batch_is_its_lanes():
         y, ok = run(rate)
         assert bool(ok) == bool(batch[1][i])
         np.testing.assert_allclose(batch[0][i], y, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_on_a_manifold():
-    """At the steps and between them; the solver alone keeps the energy only."""
-    solver = dfc.RandomFeatureSolver(6)
-    saveat = dfx.SaveAt(ts=jnp.linspace(0, 6, 41))
-
-    def run(solver):
-        return solve(kepler, KEPLER0, 6.0, solver=solver, dt0=0.25, saveat=saveat)
-
-    assert largest(drift_of(run(dfc.ManifoldProjection(solver, KEPLER)), KEPLER)) <= 4e-15
-    assert largest(drift_of(run(solver), KEPLER)) > 1e-10
 
 
 def test_second_derivatives_of_a_step():

@@ -35,20 +35,6 @@ def exact(term, y0, h=0.25, t0=0.0, args=None):
     return jax.tree.map(lambda x: x[-1], ys)
 
 
-def errors(**options):
-    """The median of those of one step."""
-    y0s = states(20)
-    ys, _ = jax.vmap(lambda y0: step(unchecked(SHIPPED, **options), y0))(y0s)
-    return jnp.median(jnp.linalg.norm(ys - jax.vmap(lambda y0: exact(TERM, y0))(y0s), axis=1))
-
-
-@pytest.mark.slow
-def test_each_sweep_gains_a_digit():
-    found = [errors(corrections=k) for k in (0, 1, 4, 8)]
-    assert found[0] > 5 * found[1] > 5e3 * found[2] > 5e7 * found[3]
-    assert found[3] < 1e-12
-
-
 def test_sweeps_of_a_flow_map_that_knows_nothing_have_their_order():
     solver = unchecked(Still(), corrections=3)
     assert solver.order(DRIVEN) == 3

@@ -18,7 +18,7 @@ from ..thinned import some_of
 
 SYSTEMS = {name: systems.get(name) for name in systems.names()}
 every_system = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
-some_systems = some_of("system", SYSTEMS.values(), ids=SYSTEMS, period=6)
+some_systems = some_of("system", SYSTEMS.values(), ids=SYSTEMS, period=7)
 periodic = [s for s in SYSTEMS.values() if eqx.filter_eval_shape(s.period) is not None]
 
 

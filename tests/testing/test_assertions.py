@@ -17,10 +17,10 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .. import problems
-from ..problems import OMEGA0, RIGID_BODY, rigid_body
+from ..problems import OMEGA0, RIGID_BODY, refused, rigid_body
 
 TERM = dfx.ODETerm(rigid_body)
-PROJECTED = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
+PLAIN, PROJECTED = dfx.Heun(), dfc.ManifoldProjection(dfx.Heun(), RIGID_BODY)
 SAVED = dfx.SaveAt(t0=True, steps=True, dense=True)
 
 
@@ -31,8 +31,9 @@ def solve(solver, y0=OMEGA0, *, dense=False, **options):
     return sol if dense else dataclasses.replace(sol, interpolation=None)
 
 
-def solve_batch(solver, y0s):
-    return jax.vmap(lambda y0: solve(solver, y0))(y0s)
+def batch(y0s):
+    """As `jax.vmap` returns it, by the program of one lane."""
+    return jax.tree.map(lambda *x: np.stack(x), *(solve(PROJECTED, y0) for y0 in y0s))
 
 
 def rows_of(sol, *rows):
@@ -50,7 +51,8 @@ def fails(function, *args, **kwargs):
 
 def test_a_projected_solution_is_conserved_and_a_plain_one_not():
     """With rows that diffrax padded, and at the dense output of two saved states."""
-    saved, plain = solve(PROJECTED, dense=True), solve(dfx.Tsit5())
+    saved, dense = solve(PROJECTED, dense=True), solve(PLAIN, dense=True)
+    plain = dataclasses.replace(dense, interpolation=None)
     sol = rows_of(saved, 0, 20)
     for right in (dataclasses.replace(saved, interpolation=None), sol):
         dct.assert_conserved(right, RIGID_BODY)
@@ -60,11 +62,10 @@ def test_a_projected_solution_is_conserved_and_a_plain_one_not():
     assert "must stay 0.3" in text
     assert "units of roundoff (float64)" in text
     assert "violated in 20 of 21 rows" in text
-    dct.assert_conserved(plain, RIGID_BODY, rtol=1e-6)
-    dct.assert_conserved(plain, RIGID_BODY, rtol=0, atol=1e-6)
+    dct.assert_conserved(plain, RIGID_BODY, rtol=1e-2)
+    dct.assert_conserved(plain, RIGID_BODY, rtol=0, atol=1e-2)
     # The nodes lie on the manifold; this is the defect of a naive wrapper.
-    dense = solve(dfx.Tsit5(), dense=True).interpolation
-    mixed = eqx.tree_at(lambda s: s.interpolation, sol, dense)
+    mixed = eqx.tree_at(lambda s: s.interpolation, sol, dense.interpolation)
     assert "dense output, row" in fails(dct.assert_conserved, mixed, RIGID_BODY)
     end = rows_of(plain, 20)
     assert "first at time 2" in fails(dct.assert_conserved, end, RIGID_BODY, y0=OMEGA0)
@@ -92,13 +93,13 @@ def test_an_unsuccessful_solve_is_reported_as_that():
 
 def test_lanes_of_a_batch_are_all_checked():
     y0s = jnp.stack([OMEGA0, 2 * OMEGA0, 3 * OMEGA0])
-    sol = solve_batch(PROJECTED, y0s)
+    sol = batch(y0s)
     dct.assert_conserved(sol, RIGID_BODY, y0=y0s)
-    moved = eqx.tree_at(lambda s: s.ys, sol, sol.ys.at[2, 5].multiply(1.001))
+    moved = eqx.tree_at(lambda s: s.ys, sol, jnp.asarray(sol.ys).at[2, 5].multiply(1.001))
     text = fails(dct.assert_conserved, moved, RIGID_BODY)
     assert "first at time 0.5 (saved state, row 5 of 21, lane (2,))" in text
     assert "violated in 1 of 63 rows" in text
-    text = fails(dct.assert_conserved, solve_batch(PROJECTED, y0s.at[1].set(jnp.nan)), RIGID_BODY)
+    text = fails(dct.assert_conserved, batch(y0s.at[1].set(jnp.nan)), RIGID_BODY)
     assert "in 1 of 3 lanes, first in lane (1,)" in text
 
 
@@ -170,20 +171,14 @@ def test_states_are_like_the_given_one_and_bounded(y):
         assert np.all((x == 0) | (x.astype(np.float32) ** 2 > 0))
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "match"),
-    [
-        (lambda: dct.states(np.zeros(3, int)), TypeError, "floating-point"),
-        (lambda: dct.states(np.zeros(3), magnitude=0.0), ValueError, "`magnitude`"),
-        (lambda: dct.step_sizes(-0.1), ValueError, "smallest"),
-        (lambda: dct.times(0.0, np.inf), ValueError, "finite"),
-        (lambda: dct.restructurings((KEPLER.y0[0], np.zeros(2, "f4"))), ValueError, "dtypes"),
-        (lambda: dct.quadratic_systems(2, integrals=2), ValueError, "1 or 2 integrals"),
-    ],
+test_mistakes_are_named = refused(
+    (lambda: dct.states(np.zeros(3, int)), TypeError, "floating-point"),
+    (lambda: dct.states(np.zeros(3), magnitude=0.0), ValueError, "`magnitude`"),
+    (lambda: dct.step_sizes(-0.1), ValueError, "smallest"),
+    (lambda: dct.times(0.0, np.inf), ValueError, "finite"),
+    (lambda: dct.restructurings((KEPLER.y0[0], np.zeros(2, "f4"))), ValueError, "dtypes"),
+    (lambda: dct.quadratic_systems(2, integrals=2), ValueError, "1 or 2 integrals"),
 )
-def test_mistakes_are_named(make, error, match):
-    with pytest.raises(error, match=match):
-        make()
 
 
 @given(y=dct.system_states(dfc.systems.CartesianPendulum(), dtype=np.float32))

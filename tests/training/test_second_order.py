@@ -11,12 +11,10 @@ import pytest
 
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._networks.cores import Gated
-from diffrax_conserve.learned._training.second_order import (
-    _by_gram_matrix,
-    _by_triangular_factor,
-)
+from diffrax_conserve.learned._training.second_order import _by_gram_matrix, _by_triangular_factor
 
-from ..learned import EAST, LORENZ, SMALL, flow_map, oscillator, states
+from ..learned import EAST, LORENZ, SMALL, flow_map, states
+from ..problems import oscillator
 
 KEY = jr.key(5)
 
@@ -103,19 +101,6 @@ def test_a_conservative_window_is_as_accurate_and_on_the_manifold():
 
 
 @pytest.mark.slow
-def test_no_update_in_single_precision_is_skipped():
-    here, network = jax.tree.map(
-        lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x,
-        (states(), flow_map(core="concatenated")),
-    )
-    with jax.enable_x64(False):
-        chosen = dataclasses.replace(dfc.learned.second_order(network), epochs=200, points=50)
-        field = lambda t, y, args: LORENZ.vector_field(t, y, args)  # noqa: E731
-        _, log = dfc.fit(network, field, sample=here, key=jr.key(6), recipe=chosen)
-    assert log.skipped == 0
-
-
-@pytest.mark.slow
 def test_a_flow_map_does_not_depend_on_the_units_of_components():
     def losses(units):
         here = units * states()
@@ -182,23 +167,11 @@ def test_it_gets_none_where_that_would_harm_or_is_not_wanted(field, options):
 
 
 @pytest.mark.slow
-def test_it_gets_the_slope_of_the_field_and_goes_on_bit_for_bit_from_between_two_comparisons():
+def test_it_gets_the_slope_of_the_field():
     network = flow_map()
-    chosen = few(network, epochs=400, check_every=100)
-    options = dict(key=KEY, sample=LORENZ.sample, recipe=chosen)
-    whole, log = dfc.fit(network, LORENZ.vector_field, **options)
-    assert isinstance(whole.core, Gated)
+    found = dfc.fit(
+        network, LORENZ.vector_field, key=KEY, sample=LORENZ.sample, recipe=few(network)
+    )[0]
+    assert isinstance(found.core, Gated)
     y = states(1)[0]
-    slope = LORENZ.vector_field(0.0, y, None)
-    np.testing.assert_allclose(whole.slope(y), slope, rtol=1e-12)
-    state, seconds = None, 0.02
-    for _ in range(100):
-        model, stopped = dfc.fit(
-            network, LORENZ.vector_field, **options, state=state, seconds=seconds
-        )
-        if stopped.ended != "seconds":
-            break
-        state, seconds = stopped.state, 4 * seconds
-    assert eqx.tree_equal(model, whole)
-    np.testing.assert_array_equal(stopped.losses, log.losses)
-    np.testing.assert_array_equal(stopped.criteria, log.criteria)
+    np.testing.assert_allclose(found.slope(y), LORENZ.vector_field(0.0, y, None), rtol=1e-12)
