@@ -224,8 +224,8 @@ def decide_success_by_the_scale_at_the_candidate(package):
 
 
 @noticed_by("tests/laws/test_units.py", "-k", "satellites")
-def polish_all_constraints_where_one_is_more_than_noise(package):
-    package.function("corrected", lambda given: lambda *x, only=None, **y: given(*x, **y))
+def polish_along_nearly_parallel_gradients(package):
+    package.function("corrected", lambda given: lambda *x, least=None: given(*x))
 
 
 @noticed_by("tests/laws/test_never_silent.py", "-k", "parallel")

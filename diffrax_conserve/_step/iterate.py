@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import AT_BOUND, FROZEN_STEPS, SHORTER, WRITTEN_OUT
+from .._constants import AT_BOUND, FROZEN_STEPS, ROUNDOFF, SHORTER, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
 from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
@@ -163,6 +163,8 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     equations, candidate, directions = given
+    dtype = equations.magnitude.dtype
+    roundoff = ROUNDOFF * float(jnp.finfo(dtype).eps)
 
     def first_rows(y: Any) -> Any:
         """The gradients at the candidate, which the steps share."""
@@ -182,11 +184,12 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         frozen = counter > max_steps + 1 - FROZEN_STEPS
         along = jnp.where(frozen, first, rows) if fresh else first
         counter = after_test(level, counter)
-        # A step that only polishes leaves alone what is noise. If it must not change that, and the
-        # gradients are nearly parallel, it would be as long as roundoff over the sine of their
-        # angle.
-        only = (wrong != 0) | (level < ON)
-        moved = y - equations.change(corrected(rows, along, wrong / sizes, only=only))
+        # A step that only polishes is as long as roundoff over the sine of the angle between
+        # gradients. So that it is never much longer than what it corrects, a constraint whose
+        # gradient is nearly parallel to others takes no part in it. In float64 it is short in any
+        # case, and the batch is faster without the distinction.
+        least = jnp.where(level < ON, roundoff, 1 / ROUNDOFF**2) if dtype != jnp.float64 else None
+        moved = y - equations.change(corrected(rows, along, wrong / sizes, least=least))
         return keep_done(counter, moved, y), counter
 
     # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
@@ -57,16 +57,10 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def corrected(
-    rows: Any,
-    along: Any,
-    b: Float[Array, " m"],
-    *,
-    only: Bool[Array, " m"] | None = None,
-    least: float | None = None,
+    rows: Any, along: Any, b: Float[Array, " m"], *, least: float | Array | None = None
 ) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
-    If `only` some of up to four constraints take part, the others change as it comes. The `least`
-    pivot that counts is that of `eliminated`.
+    The `least` pivot that counts is that of `eliminated`.
 
     If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
     the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
@@ -77,8 +71,6 @@ def corrected(
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b, least=least), along)
-    if only is not None:
-        gram = jnp.where(only[:, None] & only[None], gram, 0)
     return combined(*eliminated(gram, b, along, least=least))
 
 
@@ -172,7 +164,7 @@ def refined(
 
 
 def eliminated(
-    gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | None = None
+    gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | Array | None = None
 ) -> tuple[Array, Array]:
     """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, in the order
     of the elimination. The `combined` of both is `rowsᵀ gram⁻¹ b`.
@@ -180,9 +172,10 @@ def eliminated(
     Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
     angles between the gradient of each constraint and those before it. Next is always the
     constraint with the largest of them: if a nearly parallel one came earlier, its roundoff would
-    be magnified in the pivots of those that could replace it. A pivot of at most `least`, by
-    default the roundoff of the diagonal, counts as infinite, so that its multiplier is zero."""
-    m, roundoff = len(gram), ROUNDOFF * float(jnp.finfo(gram.dtype).eps)
+    be magnified in the pivots of those that could replace it. A pivot of at most `least` of the
+    diagonal, by default roundoff, counts as infinite, so that its multiplier is zero."""
+    m = len(gram)
+    least = ROUNDOFF * float(jnp.finfo(gram.dtype).eps) if least is None else least
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
@@ -193,8 +186,7 @@ def eliminated(
                 first, second = each[k], each[i]
                 each[k] = jtu.tree_map(ft.partial(jnp.where, larger), second, first)
                 each[i] = jtu.tree_map(ft.partial(jnp.where, larger), first, second)
-        limit = roundoff * size[k] if least is None else least
-        pivot = jnp.where(jnp.abs(matrix[k][k]) > limit, matrix[k][k], jnp.inf)
+        pivot = jnp.where(jnp.abs(matrix[k][k]) > least * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
             b[i], rows[i] = b[i] - below * b[k], rows[i] - beside * rows[k]

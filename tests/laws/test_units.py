@@ -152,7 +152,7 @@ def test_orbits_beat_plain_and_no_saved_state_is_of_another_time():
 
 def test_roundoff_does_not_move_satellites_further_than_plain():
     """In single precision and metres, almost circular, where energy and momentum have nearly
-    parallel gradients: what is roundoff in one is left alone when the other is corrected."""
+    parallel gradients, so that a correction of roundoff in one of them only would be long."""
     rng, lanes = np.random.default_rng(0), 300
     a, e, phase = rng.uniform([[6.8e6], [0], [0]], [[8e6], [0.1], [2 * np.pi]], (3, lanes))
     rate = np.sqrt(EARTH / a**3)
