@@ -6,6 +6,7 @@ A comparison has a function `measure(smoke)`, which returns rows, and `table(res
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -15,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "cost"))
+# Factorisations are many times slower if threads of OpenBLAS wait beside those of XLA.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import diffrax as dfx
 import equinox as eqx

@@ -4,6 +4,8 @@
 - A02: a row of N four-bar linkages, 2 N + 1 rods of one metre and one kilogram. Twice in a turn
   all rods lie in one line, and the Jacobian of the constraints loses rank. B0 starts at the top
   with 1 m/s. Here N is 2, for 10 s, as in OpenSim; the library asks for N = 40.
+- A03: Andrews' mechanism, seven bodies in a plane, a motor of 0.033 N m and a spring, 0.05 s. Each
+  body is a place and an angle here, 21 numbers under 20 constraints.
 - A04: Bricard's mechanism, five rods of one metre and one kilogram with a square section of 0.1 m,
   six hinges, 10 s. It is over-constrained: counted naively it can not move, and it has one degree
   of freedom. Each rod is a place and a matrix here, 60 numbers under 66 constraints.
@@ -11,8 +13,9 @@
 Published: the library's specification (A02), and OpenSim's times and largest change of the energy
 (github.com/RehabEngGroup/MBSbenchmarksInOpenSim, commit c76fa61, an Intel i5-4570 of 2013; the
 energy is read off a figure). The references are the equations in one angle at 1e-13 for A01 and
-A02, and for A04 plain Dopri8 at 1e-12. The library's own curve of A04, read off a figure, has a
-period of 5.0 s, z down to -0.50 and y up to -0.866.
+A02, and for A03 and A04 plain Dopri8 at 1e-12. The data of A03 are those of the test set of Lioen
+and de Swart (CWI, 1999), which publishes the angles after 0.03 s. The library's own curve of A04,
+read off a figure, has a period of 5.0 s, z down to -0.50 and y up to -0.866.
 """
 
 import itertools
@@ -20,6 +23,7 @@ import math
 
 import common
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -30,21 +34,21 @@ SOURCE = (
     "c76fa61, OpenSim 3.2"
 )
 # Seconds and the largest change of the energy in joules.
-OPENSIM = {"A01": (0.637, None), "A02": (0.455, None), "A04": (0.258, 9e-7)}
+OPENSIM = dict(A01=(0.637, None), A02=(0.455, None), A03=(0.384, None), A04=(0.258, 9e-7))
 GRAVITY = 9.81
 MAX_STEPS = 2_000
 
 
-def mechanism(masses, force, constraint, q0, v0):
+def mechanism(masses, potential, constraint, q0, v0):
     """The equations of motion of positions with diagonal masses, and what is kept."""
 
     def free(t, y, args):
-        _q, v = y
-        return v, force / masses * jnp.ones_like(v)
+        q, v = y
+        return v, -jax.grad(potential)(q) / masses
 
     def energy(t, y, args):
         q, v = y
-        return jnp.sum(masses * v**2) / 2 - jnp.sum(force * q)
+        return jnp.sum(masses * v**2) / 2 + potential(q)
 
     joints = dfc.Constraint(lambda t, y, args: constraint(y[0]))
     rates = joints.derivative(free)
@@ -69,8 +73,10 @@ def one_angle(inertia, weight, angle, rate, times):
 
 
 def pendulum():
-    force = jnp.array([[0.0, -GRAVITY]])
-    problem = mechanism(1.0, force, lambda q: q[0] @ q[0] - 1, [[-1.0, 0.0]], np.zeros((1, 2)))
+    def potential(q):
+        return GRAVITY * q[0, 1]
+
+    problem = mechanism(1.0, potential, lambda q: q[0] @ q[0] - 1, [[-1.0, 0.0]], np.zeros((1, 2)))
 
     def reference(times):
         return one_angle(1.0, GRAVITY, np.pi, 0.0, times)
@@ -95,16 +101,79 @@ def four_bars(windows, t1):
         upright, level = places - feet, places[1:] - places[:-1]
         return jnp.concatenate([jnp.sum(upright**2, 1), jnp.sum(level**2, 1)]) - 1
 
-    force = jnp.asarray(np.linalg.solve(factor, weights[:, None] * [[0.0, -GRAVITY]]))
+    def potential(z):
+        return GRAVITY * weights @ (to_places @ z)[:, 1]
+
     q0 = factor.T @ (feet + np.array([0.0, 1.0]))
     v0 = factor.T @ np.broadcast_to([1.0, 0.0], (ends, 2))
-    problem = mechanism(1.0, force, constraint, q0, v0)
+    problem = mechanism(1.0, potential, constraint, q0, v0)
     inertia, weight = ends / 3 + windows, GRAVITY * weights.sum()
 
     def reference(times):
         return one_angle(inertia, weight, np.pi / 2, -1.0, times)
 
     return problem, lambda z: (to_places @ z)[..., 0, :], reference, t1
+
+
+# ---- A03: Andrews' mechanism ----
+
+A, B, C = np.array([[-0.06934, -0.00227], [-0.03635, 0.03273], [0.014, 0.072]])
+MASSES = np.array([0.04325, 0.00365, 0.02373, 0.00706, 0.0705, 0.00706, 0.05498])
+INERTIAS = np.array([2.194, 0.441, 5.255, 0.5667, 11.69, 0.5667, 19.12]) * 1e-6
+CRANK, ROD, COUPLER, SIDE, ARM = 0.007, 0.028, 0.02, 0.035, 0.04
+# The angles of the bodies K1 to K7 at the start, and after 0.03 s as published: beta, beta + theta,
+# gamma, phi + delta, delta, omega + epsilon, epsilon.
+START = [-0.06171389001427645, -0.06171389001427645, 0.4552798191630703, 0.7100333697097284,
+         0.4873649795438426, 1.0078790543839361, 1.2305474445498212]  # fmt: skip
+PUBLISHED = [15.81077119629904, 0.05440013645606, 0.04082224013073101, -0.0103201504421644,
+             0.5244099658805304, 1.582810857464958, 1.048080741042263]  # fmt: skip
+
+
+def turned(angle, x, y):
+    """The vector (x, y) of a body that is turned by an angle."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([x * cos - y * sin, x * sin + y * cos])
+
+
+def andrews():
+    """The state is the centre and the angle of each body."""
+
+    def centres(angles):
+        k1, k2, k3, k4, k5, k6, k7 = angles
+        return jnp.stack([
+            turned(k1, 0.00092, 0.0),
+            turned(k1, CRANK, 0.0) + turned(k2, -0.0115, 0.0),
+            B + turned(k3, 0.01043, -0.01874),
+            A + turned(k5, ARM, 0.0) + turned(k4, 0.0, 0.01421 - COUPLER),
+            A + turned(k5, 0.02308, 0.00916),
+            A + turned(k7, 0.0, -ARM) + turned(k6, COUPLER - 0.01421, 0.0),
+            A + turned(k7, -0.00449, -0.01228),
+        ])  # fmt: skip
+
+    def constraint(q):
+        k1, k2, k3, k4, k5, k6, k7 = q[:, 2]
+        joint = turned(k1, CRANK, 0.0) + turned(k2, -ROD, 0.0)
+        ends = (
+            B + turned(k3, 0.0, -SIDE),
+            A + turned(k5, ARM, 0.0) + turned(k4, 0.0, -COUPLER),
+            A + turned(k7, 0.0, -ARM) + turned(k6, COUPLER, 0.0),
+        )
+        loops = jnp.concatenate([joint - end for end in ends])
+        return jnp.concatenate([(q[:, :2] - centres(q[:, 2])).ravel(), loops])
+
+    def potential(q):
+        spring = B + turned(q[2, 2], 0.02, -0.018) - C
+        return 4530.0 * (jnp.sqrt(spring @ spring) - 0.07785) ** 2 / 2 - 0.033 * q[0, 2]
+
+    def end_of_crank(q):
+        beta = q[..., 0, 2]
+        return CRANK * np.stack([np.cos(beta), np.sin(beta)], axis=-1)
+
+    angles = jnp.asarray(START)
+    q0 = jnp.concatenate([centres(angles), angles[:, None]], axis=1)
+    masses = jnp.stack([MASSES, MASSES, INERTIAS], axis=1)
+    problem = mechanism(masses, potential, constraint, q0, np.zeros((7, 3)))
+    return problem, end_of_crank, None, 0.05
 
 
 # ---- A04: Bricard's mechanism ----
@@ -143,9 +212,11 @@ def bricard():
         parts = (grams[:, rows, columns], ends - starts, before - after)
         return jnp.concatenate([part.ravel() for part in parts])
 
-    force = jnp.zeros((5, 4, 3)).at[:, 0, 1].set(-GRAVITY)
+    def potential(q):
+        return GRAVITY * jnp.sum(q[:, 0, 1])
+
     q0 = np.concatenate([centres[:, None], np.broadcast_to(np.eye(3), (5, 3, 3))], axis=1)
-    problem = mechanism(masses, force, constraint, q0, np.zeros((5, 4, 3)))
+    problem = mechanism(masses, potential, constraint, q0, np.zeros((5, 4, 3)))
 
     def corner(q):  # P3 of the library, the end of the second rod
         arm = np.einsum("k,...kj->...j", along[1] / 2, q[..., 1, 1:, :])
@@ -211,11 +282,17 @@ def measure(smoke):
     for name, made, programs, metric in (
         ("A01", pendulum(), ("plain", "joints"), None),
         ("A02, N = 2", four_bars(2, 10.0), ("plain", "joints", "joints and energy"), None),
+        ("A03", andrews(), ("plain", "joints", "joints and energy"), 1.0),
         ("A04", bricard(), ("plain", "joints"), 1.0),
     ):
         found, curves[name] = rows_of(name, made, programs, two, False, metric)
         rows += found
-    return dict(source=SOURCE, opensim=OPENSIM, rows=rows, curves=curves)
+    (field, manifold, y0), *_ = andrews()
+    solver = dfc.ManifoldProjection(dfx.Dopri8(), manifold)
+    tight, end = jnp.array(1e-9), dfx.SaveAt(t1=True)
+    angles = common.solve(field, solver, y0, jnp.array(0.03), tight, tight, end).ys[0][-1, :, 2]
+    off = float(np.max(np.abs(angles - np.array(PUBLISHED))))
+    return dict(source=SOURCE, opensim=OPENSIM, rows=rows, curves=curves, angles_off=off)
 
 
 # ---- The page ----

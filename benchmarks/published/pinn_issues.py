@@ -13,11 +13,6 @@ something is conserved. Beside it Dopri8, which needs no network. Errors are the
 times, of each component relative to its largest value; the reference is Dopri8 at 1e-13.
 """
 
-import os
-
-# The factorisations of a training are slow when threads of OpenBLAS wait beside those of XLA.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import functools
 import time
 import warnings

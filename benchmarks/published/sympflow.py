@@ -12,11 +12,6 @@ Ours is a `DeepONet`, trained by default on 1,000 states of the same box, in a `
 on the energy. Beside both RK4 and Dopri8 without a network. The reference is Dopri8 at 1e-13.
 """
 
-import os
-
-# The factorisations of a training are slow when threads of OpenBLAS wait beside those of XLA.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import functools
 import time
 

@@ -199,7 +199,8 @@ class DAE(eqx.Module):
             each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
             equations differentiate stays, such as $x$ or $M y$. With a higher index unknowns
             without slopes, such as forces, are free, and the others move to the nearest point,
-            relative to their sizes.
+            relative to their sizes. So of a mechanism at rest give velocities of exactly zero:
+            small ones that do not fit its joints would hardly move, and turn its bodies instead.
 
         **Returns:**
 

@@ -74,6 +74,10 @@ class SymmetricProjection(ForwardingSolver):
     wrapped solver: about four. Steps are fixed, because a step size that follows an error estimate
     is not symmetric. By default the metric is Euclidean: that of motion depends on the past.
 
+    The multipliers are the same at both ends of a step, so quantities with nearly parallel
+    gradients, such as energy and angular momentum on an almost circular orbit, may not be met
+    together, however short the steps are. Keep one of them, or use `ManifoldProjection`.
+
     !!! example
 
         ```python

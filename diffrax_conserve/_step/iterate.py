@@ -98,14 +98,14 @@ def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
     """The counter after unknowns of this `level` were tested.
 
     Unknowns that are settled are done. Of those that are merely within the tolerance, one more step
-    brings the residual to roundoff, where `polish` asks for it. A residual that is not finite
-    cannot recover, but one more step takes the NaN to the unknowns, where everybody sees it. If no
-    test is left and the unknowns do not solve the equations, the iteration has failed.
+    brings the residual to roundoff, where `polish` asks for it; should that step have left the
+    tolerance, another returns to it. A residual that is not finite cannot recover, but one more
+    step takes the NaN to the unknowns, where everybody sees it. If no test is left and the unknowns
+    do not solve the equations, the iteration has failed.
     """
-    one_more = jnp.minimum(counter - 1, 1)
-    then = jnp.where(level == NOT_FINITE, one_more, counter - 1)
+    then = jnp.where(level == NOT_FINITE, jnp.minimum(counter - 1, 1), counter - 1)
     then = jnp.where((level < ON) & (then == 0), -1, then)
-    then = jnp.where(level == ON, one_more if polish else 0, then)
+    then = jnp.where(level == ON, jnp.where(counter > 2, 2, 0) if polish else 0, then)
     then = jnp.where(level == SETTLED, 0, then)
     return jnp.where(counter > 0, then, counter).astype(counter.dtype)
 
@@ -182,7 +182,11 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         frozen = counter > max_steps + 1 - FROZEN_STEPS
         along = jnp.where(frozen, first, rows) if fresh else first
         counter = after_test(level, counter)
-        moved = y - equations.change(corrected(rows, along, wrong / sizes))
+        # A step that only polishes leaves alone what is noise. If it must not change that, and the
+        # gradients are nearly parallel, it would be as long as roundoff over the sine of their
+        # angle.
+        only = (wrong != 0) | (level < ON)
+        moved = y - equations.change(corrected(rows, along, wrong / sizes, only=only))
         return keep_done(counter, moved, y), counter
 
     # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
@@ -57,10 +57,16 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def corrected(
-    rows: Any, along: Any, b: Float[Array, " m"], *, least: float | None = None
+    rows: Any,
+    along: Any,
+    b: Float[Array, " m"],
+    *,
+    only: Bool[Array, " m"] | None = None,
+    least: float | None = None,
 ) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
-    The `least` pivot that counts is that of `eliminated`.
+    If `only` some of up to four constraints take part, the others change as it comes. The `least`
+    pivot that counts is that of `eliminated`.
 
     If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
     the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
@@ -71,6 +77,8 @@ def corrected(
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b, least=least), along)
+    if only is not None:
+        gram = jnp.where(only[:, None] & only[None], gram, 0)
     return combined(*eliminated(gram, b, along, least=least))
 
 
