@@ -173,43 +173,6 @@ def test_roundoff_does_not_move_satellites_further_than_plain():
     assert np.median(projected) < 0.7 * np.median(plain)
 
 
-SEVEN = {
-    "energy": dfc.FirstIntegral(lambda t, y, mu: y[3:] @ y[3:] / 2 - mu / jnp.linalg.norm(y[:3])),
-    "momentum": dfc.FirstIntegral(lambda t, y, mu: jnp.cross(y[:3], y[3:])),
-    "eccentricity": dfc.FirstIntegral(
-        lambda t, y, mu: (
-            jnp.cross(y[3:], jnp.cross(y[:3], y[3:])) - mu * y[:3] / jnp.linalg.norm(y[:3])
-        )
-    ),
-}
-
-
-@pytest.mark.slow
-def test_the_seven_integrals_of_an_orbit_in_space_of_which_five_are_independent():
-    a, e, turns = 7.078e6, np.array([0.0, 1e-8, 1e-4, 1e-2, 0.3]), 5
-    rate, size = np.sqrt(EARTH / a**3), np.repeat([a, np.sqrt(EARTH / a)], 3)
-    plane = np.array([[1, 0, 0], [0, np.cos(0.7), np.sin(0.7)]])
-    ellipse = on_ellipse(EARTH, a, e[:, None], np.array([[0.3, 0.3 + 2 * np.pi * turns]]))
-    in_space = [part @ plane for part in np.split(ellipse, 2, axis=-1)]
-    y0, exact = np.moveaxis(np.concatenate(in_space, axis=-1), 1, 0)
-    field = lambda t, y, mu: jnp.append(y[3:], -mu * y[:3] / jnp.linalg.norm(y[:3]) ** 3)  # noqa: E731
-
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, None))
-    def run(y0, dt):
-        solvers = dfx.Tsit5(), dfc.ManifoldProjection(dfx.Tsit5(), SEVEN)
-        options, end = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False), 2 * np.pi
-        sols = [dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, turns * end / rate, dt, y0, EARTH,
-                                **options) for solver in solvers]  # fmt: skip
-        return *[sol.ys[0] for sol in sols], dfc.statistics(sols[1]).max_iterations
-
-    for count in 60, 200:
-        plain, projected, iterations = run(y0, 2 * np.pi / rate / count)
-        errors = [np.max(np.abs(y - exact) / size, axis=1) for y in (plain, projected)]
-        assert np.all(errors[1] < errors[0])  # NaN is not
-        assert np.all(iterations <= 12)
-
-
 def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another():
     """By the sizes and the changes of a step: `sqrt(4 · 1)` and `sqrt(2 · 0.02)`."""
     place, speed = np.array([[0.0, 4.0], [3.0, 0.0]]), np.array([2.0, 0.0])
