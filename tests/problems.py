@@ -108,7 +108,12 @@ def solve(vector_field, solver, y0, *, t0=0.0, t1=1.0, dt0=0.1, args=None, **kwa
 @eqx.filter_jit
 def _solve(vector_field, solver, t0, t1, dt0, y0, args, kwargs):
     """All in one program: outside of one, diffrax compiles each of some forty operations."""
-    return dfx.diffeqsolve(dfx.ODETerm(vector_field), solver, t0, t1, dt0, y0, args, **kwargs)
+    terms = dfx.ODETerm(vector_field) if callable(vector_field) else vector_field
+    return dfx.diffeqsolve(terms, solver, t0, t1, dt0, y0, args, **kwargs)
+
+
+# Of solves by which nothing is differentiated in reverse: a failure is a result.
+TO_THE_END = dict(max_steps=None, throw=False, adjoint=dfx.ForwardMode())
 
 
 @eqx.filter_jit

@@ -131,7 +131,7 @@ test_mistakes_are_named = refused(
         (
             lambda x=x: run(dataclasses.replace(ENERGY, value=x)),
             ValueError,
-            "of `manifold` has the st",
+            "conserved value of `manifold` has the structure",
         )
         for x in ((1.0, 2.0), jnp.ones(1), {"energy": 1.0})
     ),

@@ -358,32 +358,6 @@ def test_newton_does_not_leave_the_domain_of_a_function(name):
     assert np.all(off <= 1e-13 * (1 + np.abs(value(y)))), np.max(off)
 
 
-TODA = (
-    lambda t, y, args: jnp.sum(y[1]),
-    lambda t, y, args: jnp.sum(y[1] ** 2) / 2 + jnp.sum(jnp.exp(y[0] - jnp.roll(y[0], -1))),
-)
-
-
-def toda(t, y, args):
-    force = jnp.exp(y[0] - jnp.roll(y[0], -1))
-    return jnp.stack([y[1], jnp.roll(force, 1) - force])
-
-
-@pytest.mark.slow
-def test_small_vibrations_are_moved_by_little():
-    """The energy has only roundoff, which is not corrected where the momentum is."""
-    amplitude = 10 ** np.random.default_rng(2).uniform(-12, -5, (100, 1, 1))
-    y0 = jnp.asarray(amplitude * np.random.default_rng(3).normal(size=(100, 2, 3)))
-    saveat = dfx.SaveAt(ts=jnp.linspace(0, 1, 23))
-
-    def states(solver):
-        return jax.jit(jax.vmap(lambda y: solve(toda, solver, y, t1=1, dt0=0.05, saveat=saveat).ys))
-
-    manifold = tuple(map(dfc.FirstIntegral, TODA))
-    moved = states(dfc.ManifoldProjection(dfx.Dopri5(), manifold))(y0) - states(dfx.Dopri5())(y0)
-    assert np.max(np.abs(moved) / amplitude[..., None]) < 1e-9
-
-
 @pytest.mark.usefixtures("errors_raise")
 def test_a_branch_that_is_not_taken_does_not_run():
 
@@ -461,3 +435,29 @@ def test_products_of_matrices_have_all_digits(projection):
             if eqn.primitive.name == "dot_general":
                 precisions.add(eqn.params["precision"])
     assert precisions == {(lax.Precision.HIGHEST, lax.Precision.HIGHEST)}
+
+
+TODA = (
+    lambda t, y, args: jnp.sum(y[1]),
+    lambda t, y, args: jnp.sum(y[1] ** 2) / 2 + jnp.sum(jnp.exp(y[0] - jnp.roll(y[0], -1))),
+)
+
+
+def toda(t, y, args):
+    force = jnp.exp(y[0] - jnp.roll(y[0], -1))
+    return jnp.stack([y[1], jnp.roll(force, 1) - force])
+
+
+@pytest.mark.slow
+def test_small_vibrations_are_moved_by_little():
+    """The energy has only roundoff, which is not corrected where the momentum is."""
+    amplitude = 10 ** np.random.default_rng(2).uniform(-12, -5, (100, 1, 1))
+    y0 = jnp.asarray(amplitude * np.random.default_rng(3).normal(size=(100, 2, 3)))
+    saveat = dfx.SaveAt(ts=jnp.linspace(0, 1, 23))
+
+    def states(solver):
+        return jax.jit(jax.vmap(lambda y: solve(toda, solver, y, t1=1, dt0=0.05, saveat=saveat).ys))
+
+    manifold = tuple(map(dfc.FirstIntegral, TODA))
+    moved = states(dfc.ManifoldProjection(dfx.Dopri5(), manifold))(y0) - states(dfx.Dopri5())(y0)
+    assert np.max(np.abs(moved) / amplitude[..., None]) < 1e-9

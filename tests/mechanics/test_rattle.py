@@ -10,7 +10,8 @@ import pytest
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import assert_lanes, difference, final, largest, refused
+from .. import problems
+from ..problems import TO_THE_END, assert_lanes, difference, final, largest, refused
 from ..thinned import some_of
 
 GRAVITY = np.array([0.0, -1.0])
@@ -55,17 +56,8 @@ THREE = dfc.RATTLE(dfc.Constraint(rods), MASSES)
 TERMS = terms(springs, MASSES)
 
 
-def solve(terms, solver, y0, *times):
-    """Compiled once for all times."""
-    return _solve(terms, solver, y0, *jnp.asarray(times, y0[0].dtype))
-
-
-@eqx.filter_jit
-def _solve(terms, solver, y0, t0, t1, h):
-    return dfx.diffeqsolve(
-        terms, solver, t0, t1, h, y0, saveat=dfx.SaveAt(t1=True), max_steps=None, throw=False,
-        adjoint=dfx.ForwardMode(),
-    )  # fmt: skip
+def solve(terms, solver, y0, t0, t1, dt0):
+    return problems.solve(terms, solver, y0, t0=t0, t1=t1, dt0=dt0, **TO_THE_END)
 
 
 def off(constraint, y):

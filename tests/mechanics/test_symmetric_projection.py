@@ -1,7 +1,6 @@
 """Symmetric projection and the implicit midpoint rule: steps back undo steps."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +11,15 @@ from scipy.integrate import solve_ivp
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
+from .. import problems
 from ..problems import (
     EXPONENTIAL,
     EXPONENTIAL0,
     INERTIA,
     KEPLER,
+    KEPLER0,
     RIGID_BODY,
+    TO_THE_END,
     assert_lanes,
     difference,
     exponential,
@@ -27,27 +29,17 @@ from ..problems import (
     rigid_body,
 )
 
-Y0 = jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])  # e = 0.6
-E0, H = EXPONENTIAL0, 2 * np.pi / 200
+# Of the eccentricity 0.6.
+Y0, E0, H = KEPLER0, EXPONENTIAL0, 2 * np.pi / 200
 SYMMETRIC = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), KEPLER)
 BODY = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), RIGID_BODY)
 EXP = dfc.SymmetricProjection(dfc.ImplicitMidpoint(), EXPONENTIAL)
 W0 = jnp.array([1.0, 0.7, -0.4])
 
 
-def solve(field, solver, y0, *times, args=None):
-    """Compiled once for all times."""
-    times = jnp.asarray(times, jnp.result_type(*jax.tree.leaves(y0)))
-    return _solve(field, solver, y0, *times, args)
-
-
-@eqx.filter_jit
-def _solve(field, solver, y0, t0, t1, h, args):
-    save = dfx.SaveAt(t1=True, solver_state=True)
-    return dfx.diffeqsolve(
-        dfx.ODETerm(field), solver, t0, t1, h, y0, args, saveat=save, max_steps=None, throw=False,
-        adjoint=dfx.ForwardMode(),
-    )  # fmt: skip
+def solve(field, solver, y0, t0, t1, dt0, args=None):
+    options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), args=args) | TO_THE_END
+    return problems.solve(field, solver, y0, t0=t0, t1=t1, dt0=dt0, **options)
 
 
 def drift(y, y0):

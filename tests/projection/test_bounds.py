@@ -61,19 +61,6 @@ def quadratic_program(atoms, value, candidate, metric):
 MANY = 2_000  # one number of candidates for several tests, so that they share what is compiled
 
 
-@pytest.mark.slow
-@ONE_OF_BOTH
-def test_units_of_constraints_do_not_matter_in_single_precision(kind):
-    atoms, values, candidates = (
-        x.astype("float32") for x in chemistry(np.random.default_rng(2), MANY)
-    )
-    units, ok = jnp.asarray([[1, 1, 1], [1, 1e3, 1e-4]], jnp.float32), []
-    for unit in units:
-        _, found, _ = project(kind, atoms * unit[:, None], values * unit, candidates, None)
-        ok.append(int(found.sum()))
-    assert ok[1] > 0.99 * ok[0]
-
-
 def test_it_solves_the_quadratic_program():
     rng = np.random.default_rng(1)
     count = 30

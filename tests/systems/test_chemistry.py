@@ -1,6 +1,5 @@
 """Reactions as differential equations, what they conserve, and the two stiff problems."""
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve.systems import Mechanism
 
-from ..problems import refused, solve
+from ..problems import refused
 from ..thinned import some_of
 
 STIFF = {name: dfc.systems.get(name) for name in dfc.systems.names(stiff=True)}
@@ -102,18 +101,23 @@ def test_rates_are_a_function_of_time_state_and_arguments():
 
 
 test_mistakes_are_named = refused(
-    (lambda: Mechanism(["A = B"], [1.0]), "cannot be read"),
-    (lambda: Mechanism(["A -> B -> C"], [1.0]), "cannot be read"),
-    (lambda: Mechanism(["1.5 A -> B"], [1.0]), "cannot be read"),
-    (lambda: Mechanism(["A -> B"], [1.0, 2.0]), "1 `reactions`"),
+    (lambda: Mechanism(["A = B"], [1.0]), ValueError, "cannot be read"),
+    (lambda: Mechanism(["A -> B -> C"], [1.0]), ValueError, "cannot be read"),
+    (lambda: Mechanism(["1.5 A -> B"], [1.0]), ValueError, "cannot be read"),
+    (lambda: Mechanism(["A -> B"], [1.0, 2.0]), ValueError, "1 `reactions`"),
     (
         lambda: Mechanism(["A -> B"], lambda t, y, args: y).vector_field(0, np.ones(2), 0),
+        ValueError,
         "1 `reactions`",
     ),
-    (lambda: Mechanism(["A -> B"], [1.0], species=["A"]), "must name each species once"),
-    (lambda: Mechanism(["A -> B"], [1.0]).state({"X": 1.0}), "no species X"),
+    (
+        lambda: Mechanism(["A -> B"], [1.0], species=["A"]),
+        ValueError,
+        "must name each species once",
+    ),
+    (lambda: Mechanism(["A -> B"], [1.0]).state({"X": 1.0}), ValueError, "no species X"),
     # Its balance is A - B, which has signs.
-    (lambda: Mechanism(["A + B -> "], [1.0]).positive_projection(), "SimplifiedNewton"),
+    (lambda: Mechanism(["A + B -> "], [1.0]).positive_projection(), ValueError, "SimplifiedNewton"),
 )
 
 
@@ -169,15 +173,3 @@ def test_its_derivatives_are_those_of_what_it_computes():
         return moved_back(y[None], jnp.exp(log_noise)[None])[0][0] / y
 
     dct.assert_gradients(found, jnp.log(noise), rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_stiff_solve_keeps_signs_and_balances():
-    system = STIFF["pollu"]
-    solver = dfc.ManifoldProjection(dfx.Kvaerno3(), system.manifold, projection=PROJECTION)
-    controller = dfx.PIDController(rtol=1e-4, atol=1e-8)
-    options = dict(saveat=dfx.SaveAt(steps=True), max_steps=512, stepsize_controller=controller)
-    sol = solve(system.vector_field, solver, system.y0, t1=10.0, dt0=None, **options)
-    ys = sol.ys[: int(sol.stats["num_accepted_steps"])]
-    assert float(jnp.min(ys)) >= 0
-    np.testing.assert_allclose(ys @ WEIGHTS.T, (ys @ WEIGHTS.T)[:1].repeat(len(ys), 0), rtol=4e-15)
