@@ -74,7 +74,9 @@ def corrected(
     return combined(*eliminated(gram, b, along, least=least))
 
 
-def solve(gram: Any, b: Float[Array, " m"], *, least: float | None = None) -> Float[Array, " m"]:
+def solve(
+    gram: Any, b: Float[Array, " m"], *, least: float | Array | None = None
+) -> Float[Array, " m"]:
     """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
     if isinstance(gram, BlockGram):
         return refined(gram.factored(), gram.times, b)
@@ -105,24 +107,27 @@ def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[
 
 
 class Factors(eqx.Module):
-    """The inverses of the two factors of a matrix, so that a solve is two products with a matrix.
-    These are faster than two substitutions, in a batch above all. Their product is not formed:
-    where constraints depend on each other, the elements of an inverse are as large as one over what
-    is added, and their roundoff would spoil what the constraints determine.
+    """The two factors of a matrix. Those of a small one are inverted, so that a solve is two
+    products, which XLA fuses with what is around them. Those of a large one are LAPACK's, and a
+    solve is two substitutions: to invert them takes longer than the few solves of a step.
 
     - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
     """
 
-    below: Float[Array, "m m"]
-    above: Float[Array, "m m"]
+    factors: tuple[Array, Array]
     unit: Float[Array, " m"]
 
     def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
-        x = (b * self.unit).astype(self.below.dtype)
-        return combined(combined(x, self.below.T), self.above.T).astype(b.dtype) * self.unit
+        x = (b * self.unit).astype(self.factors[0].dtype)
+        if _is_large(b):
+            x = jsp.linalg.lu_solve(self.factors, x)
+        else:
+            below, above = self.factors
+            x = combined(combined(x, below.T), above.T)
+        return x.astype(b.dtype) * self.unit
 
 
-def factored(gram: Any, *, least: float | None = None) -> Solve:
+def factored(gram: Any, *, least: float | Array | None = None) -> Solve:
     """`gram⁻¹ b` as a function of `b`. What is added to the diagonal of a large matrix is an error
     of the solution, which `solve` removes, and so do the steps of an iteration."""
     if isinstance(gram, BlockGram):
@@ -133,19 +138,11 @@ def factored(gram: Any, *, least: float | None = None) -> Solve:
     if not _is_large(gram):
         one = jnp.eye(len(gram), dtype=gram.dtype)
         below, above = eliminated(matrix, one, one)
-        return Factors(below, above.T, unit)
-    return _large_factors(matrix, unit, least)
-
-
-def _large_factors(
-    matrix: Float[Array, "m m"], unit: Float[Array, " m"], least: float | None
-) -> Factors:
+        return Factors((below, above.T), unit)
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
     added = eps**ADDED_POWER * len(matrix) ** 0.5 if least is None else least
-    lu, _, order = lax.linalg.lu(matrix.astype(dtype) + added * one)
-    triangle = ft.partial(jsp.linalg.solve_triangular, lu)
-    return Factors(triangle(one[order], lower=True, unit_diagonal=True), triangle(one), unit)
+    return Factors(jsp.linalg.lu_factor(matrix.astype(dtype) + added * one), unit)
 
 
 def _is_large(gram: Any) -> bool:
