@@ -132,7 +132,10 @@ def _needs(error: Exception, args: Any) -> str:
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 
 
-ONE_STATE = "For one state `y` write `jax.tree.map(lambda x: x[None], y)`."
+ONE_STATE = (
+    "For one state `y` write `jax.tree.map(lambda x: x[None], y)`: `states`, as all arguments of "
+    "many states, have a leading axis over them."
+)
 
 
 def check_solution(sol: Any, user: str) -> None:

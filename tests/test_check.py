@@ -70,6 +70,9 @@ def test_explicit_time_is_part_of_the_derivative():
     assert check_invariance(f, dfc.FirstIntegral(integral), ys, t=jnp.linspace(0.0, 3.0, 7)).ok
     report = check_invariance(f, dfc.FirstIntegral(lambda t, y, a: y), ys, t=1.0)
     assert not report.ok
+    timed = dfc.FirstIntegral(lambda t, y, args: y * (2 + jnp.cos(t)) * jnp.exp(-t))
+    with pytest.raises(ValueError, match=r"`manifold` is conserved at t = 0, .* Give one time"):
+        check_invariance(f, timed, ys)
 
 
 def test_constraints_are_checked_where_they_hold():

@@ -206,6 +206,7 @@ def test_errors_are_judged_up_to_where_the_reference_is_trusted():
     assert list(report.last) == [3]
     np.testing.assert_allclose(report.error[:, 0], [1e-5, 1e-6])
     assert any("t = 3" in note and "trusted" in note for note in report.notes)
+    assert "Take `choice 1`: up to t = 3 of 5 the error is 0.1 times" in report.verdict
     lost = report_of((1e-2, 0.1, 0.6, 0.9, 1), (1e-3, 1e-2, 0.5, 1, 1))
     assert list(lost.last) == [2]
     assert any("as large as the state, as in chaos" in note for note in lost.notes)

@@ -48,6 +48,12 @@ def drift(saveat, convert=lambda sol: sol, manifold=ENERGY):
     return jax.eval_shape(lambda: dfc.drift(convert(sol()), manifold))
 
 
+def resumed(init):
+    """A solve that is traced only, with the state that `init` makes."""
+    state = lambda: init(dfx.ODETerm(rigid_body), 0.0, 1.0, OMEGA0, None)  # noqa: E731
+    return jax.eval_shape(lambda: solve(rigid_body, wrap(ENERGY), OMEGA0, solver_state=state()))
+
+
 def batch(sol):
     return dataclasses.replace(sol, ts=jnp.zeros((2, 3)), ys=jnp.zeros((2, 3, 3)))
 
@@ -139,9 +145,15 @@ test_mistakes_are_named = refused(
         (lambda x=x: run((ENERGY, FirstIntegral(lambda *_: x))), TypeError, r"1\]` must.*floating")
         for x in (1, True, 1j, "energy", np.ones(2, int))
     ),
+    (lambda: resumed(lambda *_: ()), ValueError, "`solver_state` is the state of a solve by anoth"),
+    (
+        lambda: resumed(wrap([ENERGY]).init),
+        ValueError,
+        r"entries manifold\[0\], not manifold\. Pass",
+    ),
     (lambda: drift(dfx.SaveAt(t1=True)), ValueError, r"SaveAt\(t0=True, t1=True\)"),
     (lambda: drift(dfx.SaveAt(dense=True)), ValueError, "saved states"),
-    (lambda: drift(dfx.SaveAt(ts=[0.0, 1.0]), batch), ValueError, r"jax\.vmap"),
+    (lambda: drift(dfx.SaveAt(ts=[0.0, 1.0]), batch), ValueError, r"equinox\.filter_vmap"),
     (lambda: drift(STEPS, manifold=FirstIntegral(NEEDS_ARGS)), ValueError, "`args` of the solve"),
     (lambda: drift(SUBS), ValueError, r"`SaveAt\(subs=...\)`.*dataclasses.replace"),
     (lambda: drift(PARTS), ValueError, r"saved \(2,\) at each time, but the states are \(3,\)"),

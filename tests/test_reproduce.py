@@ -191,7 +191,7 @@ def test_without_matplotlib(tmp_path, monkeypatch, capsys, only_rk4):
     assert status == 0
     printed = capsys.readouterr().out
     assert "rk4" in printed
-    assert "pip install 'diffrax-conserve[plots]'" in printed
+    assert "pip install '.[plots]'" in printed
     assert [file.name for file in (tmp_path / "out").iterdir()] == ["metrics.json"]
 
 

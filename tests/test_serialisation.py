@@ -79,6 +79,11 @@ def test_another_vector_field_is_told(path):
     with pytest.raises(ValueError, match="Pass the field, and its `args`, for which the network"):
         dfc.load(path, taylor=dfc.learned.Taylor(spring, 2, args=1.01))
     dfc.load(path, taylor=dfc.learned.Taylor(oscillator, 2))
+    layer, other = LAYER(RADIUS), LAYER(dfc.FirstIntegral(lambda t, y, args: y[0] ** 3))
+    dfc.save(path, dfc.DeepONet(EAST[None], 1.0, layer=LAYER(RADIUS), key=jr.key(0), **SMALL))
+    with pytest.raises(ValueError, match="Pass the manifold, and its `args`, for which the"):
+        dfc.load(path, layer=other)
+    dfc.load(path, layer=layer)
 
 
 def test_the_info(path):

@@ -108,6 +108,7 @@ test_mistakes_are_named = refused(
     (lambda: dfc.tangent(dfx.ODETerm(falling), ROW), TypeError, "vector_field"),
     (lambda: dfc.tangent(falling, ROW, gain=1.0), ValueError, "no value that it could return"),
     (lambda: dfc.tangent(falling, GROWING, gain=1.0), ValueError, "changes at its `rate`"),
+    (lambda: dfc.tangent(falling, ROD_MANIFOLD), ValueError, r"Pass `metric=\(jnp.inf, masses"),
     (
         lambda: dfc.tangent(falling, ROW, metric=(1.0,))(0.0, PENDULUM.y0, None),
         ValueError,

@@ -193,7 +193,7 @@ class DAE(eqx.Module):
         **Arguments:**
 
         - `guess`: the state, with its structure, shapes and dtype; of `DAE(f, algebraic=g)` its two
-            parts, `consistent(x, z)`.
+            parts, `consistent(x, z)`, or their pair, as `consistent` returns it.
         - `t`, `args`: passed to the functions.
         - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
             each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
@@ -262,6 +262,8 @@ class DAE(eqx.Module):
 
     def _state(self, guess: tuple[Any, ...]) -> Any:
         wanted = 1 if self.algebraic is None else 2
+        if wanted == 2 and len(guess) == 1 and isinstance(guess[0], tuple | list):
+            guess = tuple(guess[0])
         if len(guess) != wanted:
             names = "the state `y`" if wanted == 1 else "the two parts of the state, `x, z`"
             raise ValueError(f"Pass {names}: {wanted} positional arguments, not {len(guess)}.")

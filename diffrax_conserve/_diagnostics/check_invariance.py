@@ -48,6 +48,9 @@ _ROUNDOFF = 1e4
 # The distance to another state at which a derivative is looked at too, as a share of each
 # component.
 _BESIDE = 0.1
+# A second time, at which what depends on time should have another value: a number that is no
+# multiple of a likely period.
+LATER = 0.7390851332151607
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +132,8 @@ def check_invariance(
         general position: a sampler that multiplies a state leaves its zeros zero, and an entry
         whose derivative has no other terms is not tested. With a [`diffrax_conserve.Constraint`][]
         they must be on the manifold.
-    - `t`: the time, or one for each state. Give several for integrals that depend on time.
+    - `t`: the time, or one for each state, as what depends on time needs it: at one time, such as
+        the default, a derivative that is missing may be zero.
     - `args`: passed to `vector_field` and to the functions of the manifold.
     - `key`, `num_states`: the seed (default: `jax.random.key(0)`) and the number of sampled states.
     - `rtol`: the largest defect that counts as roundoff. Default: 10,000 machine epsilons.
@@ -140,8 +144,9 @@ def check_invariance(
 
     **Raises:**
 
-    `ValueError` if a state violates a constraint, or if the value of `vector_field` is not shaped
-    like `y`; `TypeError` or `ValueError` if `manifold` is not valid.
+    `ValueError` if a state violates a constraint, if an entry is conserved at the one time `t` but
+    not at another, or if the value of `vector_field` is not shaped like `y`; `TypeError` or
+    `ValueError` if `manifold` is not valid.
 
     !!! example
 
@@ -168,10 +173,19 @@ def check_invariance(
         rtol = _ROUNDOFF * float(jnp.finfo(ts.dtype).eps)
     with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
+        one_time = np.all(ts == ts[0])
+        later = _measure(vector_field, manifold, ts + LATER, ys, args) if one_time else found
     entries = [
         _entry_of_report(name, entry, rtol, *map(np.asarray, measured))
         for (name, entry), measured in zip(_entries(manifold), found, strict=True)
     ]
+    for entry, (defect, violation, *_) in zip(entries, later, strict=True):
+        if entry.ok and not np.all((defect <= rtol) & (violation <= rtol)):
+            raise ValueError(
+                f"`{entry.name}` is conserved at t = {ts[0]:.3g}, the one time `t` of all states, "
+                f"but not at t = {ts[0] + LATER:.3g}: it, its `rate` or `vector_field` depends on "
+                f"time. Give one time for each state, such as `t=jnp.linspace(0, 10, {ts.size})`."
+            )
     return InvarianceReport(tuple(entries), ts.size, rtol)
 
 

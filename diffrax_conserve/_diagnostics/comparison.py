@@ -157,14 +157,14 @@ class ComparisonReport:
             if _mean(ratios[self.index]) >= 1 - _EQUAL:
                 told = f"Projecting changes the error little: `{self.choice}` is good for what it "
                 told += "keeps, and "
-            return f"{told}{_compared(ratios[self.index])}{self._linear}."
+            return f"{told}{self._until}{_compared(ratios[self.index])}{self._linear}."
         rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
         if not rivals:
             where = " in some lane" if error.shape[1] > 1 else ""
             return f"Do not project: every projection fails{where}."
         best = min(rivals, key=lambda i: _mean(ratios[i]))
         name = self.rows[best].name
-        told = f"Do not project: with `{name}`, the best of the projections, "
+        told = f"Do not project: {self._until}with `{name}`, the best of the projections, "
         return f"{told}{_compared(ratios[best])}."
 
     def _unjudged(self) -> str:
@@ -193,16 +193,25 @@ class ComparisonReport:
             found.append("This is one start: others may differ, so try several with `batch=True`.")
         return found
 
+    @property
+    def _end(self) -> float:
+        """The last time at which every judged lane is judged."""
+        return float(self.ts[self.last[self.last > 0]].min())
+
+    @property
+    def _until(self) -> str:
+        end = float(self.ts[-1])
+        return f"up to t = {self._end:.3g} of {end:.3g} " * (self._end < end)
+
     def _horizon(self) -> list[str]:
         last, end = self.last, len(self.ts) - 1
         if self.index is None or np.all(last == end):
             return []
-        until = self.ts[last[last > 0]].min()
         best = self._best[:, -1]
         cause = "the reference cannot be trusted"
         if np.all(best[last < end] > _LOST):
             cause = "every error is as large as the state"
-        found = f"Judged up to t = {until:.3g} only, because later {cause}, as in chaos."
+        found = f"Judged up to t = {self._end:.3g} only, because later {cause}, as in chaos."
         if np.any(last == 0):
             found += f" {np.sum(last == 0)} of {len(last)} lanes are not judged at all."
         return [found]
@@ -274,7 +283,7 @@ class ComparisonReport:
         """Draws the error against time, in a batch its median over the lanes, and returns the axes.
 
         At most six curves are drawn: that without projection, and the best others. It needs
-        matplotlib: `pip install 'diffrax-conserve[plots]'`.
+        matplotlib: `pip install '.[plots]'` in the folder of diffrax-conserve.
 
         **Arguments:**
 

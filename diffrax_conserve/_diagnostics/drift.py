@@ -45,7 +45,7 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     **Arguments:**
 
     - `sol`: the solution from `diffrax.diffeqsolve`, with saved times; save `t0` too for the drift
-        from the initial state. For a batch of solutions use `jax.vmap`.
+        from the initial state. For a batch use `equinox.filter_vmap`.
     - `manifold`: a PyTree of `FirstIntegral`s and `Constraint`s.
     - `args`: as given to `diffeqsolve`.
 
@@ -57,8 +57,9 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     **Raises:**
 
     `ValueError` if `sol` is a batch, holds no states or one without a conserved value to compare it
-    with, was saved by `SaveAt(subs=...)` or `SaveAt(fn=...)`, or lacks dense output for a `rate`.
-    `TypeError` if `sol` is not a solution.
+    with, was saved by `SaveAt(subs=...)`, or by `SaveAt(fn=...)` in a form to which `manifold` does
+    not apply, or lacks dense output for a `rate`. What `fn` saved in the form of a state, such as
+    `2 * y`, is taken for the state. `TypeError` if `sol` is not a solution.
 
     !!! example
 
@@ -160,7 +161,7 @@ def _residuals(
     if sol.ts.ndim != 1:
         raise ValueError(
             f"`{user}` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch "
-            f"write `jax.vmap(lambda s: {user}(s, manifold, args))(sol)`."
+            f"write `equinox.filter_vmap(lambda s: {user}(s, manifold, args))(sol)`."
         )
     for name, entry in named_entries(manifold):
         if sol.ts.size == 1 and not has_value(entry):

@@ -26,7 +26,7 @@ from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral, check_vector_field, slope_of
 from .._options import check_counts, check_function, one_of
 from .._tree import ravel, real_view, tree_size, unravel
-from .check_invariance import batch
+from .check_invariance import LATER, batch
 
 try:
     from jax import enable_x64 as _enable_x64
@@ -53,9 +53,6 @@ _ZERO = 1e-9
 _PIVOT = 1e-8
 # A combination counts as a polynomial of others if at most this share of it is left over.
 _DEPENDENT = 1e-7
-# A second time, at which a field that depends on time should have another value: a number that is
-# no multiple of a likely period.
-_LATER = 0.7390851332151607
 # The scales of rows and of columns depend on each other. They settle after three rounds.
 _ROUNDS = 3
 # A sampler is called for this many states at least, and for four for each function.
@@ -358,7 +355,7 @@ def _sampled(
                 f"`{name}`, or its derivative, is not finite at state {np.argmin(finite)} of "
                 "`states`. Give states inside its domain."
             )
-    if np.all(ts == ts[0]) and np.any(np.asarray(measure(ts + _LATER, ys)[2]) != slopes):
+    if np.all(ts == ts[0]) and np.any(np.asarray(measure(ts + LATER, ys)[2]) != slopes):
         raise ValueError(
             "`vector_field` depends on time, but `t` is one time, at which something may be "
             "conserved that is not at others. Give one time for each state, such as "

@@ -190,7 +190,8 @@ def pattern_of(
     if _asdex() is None:
         warnings.warn(
             f"The manifold has {m} constraints. Their Jacobian is treated as dense, because the "
-            "package that finds sparse ones is missing: `pip install 'diffrax-conserve[sparse]'`.",
+            "package that finds sparse ones is missing: `pip install '.[sparse]'` in the folder "
+            "of diffrax-conserve.",
             stacklevel=2,
         )
         return None

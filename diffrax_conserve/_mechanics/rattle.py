@@ -95,6 +95,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
     is the acceleration: a force in its place is a solve with other masses, which no check can tell.
     With momenta $p$ in the place of $v$, the terms are $p/m$ and $F$, and `masses` is 1.
 
+    The constraints are functions of the positions alone, and those on the velocities follow: do not
+    pass the constraint of [`diffrax_conserve.tangent`][], which takes `(q, v)`.
+
     Steps are fixed. A state at a saved time comes from a shorter step. Derivatives follow from the
     implicit function theorem. Redundant constraints, such as of a closed loop, do no harm. A step
     that fails is NaN, and the `diffrax.RESULTS` tells why, as with

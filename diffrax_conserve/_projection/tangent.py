@@ -15,6 +15,7 @@ from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.scalars import written_out
 from .._manifold import (
+    Along,
     check_manifold,
     check_vector_field,
     conserved_values,
@@ -61,7 +62,8 @@ def tangent(
     - `vector_field`: $f$, called as `vector_field(t, y, args)`.
     - `manifold`: a PyTree of `FirstIntegral`s, which change at their `rate`, and `Constraint`s.
     - `metric`: as of a [`diffrax_conserve.SimplifiedNewton`][], but Euclidean by default; an
-        infinite weight leaves its component of the field unchanged.
+        infinite weight leaves its component of the field unchanged. A `Constraint.derivative`
+        needs one, because the Euclidean metric is not that of a mechanism.
     - `gain`: the decay rate, in one over time; negative for a solve backward in time.
 
     **Returns:**
@@ -71,8 +73,9 @@ def tangent(
     **Raises:**
 
     `TypeError` or `ValueError` if an argument does not fit, if a `gain` is given for a
-    `FirstIntegral` without a `value` or with a `rate`, or, when it is called, if the value of the
-    field is not shaped like the state.
+    `FirstIntegral` without a `value` or with a `rate`, if there is no `metric` for a
+    `Constraint.derivative`, or, when it is called, if the value of the field is not shaped like the
+    state.
 
     !!! example
 
@@ -104,6 +107,13 @@ def tangent(
     check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
+        if metric is None and isinstance(entry.fn, Along):
+            raise ValueError(
+                f"`{name}` is the derivative of a constraint, but `tangent` has no `metric`, which "
+                "decides the forces. Pass `metric=(jnp.inf, masses)` for a state of positions and "
+                "velocities, or `metric=1.0` if the Euclidean one is meant, which moves positions "
+                "too."
+            )
         why = "" if has_value(entry) else "has no value that it could return to"
         why = why if rate_of(entry) is None else "changes at its `rate`"
         if damped and why:

@@ -241,7 +241,7 @@ class ManifoldProjection(ForwardingSolver):
         # last stage, which its root finder has solved; a slope at the projected state would amplify
         # the error of the root finder. `QUICSORT` keeps none, and refuses to be told.
         keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
-        state = solver_state
+        state = self._checked(solver_state)
         candidate, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
         )
@@ -299,6 +299,19 @@ class ManifoldProjection(ForwardingSolver):
             preferred=preferred,
         )
         return y1, error, dense_info, state, result
+
+    def _checked(self, state: Any) -> State:
+        names = tuple(name for name, _ in named_entries(self.manifold))
+        if isinstance(state, State) and state.statistics.names == names:
+            return state
+        of = "a solve by another solver"
+        if isinstance(state, State):
+            kept = ", ".join(state.statistics.names)
+            of = f"a solve with the entries {kept}, not {', '.join(names)}"
+        raise ValueError(
+            f"`solver_state` is the state of {of}. Pass that of a solve by this solver, or leave "
+            "it out: then the conserved values are those of `y0`."
+        )
 
     def _target(
         self,

@@ -38,8 +38,9 @@ FIRST = register(
     "value that it has at the start is a `FirstIntegral`. After a jump of the vector field end the "
     "solve there, `project`, and go on. " + _ENTRY,
     "the projection of a step failed: a state is not finite, or a function of the manifold there, "
-    "or the iteration diverged. At the first step look for NaN in `y0` and `args`, and for "
-    "overflow, in float32 of squares of 2e19: use other units, or float64. Later check the vector "
+    "or the iteration diverged. At the first step look for NaN in `y0` and `args`, for "
+    "derivatives of roots and norms at zero, which are infinite or NaN, and for overflow, in "
+    "float32 of squares of 2e19: use other units, or float64. Later check the vector "
     "field and `fn`, and take smaller steps. " + _ENTRY,
     "the projection of a step failed: the correction is a larger share of the step than "
     "`max_correction` allows. Check by `check_invariance` that the quantity is conserved at all, "

@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._manifold import Constraint, FirstIntegral
+from .._manifold import Constraint, FirstIntegral, evaluate
+from .._tree import ravel, unravel
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
 from ._networks.deeponet import DeepONet
@@ -91,9 +92,10 @@ def save(path: PathLike, model: Network, *, info: dict[str, Any] | None = None) 
     header = {"network": _describe(model, arrays), "info": info or {}}
     _check(model)
     network: Any = _unwrapped(model)
+    if "given" in (_describe_field("layer", network.layer, []) or ()):
+        header["gradients"] = _finite(_gradients(network))
     if isinstance(network, DeepONet) and network.taylor is not None:
-        slope = _slope(network)
-        header["slope"] = slope.tolist() if np.all(np.isfinite(slope)) else None
+        header["slope"] = _finite(_slope(network))
     text = json.dumps(header, allow_nan=False).encode()
     rest = b"".join([text, b"\n", *(x.tobytes() for x in arrays)])
     first = b"%s%d %s\n" % (_MAGIC, _VERSION, hashlib.sha256(rest).hexdigest().encode())
@@ -117,8 +119,9 @@ def load(
     **Raises:**
 
     `ValueError` if the file is not of this version, is truncated or damaged, or needs a `layer`,
-    `taylor` or `frame`, or if the vector field of `taylor` is not that of the saved network, at a
-    state of its domain; `OSError` if it cannot be read.
+    `taylor` or `frame`, or if the vector field of `taylor` or the gradients of the functions of
+    `layer` are not those of the saved network, at a state of its domain (a file of an earlier
+    version does not tell gradients); `OSError` if it cannot be read.
     """
     given = {"layer": layer, "taylor": taylor, "make": frame}
 
@@ -128,7 +131,19 @@ def load(
             raise ValueError("it has data after the last array")
         _check(model)
         if taylor is not None and header.get("slope") is not None:
-            _check_slope(_unwrapped(model), np.asarray(header["slope"], float))
+            _check_same(
+                "The vector field of `taylor` is",
+                _slope(_unwrapped(model)),
+                header["slope"],
+                "the field, and its `args`,",
+            )
+        if layer is not None and header.get("gradients") is not None:
+            _check_same(
+                "The gradients of the functions of `layer` are",
+                _gradients(_unwrapped(model)),
+                header["gradients"],
+                "the manifold, and its `args`,",
+            )
         return model
 
     model = _read(path, build)
@@ -159,7 +174,7 @@ def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
     text, _, body = rest.partition(b"\n")
     try:
         header = json.loads(text)
-        if set(header) - {"slope"} != {"network", "info"}:
+        if set(header) - {"slope", "gradients"} != {"network", "info"}:
             raise ValueError("its second line does not describe a network")
         return use(header, io.BytesIO(body))
     except _NotGiven:
@@ -307,20 +322,40 @@ def _unwrapped(model: Any) -> Any:
 
 
 def _slope(network: DeepONet) -> np.ndarray:
-    """The vector field of the Taylor polynomial at one state of the domain, not its centre, where
-    fields often vanish."""
-    taylor, domain, y = network.taylor, network.domain, network.state
+    """The vector field of the Taylor polynomial at one state."""
+    taylor, y = network.taylor, _state(network)
     assert taylor is not None
-    if isinstance(domain, Box):
-        y = jax.tree.map(lambda a, b: 0.6 * a + 0.4 * b, domain.lower, domain.upper)
     args = taylor.args if network.args_domain is None else network.args_domain.lower
     return np.asarray(flatten(taylor.vector_field(0.0, y, args)), float)
 
 
-def _check_slope(network: DeepONet, slope: np.ndarray) -> None:
-    found = _slope(network)
-    if not np.max(np.abs(found - slope)) <= 1e-3 * np.max(np.abs(slope)):
+def _gradients(network: Network) -> np.ndarray:
+    """The gradients of the functions of the layer at one state."""
+    layer: Any = network.layer
+    y = _state(network)
+    vector = ravel(y)
+    values = lambda x: ravel(evaluate(layer.manifold, 0.0, unravel(x, y), layer.args))  # noqa: E731
+    return np.asarray(jax.jacfwd(values)(vector), float)
+
+
+def _state(network: Any) -> Any:
+    """A state of the domain, not its centre, where fields often vanish; of a `PINN` its first."""
+    if isinstance(network, PINN):
+        return jax.tree.map(lambda y: y[0], network.y0s)
+    if isinstance(domain := network.domain, Box):
+        return jax.tree.map(lambda a, b: 0.6 * a + 0.4 * b, domain.lower, domain.upper)
+    return network.state
+
+
+def _finite(x: np.ndarray) -> list[Any] | None:
+    return x.tolist() if np.all(np.isfinite(x)) else None
+
+
+def _check_same(what: str, found: np.ndarray, saved: Any, remedy: str) -> None:
+    saved = np.asarray(saved, float)
+    same = found.shape == saved.shape
+    if not same or not np.max(np.abs(found - saved)) <= 1e-3 * np.max(np.abs(saved)):
         raise _NotGiven(
-            f"The vector field of `taylor` is {found} at a state where that of the saved network "
-            f"is {slope}. Pass the field, and its `args`, for which the network was trained."
+            f"{what} {found} at a state where the saved network has {saved}. Pass {remedy} for "
+            "which the network was trained."
         )

@@ -100,7 +100,8 @@ def reproduce(
     replace_file(out / "metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
     print(table(system, numbers))
     if plot is None:
-        print("\nThe figures need matplotlib: pip install 'diffrax-conserve[plots]'")
+        where = "in the folder of diffrax-conserve"
+        print(f"\nThe figures need matplotlib: pip install '.[plots]' {where}")
     print(f"\nWhat is written is in {out}")
     return len(errors) == len(runs)
 

@@ -42,7 +42,9 @@ def verdict(
     if out is not None:
         plot = import_plot()
         if plot is None:
-            raise SetupError("--out needs matplotlib: pip install 'diffrax-conserve[plots]'")
+            raise SetupError(
+                "--out needs matplotlib: pip install '.[plots]' in the folder of diffrax-conserve"
+            )
         make_writable(out)
     y0 = system.y0
     if starts is not None:

@@ -2,7 +2,8 @@ import importlib.util as _util
 
 if _util.find_spec("hypothesis") is None:
     raise ImportError(
-        "diffrax_conserve.testing needs hypothesis: pip install 'diffrax-conserve[testing]'"
+        "diffrax_conserve.testing needs hypothesis: pip install '.[testing]' in the folder of "
+        "diffrax-conserve"
     )
 
 from ._conserved import assert_conserved as assert_conserved

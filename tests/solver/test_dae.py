@@ -252,4 +252,6 @@ test_mistakes_are_named = refused(
     (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
     (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
     (lambda: PAIRED.consistent(X[0], X[0]), ValueError, "`f` returns .* like `x`"),
+    # The pair is taken as its parts.
+    (lambda: PAIRED.report((X[0], X[0])), ValueError, "`f` returns .* like `x`"),
 )

@@ -148,8 +148,9 @@ class DeepONet(AbstractFlowMap):
         start, size = flatten(y0).astype(self.scale.dtype), flatten(self.state).size
         if start.size != size:
             raise ValueError(
-                f"This `DeepONet` is for states of {size} numbers, not {start.size}. Map it over "
-                "several states: `jax.vmap(deeponet, (0, None))(states, h)`."
+                f"This `DeepONet` is for states of {size} numbers, not {start.size}. Pass "
+                "states of its own system, also as `sample`, `data` or `y0`. Apply it to several "
+                "by `jax.vmap(deeponet, (0, None))(states, h)`."
             )
         h = jnp.asarray(h).astype(start.dtype)
         known = self._known(args)
@@ -210,7 +211,8 @@ class DeepONet(AbstractFlowMap):
 
 DeepONet.__init__.__doc__ = r"""**Arguments:**
 
-- `states`: initial states, stacked along a leading axis: any PyTree of real arrays. $N$ gets
+- `states`: initial states, stacked along a leading axis: any PyTree of real arrays. One array of
+    two numbers is two states of one number; for one state `y` write `y[None]`. $N$ gets
     $(u_0 - m)/S$, with their mean $m$ and standard deviation $S$, the unit of the loss, and $h$
     scaled to $[-1, 1]$. The box around them is the `domain` of the flow map.
 - `max_step`: the longest step $\Delta$.
