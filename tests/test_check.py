@@ -73,6 +73,8 @@ def test_explicit_time_is_part_of_the_derivative():
     timed = dfc.FirstIntegral(lambda t, y, args: y * (2 + jnp.cos(t)) * jnp.exp(-t))
     with pytest.raises(ValueError, match=r"`manifold` is conserved at t = 0, .* Give one time"):
         check_invariance(f, timed, ys)
+    moving = dfc.Constraint(lambda t, y, args: y**2 - t**2)  # not conserved off the manifold
+    assert check_invariance(lambda t, y, args: jnp.ones_like(y), moving, jnp.ones(3), t=1.0).ok
 
 
 def test_constraints_are_checked_where_they_hold():
