@@ -260,5 +260,5 @@ def test_quadratic_systems_conserve_their_integrals(dimension, integrals):
 
 def test_without_hypothesis_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"pip install 'diffrax-conserve\[testing\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[testing\]'"):
         runpy.run_path(dct.__file__)
