@@ -188,7 +188,9 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # gradients. So that it is never much longer than what it corrects, a constraint whose
         # gradient is nearly parallel to others takes no part in it. In float64 it is short in any
         # case, and the batch is faster without the distinction.
-        least = jnp.where(level < ON, roundoff, 1 / ROUNDOFF**2) if dtype != jnp.float64 else None
+        least = None
+        if dtype != jnp.float64:
+            least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))
         moved = y - equations.change(corrected(rows, along, wrong / sizes, least=least))
         return keep_done(counter, moved, y), counter
 
