@@ -34,7 +34,7 @@ from .._constants import AT_BOUND, FROZEN_STEPS, ROUNDOFF, SHORTER, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
 from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
-from .linear import combined, corrected, factored, gram_matrix, scaled_rows, solve
+from .linear import combined, corrected, factored, gram_matrix, roundoff_pivot, scaled_rows, solve
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -164,7 +164,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     equations, candidate, directions = given
     dtype = equations.magnitude.dtype
-    roundoff = ROUNDOFF * float(jnp.finfo(dtype).eps)
+    roundoff = roundoff_pivot(dtype)
 
     def first_rows(y: Any) -> Any:
         """The gradients at the candidate, which the steps share."""
@@ -185,9 +185,9 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         along = jnp.where(frozen, first, rows) if fresh else first
         counter = after_test(level, counter)
         # A step that only polishes is as long as roundoff over the sine of the angle between
-        # gradients. So that it is never much longer than what it corrects, a constraint whose
-        # gradient is nearly parallel to others takes no part in it. In float64 it is short in any
-        # case, and the batch is faster without the distinction.
+        # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
+        # constraint whose gradient is more nearly parallel to others takes no part in it. In
+        # float64 it is short in any case, and a batch is faster without the distinction.
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))

@@ -7,9 +7,9 @@ contradict each other. There are three ways to solve such a system, by its size.
 - Up to four constraints are eliminated one after the other, written out in scalars, and next always
   the one whose gradient is farthest from a combination of those before it. Once it is such a
   combination, its pivot is roundoff. We give it the multiplier zero: if the others hold, it holds
-  too. Gradients that are only nearly parallel are all
-  kept, because a correction needs the direction in which they differ. A derivative does not, and
-  would lose its digits in that direction; see `implicit`.
+  too. Gradients that are only nearly parallel are all kept, because a correction needs the
+  direction in which they differ. A derivative does not, and would lose its digits in that
+  direction; see `implicit`. Nor does a step that only polishes; see `iterate`.
 - More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a
   derivative the share is the least pivot that counts: what is smaller has nearly no effect.
 - A sparse matrix is factored in blocks, in the same way; see `sparse`.
@@ -172,7 +172,7 @@ def eliminated(
     be magnified in the pivots of those that could replace it. A pivot of at most `least` of the
     diagonal, by default roundoff, counts as infinite, so that its multiplier is zero."""
     m = len(gram)
-    least = ROUNDOFF * float(jnp.finfo(gram.dtype).eps) if least is None else least
+    least = roundoff_pivot(gram.dtype) if least is None else least
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
     b, rows = list(b), list(rows)  # pyright: ignore
@@ -217,6 +217,11 @@ def unit_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
     lengths = jnp.linalg.norm(rows, axis=1)
     lengths = jnp.where(lengths > 0, lengths, 1)
     return sizes * lengths, rows / lengths[:, None]
+
+
+def roundoff_pivot(dtype: Any) -> float:
+    """The largest share of the diagonal that a pivot can be by roundoff alone."""
+    return ROUNDOFF * float(jnp.finfo(dtype).eps)
 
 
 def least_pivot(rows: Any) -> float:
