@@ -197,10 +197,10 @@ class DAE(eqx.Module):
         - `t`, `args`: passed to the functions.
         - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
             each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
-            equations differentiate stays, such as $x$ or $M y$. With a higher index unknowns
-            without slopes, such as forces, are free, and the others move to the nearest point,
-            relative to their sizes. So of a mechanism at rest give velocities of exactly zero:
-            small ones that do not fit its joints would hardly move, and turn its bodies instead.
+            equations differentiate stays, such as $x$ or $M y$. With a higher index the state moves
+            to the nearest point, relative to its sizes. If each differentiation brings unknowns
+            with which its constraints can be met, these alone move for them: of a mechanism first
+            the positions, then the velocities, then the forces.
 
         **Returns:**
 
@@ -485,20 +485,23 @@ def _consistent(
     units = structure.units(jnp.where(sizes == 0, 1, sizes))
     if moves is not None:
         units = jnp.where(moves, units, 0)
-    manifold = {"equations": Constraint(_Constraints(dae))}
-    projection = SimplifiedNewton(metric=unravel(units**-2, y), max_steps=MOST)
     none = jnp.zeros_like(jnp.concatenate(_Constraints(dae)(t, y, args)))
-    target = Target(projection, manifold, none, none, args, jnp.asarray(1))
 
-    def nearer(y: Y, _: None) -> tuple[Y, Bool[Array, ""]]:
+    def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
+        asked, free = stage
+        manifold = {"equations": Constraint(_Constraints(dae, asked))}
         hidden = hidden_scale(manifold, t, y, args)[2]
-        y, info = dataclasses.replace(target, hidden=hidden).project(t, y)
+        metric = unravel(jnp.where(free, units, 0) ** -2, y)
+        projection = SimplifiedNewton(metric=metric, max_steps=MOST)
+        target = Target(projection, manifold, none, hidden, args, jnp.asarray(1))
+        y, info = target.project(t, y)
         return y, info.ok
 
-    # The tolerance follows the roundoff at the guess, so the second time judges by that at the
-    # state. `project` measures twice too, in two programs, and compiles nearly twice as much.
-    found, ok = lax.scan(nearer, y, length=2)
-    return found, ok[1]
+    # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
+    # `project` measures twice too, in two programs, and compiles nearly twice as much.
+    stages = structure.stages(freely=moves is None)
+    found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
+    return found, ok[-1]
 
 
 @eqx.filter_jit
@@ -533,9 +536,11 @@ class _Slopes(eqx.Module):
 
 @final
 class _Constraints(eqx.Module):
-    """All constraints. Not a closure, with which every `wrap` would compile anew."""
+    """All constraints, or those of the rounds that are asked for. Not a closure, with which every
+    `wrap` would compile anew."""
 
     dae: DAE
+    asked: Bool[Array, " rounds"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         structure, equations, t, vector = _at(self.dae, t, y, args)
@@ -543,7 +548,10 @@ class _Constraints(eqx.Module):
             return [jnp.zeros_like(vector[:1])]  # every state will do
         found = structure.constraints(equations, structure.index)(t, vector)
         fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
-        return [jnp.where(fits, h, jnp.nan) for h in found]
+        found = [jnp.where(fits, h, jnp.nan) for h in found]
+        if self.asked is None:
+            return found
+        return [jnp.where(asked, h, 0) for asked, h in zip(self.asked, found, strict=True)]
 
 
 @final

@@ -43,6 +43,9 @@ class Round(NamedTuple):
     slopes: tuple[int, ...]
 
 
+_NONE = Round((), ())  # nothing is solved yet
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
     """How equations are reduced.
@@ -53,6 +56,9 @@ class Structure:
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `apart`: whether the equations that are left first contain no slopes, not even some that
       cancel.
+    - `brought`: for each differentiation the unknowns that its constraints contain and those before
+      do not, such as positions, velocities and forces; empty if not all constraints can be met by
+      these alone.
     """
 
     size: int
@@ -60,6 +66,7 @@ class Structure:
     is_linear: bool
     mass: np.ndarray | None = None
     apart: bool = False
+    brought: tuple[tuple[int, ...], ...] = ()
 
     @property
     def index(self) -> int:
@@ -81,6 +88,17 @@ class Structure:
         free = np.isin(np.arange(self.size), self.algebraic)
         some = jnp.where(sizes > 0, sizes, 1)
         return jnp.where(free, some / float(jnp.finfo(sizes.dtype).eps), sizes)
+
+    def stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The stages in which a consistent state is sought: the constraints of which rounds are
+        asked for, and which unknowns move. The last two ask for all, or with what each round has
+        brought the last one."""
+        alone = self.brought if freely else ()
+        asked = [np.arange(self.index) == k for k in range(len(alone))]
+        moving = [np.isin(np.arange(self.size), found) for found in alone]
+        rest = 1 if alone else 2
+        every = rest * [np.full(self.index, True)], rest * [np.full(self.size, True)]
+        return np.stack(asked + every[0]), np.stack(moving + every[1])
 
     def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
@@ -209,20 +227,26 @@ def find_structure(
     if mass is None:  # does it depend on the time, the state or parameters?
         other = np.asarray(jax.jit(jax.jacfwd(changed, 2))(2 * t + 1, 2 * y, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    selected, gradients = _extended(matrix, Round((), ())), np.zeros((0, y.size))
+    selected, gradients = _extended(matrix, _NONE), np.zeros((0, y.size))
     rest = np.delete(np.stack([matrix, other]), selected.equations, axis=1)
     structure = Structure(y.size, (), is_linear, mass, apart=not np.any(rest))
+    brought, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         new = structure.last_gradients(equations, t, y)
+        brought.append((new != 0).any(0) & ~(gradients != 0).any(0))
+        met.append(len(_extended(new[:, brought[-1]], _NONE).equations) == len(new))
         gradients = np.concatenate([gradients, new])
-        independent = _extended(gradients, Round((), ())).equations
+        independent = _extended(gradients, _NONE).equations
         if len(independent) < len(gradients):
             first = len(gradients) - len(left)
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
+    if all(met):
+        found = tuple(tuple(np.flatnonzero(one).tolist()) for one in brought)
+        structure = dataclasses.replace(structure, brought=found)
     return structure
 
 

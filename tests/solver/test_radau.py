@@ -213,6 +213,11 @@ def test_a_pendulum_in_cartesian_coordinates():
     dae = dfc.DAE(pendulum, mass=np.diag([1.0, 1, 1, 1, 0]))
     y0 = dae.consistent(jnp.array([1.0, 0, 0, 0, 0.3]))
     assert np.allclose(y0, [1, 0, 0, 0, 0], rtol=0, atol=EPS)
+    # Positions first: velocities that are noise turn no body.
+    at_rest, noisy = (dae.consistent(jnp.array([0.8, -0.61, c, c / 3, 0.3])) for c in (0, 1e-14))
+    assert np.allclose(noisy[:2], at_rest[:2], rtol=0, atol=EPS)
+    assert largest(at_rest[:2] - np.array([0.8, -0.61])) < 1e-2
+    assert largest(noisy[2:4]) < 1e-14
     report = dae.report(y0)
     assert (report.differentiated, report.algebraic) == ({"f[4]": 3}, ("y[4]",))
     assert str(report).startswith("Index 3, with 2 degrees of freedom.")
