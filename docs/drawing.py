@@ -11,6 +11,7 @@ def label(ax, places=None):
 
     `places` has names that stand elsewhere: the index of their point, and "left" or "right" of it.
     """
+    ax.figure.draw_without_rendering()  # which scales and places the axes
     names = []
     for line in ax.lines:
         index, side = (places or {}).get(line.get_label(), (-1, "right"))

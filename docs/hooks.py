@@ -1,7 +1,7 @@
 """What the pages cannot do themselves.
 
 The table of solvers in `api/solvers.md` is the one that the tests run. A code block in a comment
-`<!-- check ... -->` runs with the page, and is not shown. Nor is a comment for the formatter.
+`<!-- check ... -->` runs with the page, and is not shown.
 
 Links to the objects of other packages, as `` [`diffrax.diffeqsolve`][] ``, stand in a table, not in
 inventories that each build downloads, so that it needs no network. A name that is not in the table
@@ -47,5 +47,4 @@ def on_page_markdown(markdown, **kwargs):
     rows = runpy.run_path(str(TABLE))["TABLE"].items()
     table = ["| solver | tested as | inside `ManifoldProjection` |", "|---|---|---|"]
     table += [f"| `{solver}` | {kind} | supported |" for solver, kind in rows]
-    markdown = CHECK.sub("", markdown).replace("  # fmt: skip\n", "\n")
-    return markdown.replace("<!-- conformance table -->", "\n".join(table))
+    return CHECK.sub("", markdown).replace("<!-- conformance table -->", "\n".join(table))

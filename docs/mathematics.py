@@ -18,6 +18,7 @@ from mkdocs.exceptions import PluginError
 FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<latex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
 )
+MARKED = re.compile(r'(<math[^>]*"inline">(?:(?!</math>).)*</math>[.,:;)]+)')
 VERBATIM = re.compile(r"<(pre|code|script|style)\b.*?</\1>|<[^>]*>", re.DOTALL)
 LATEX = re.compile(r"\\[A-Za-z(\[{]|\$[^$]+\$")
 
@@ -44,7 +45,8 @@ def mathml(match: re.Match[str]) -> str:
 
 def on_page_content(html, **kwargs):
     del kwargs
-    return FORMULA.sub(mathml, html)
+    # A line is not broken between a formula and its comma.
+    return MARKED.sub(r'<span class="marked">\1</span>', FORMULA.sub(mathml, html))
 
 
 def on_post_page(output, page, **kwargs):

@@ -22,12 +22,9 @@ NAMES = sorted({posixpath.normpath(f"examples/{path}") for path in LINKED})
 # stay alone.
 DROPPED = re.compile(r"^(<!-- check|-->|!\[.*?\]\(.*?\)(\{.*?\})?)$\n?", re.MULTILINE)
 LINK = re.compile(r"\[([^\]]+)\](?:\[[\w.]*\]|\((?!\w+:)[^)]*\))")
-# The pages write names at the curves by a module that a reader does not have, and have comments for
-# the formatter.
-REPLACED = {
-    "from docs.drawing import label\n": "label = lambda ax, places=None: ax.legend()\n",
-    "  # fmt: skip": "",
-}
+# The pages write names at the curves by a module that a reader does not have.
+DRAWING = "from docs.drawing import label\n"
+LEGEND = "label = lambda ax, places=None: ax.legend()\n"
 NEEDS = "*Needs diffrax-conserve with its extra `plots`.*"
 
 
@@ -51,9 +48,7 @@ def _prose(text):
 
 
 def _code(block, text):
-    code = block["code"].rstrip("\n")
-    for old, new in REPLACED.items():
-        code = code.replace(old, new)
+    code = block["code"].replace(DRAWING, LEGEND).rstrip("\n")
     outputs = [new_output("stream", text=block["shown"])] if block["shown"] else []
     if figure := re.search(r'savefig\("([\w-]+\.svg)"\)', code):
         image = (DOCS / "images" / "pages" / figure[1]).read_text(encoding="utf-8")
