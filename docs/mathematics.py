@@ -8,7 +8,7 @@ fetches nothing from elsewhere.
 
 import re
 from html import unescape
-from importlib.resources import files
+from importlib.metadata import distribution
 from pathlib import Path
 
 from fontTools import subset
@@ -56,17 +56,17 @@ def on_post_page(output, page, **kwargs):
         raise PluginError(f"{page.file.src_uri} shows raw LaTeX: {found}")
 
 
-def ship(config, font, characters: str, name: str) -> None:
+def ship(config, package: str, file: str, characters: str, name: str) -> None:
     """Writes the characters of a font of a package into the site."""
+    font = distribution(package).locate_file(file)
     out = Path(config.site_dir, "assets", name)
-    subset.main(
-        [str(font), characters, "--flavor=woff", "--layout-features=*", f"--output-file={out}"]
-    )
+    options = ["--flavor=woff", "--layout-features=*", f"--output-file={out}"]
+    subset.main([str(font), characters, *options])
 
 
 def on_post_build(config):
-    formulas = files("ziamath.fonts") / "STIXTwoMath-Regular.ttf"
-    ship(config, formulas, f"--text={''.join(sorted(used))}", "formulas.woff")
+    formulas = "ziamath/fonts/STIXTwoMath-Regular.ttf"
+    ship(config, "ziamath", formulas, f"--text={''.join(sorted(used))}", "formulas.woff")
     for face in ("Regular", "It", "Bold"):
-        file = files("font_source_sans_pro.files") / f"SourceSansPro-{face}.ttf"
-        ship(config, file, TEXT, f"text-{face}.woff")
+        file = f"font_source_sans_pro/files/SourceSansPro-{face}.ttf"
+        ship(config, "font-source-sans-pro", file, TEXT, f"text-{face}.woff")
