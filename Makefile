@@ -124,8 +124,9 @@ format: $(DEV) ## fix what `make lint` can fix by itself
 types: $(DEV) ## check the types of the package
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# Not `--quiet`, which also hides the warnings from `--strict`.
 docs: $(DOCS) ## build the documentation into site/, and look at it
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	$(BIN)/python docs/browser.py site
 
 # Without a summary line of its own, so that a log of the whole CI run holds one: that of `make test`.

@@ -1,13 +1,14 @@
 """Formulas become MathML when the site is built, so that a reader needs no JavaScript for them.
 
 `pymdownx.arithmatex` marks the formulas up, in pages and in docstrings alike. A formula that
-latex2mathml cannot convert fails the build. They are set in STIX Two Math, and the text in Source
-Sans, of which the site has the characters that it needs: a reader fetches nothing from elsewhere.
+latex2mathml cannot convert, or that nobody marked up, fails the build. They are set in STIX Two
+Math, and the text in Source Sans, of which the site has the characters that it needs: a reader
+fetches nothing from elsewhere.
 """
 
-import importlib.resources
 import re
 from html import unescape
+from importlib.metadata import distribution
 from pathlib import Path
 
 from fontTools import subset
@@ -17,15 +18,17 @@ from mkdocs.exceptions import PluginError
 FORMULA = re.compile(
     r'<(?P<tag>span|div) class="arithmatex">\\[(\[](?P<latex>.*?)\\[)\]]</(?P=tag)>', re.DOTALL
 )
+MARKED = re.compile(r'(<math[^>]*"inline">(?:(?!</math>).)*</math>[.,:;)]+)')
+VERBATIM = re.compile(r"<(pre|code|script|style)\b.*?</\1>|<[^>]*>", re.DOTALL)
+LATEX = re.compile(r"\\[A-Za-z(\[{]|\$[^$]+\$")
 
-# The characters that formulas use: at first letters, and the slanted ones that a browser puts in
-# the place of those that are names.
-used = {*range(0x20, 0x7F), *range(0x391, 0x3D7), 0x210E, *range(0x1D434, 0x1D468)}
-used |= {*range(0x1D6E2, 0x1D71C)}
+# At first letters, and the slanted ones that a browser puts in the place of those that are names.
+used = set(map(chr, [*range(0x20, 0x7F), *range(0x391, 0x3D7), 0x210E, *range(0x1D434, 0x1D468)]))
+used.update(map(chr, range(0x1D6E2, 0x1D71C)))
 
 # Letters of Latin alphabets, Greek ones, punctuation, digits above and below the line, signs.
-TEXT = {*range(0x20, 0x180), *range(0x391, 0x3CA), *range(0x2010, 0x2027), *range(0x2070, 0x2095)}
-TEXT |= set(map(ord, "′″→←↔⇒∂∆∇∈∑−∓√∞∫≈≠≡≤≥·⟨⟩…"))
+TEXT = "--unicodes=U+20-17F,U+391-3C9,U+2010-2026,U+2032-2033,U+2070-2094,U+2190-2194,U+21D2"
+TEXT += ",U+2200-22FF,U+27E8-27E9"
 
 
 def mathml(match: re.Match[str]) -> str:
@@ -36,32 +39,34 @@ def mathml(match: re.Match[str]) -> str:
         converted = convert(latex, display="block" if block else "inline")
     except Exception as error:
         raise PluginError(f"latex2mathml cannot convert {latex!r}: {error!r}") from error
-    # latex2mathml leaves a command that it does not know as it is, and the dollars between two
-    # formulas that no empty line separates.
-    if re.search(r"[\\$]", unescape(converted)):
-        raise PluginError(f"latex2mathml does not know all of {latex!r}: {converted}")
-    used.update(map(ord, unescape(converted)))
+    used.update(unescape(converted))
     return f'<div class="formula">{converted}</div>' if block else converted
 
 
 def on_page_content(html, **kwargs):
     del kwargs
-    return FORMULA.sub(mathml, html)
+    # A line is not broken between a formula and its comma.
+    return MARKED.sub(r'<span class="marked">\1</span>', FORMULA.sub(mathml, html))
 
 
-def ship(config, package: str, file: str, characters: set[int], name: str) -> None:
+def on_post_page(output, page, **kwargs):
+    del kwargs
+    # Also a command that latex2mathml does not know, which it leaves as it is.
+    if found := LATEX.findall(unescape(VERBATIM.sub("", output))):
+        raise PluginError(f"{page.file.src_uri} shows raw LaTeX: {found}")
+
+
+def ship(config, package: str, file: str, characters: str, name: str) -> None:
     """Writes the characters of a font of a package into the site."""
-    options = subset.Options(flavor="woff", layout_features=["*"])
-    with importlib.resources.path(package, file) as whole:
-        font = subset.load_font(whole, options)
-    small = subset.Subsetter(options)
-    small.populate(unicodes=characters)
-    small.subset(font)
-    subset.save_font(font, Path(config.site_dir, "assets", name), options)
+    font = distribution(package).locate_file(file)
+    out = Path(config.site_dir, "assets", name)
+    options = ["--flavor=woff", "--layout-features=*", f"--output-file={out}"]
+    subset.main([str(font), characters, *options])
 
 
 def on_post_build(config):
-    ship(config, "ziamath.fonts", "STIXTwoMath-Regular.ttf", used, "formulas.woff")
+    formulas = "ziamath/fonts/STIXTwoMath-Regular.ttf"
+    ship(config, "ziamath", formulas, f"--text={''.join(sorted(used))}", "formulas.woff")
     for face in ("Regular", "It", "Bold"):
-        file = f"SourceSansPro-{face}.ttf"
-        ship(config, "font_source_sans_pro.files", file, TEXT, f"text-{face}.woff")
+        file = f"font_source_sans_pro/files/SourceSansPro-{face}.ttf"
+        ship(config, "font-source-sans-pro", file, TEXT, f"text-{face}.woff")

@@ -38,9 +38,6 @@ from .._tree import key_of, ravel, unravel, without_pattern
 
 Entry = FirstIntegral | Constraint
 
-# By default a derivative is tested at this many states: a misprint shows at almost every state, and
-# more states cost little.
-_NUM_STATES = 100
 # By default a defect of this many units of roundoff counts as roundoff. The number is a choice: the
 # roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
 # order one at almost every state.
@@ -110,7 +107,8 @@ def check_invariance(
     t: Real[ArrayLike, "*states"] = 0.0,
     args: Args = None,
     key: PRNGKeyArray | None = None,
-    num_states: int = _NUM_STATES,
+    # A misprint shows at almost every state, and more states cost little.
+    num_states: int = 100,
     rtol: float | None = None,
 ) -> InvarianceReport:
     r"""Checks, by automatic differentiation, that a vector field conserves a manifold.

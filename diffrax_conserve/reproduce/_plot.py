@@ -24,10 +24,14 @@ _LOOKS = {
     "projected rk4": ("projected RK4", "#0072B2", ".", 3.0),
     "kvaerno5": ("Kvaerno5", "#D55E00", "o", 5.0),
     "projected kvaerno5": ("projected Kvaerno5", "#0072B2", ".", 3.0),
-    "standard": ("standard", "#CC79A7", "s", 5.0),
-    "conservative": ("conservative", "#009E73", "x", 4.0),
-    "standard projected": ("standard projected", "#E69F00", "^", 4.0),
+    "standard": ("standard network", "#CC79A7", "s", 5.0),
+    "conservative": ("conservative network", "#009E73", "x", 4.0),
+    "standard projected": ("standard, projected", "#E69F00", "^", 4.0),
 }
+_LEARNED = ("standard", "conservative", "standard projected")
+_NETWORKS = (
+    "The conservative network was trained\nthrough the projection, the standard one without."
+)
 _ROUNDOFF: dict[str, Any] = dict(color="black", linewidth=0.8, linestyle=":", zorder=3)
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -145,21 +149,29 @@ def _trajectory(
 ) -> Figure:
     """One panel for each part of the system: the reference, and the last steps of each solver.
 
-    A single curve in space is drawn in three dimensions, several by their first two coordinates.
+    Of a single part numerical solvers and networks have a panel each, so that none hides another. A
+    single curve in space is drawn in three dimensions, several by their first two coordinates.
     """
     parts = list(next(iter(paths.values())))
+    learned = {name: path for name, path in paths.items() if name in _LEARNED}
+    others = {name: path for name, path in paths.items() if name not in _LEARNED}
+    shown = [(part, part, paths) for part in parts]
+    if len(parts) == 1 and learned and others:
+        shown = [("numerical", parts[0], others), ("learned", parts[0], learned)]
     dimension = len(axis_labels) if len(parts) == 1 else 2
-    columns = min(len(parts), 3)
-    rows = -(-len(parts) // columns)
-    size = (3.5, 3.5) if dimension == 3 else (max(3.5, 2.3 * columns), 2.5 * rows + 0.5)
+    columns = min(len(shown), 3)
+    rows = -(-len(shown) // columns)
+    size = (max(3.5, 2.3 * columns), 2.5 * rows + 0.5)
+    if dimension == 3:
+        size = (3.2 * columns, 3.5)
     figure = Figure(figsize=size, layout="constrained")
     keywords = dict(projection="3d") if dimension == 3 else {}
     panels = figure.subplots(rows, columns, squeeze=False, subplot_kw=keywords)
-    for ax, part in zip(panels.flat, parts, strict=False):
+    for ax, (title, part, group) in zip(panels.flat, shown, strict=False):
         if reference is not None:
             path = reference[part].T[:dimension]
             ax.plot(*path, label="reference", color="#BDBDBD", linewidth=0.8, zorder=1)
-        for i, (name, curves) in enumerate(paths.items()):
+        for i, (name, curves) in enumerate(group.items()):
             label, colour, marker, width = _LOOKS[name]
             # Open markers of different sizes, so that one solver cannot hide another.
             look = dict(marker=marker, markersize=width, markerfacecolor="none", linestyle="none")
@@ -171,14 +183,20 @@ def _trajectory(
         elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq", "qp"):
             ax.set_aspect("equal", adjustable="datalim")
         ax.locator_params(nbins=4)
-        if len(parts) > 1:
-            ax.set_title(part)
-    for ax in panels.flat[len(parts) :]:
+        if len(shown) > 1:
+            ax.set_title(title)
+    for ax in panels.flat[len(shown) :]:
         ax.set_axis_off()
-    _legend(figure, panels[0, 0])
-    if any(len(curves[parts[0]]) > _MARKED_MAX + 1 for curves in paths.values()):
-        note = f"The last {_MARKED_MAX} steps are marked."
-        figure.legend([], [], title=note, title_fontsize=8, loc="outside lower center")
+    if len(parts) == 1:
+        for axis in "xyz"[:dimension]:
+            limits = np.array([getattr(ax, f"get_{axis}lim")() for ax in panels.flat])
+            for ax in panels.flat:
+                ax.set(**{f"{axis}lim": (limits.min(), limits.max())})
+    _legend(figure, *panels.flat)
+    long = any(len(curves[parts[0]]) > _MARKED_MAX + 1 for curves in paths.values())
+    notes = [_NETWORKS] * bool(learned) + [f"The last {_MARKED_MAX} steps are marked."] * long
+    if notes:
+        figure.legend([], [], title="\n".join(notes), title_fontsize=8, loc="outside lower center")
     return figure
 
 
@@ -189,7 +207,10 @@ def _lines(ax: Any, curves: _Pairs) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(4))
 
 
-def _legend(figure: Figure, ax: Any) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    columns = 2 if len(labels) > 3 and figure.get_figwidth() < 4 else 3
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+def _legend(figure: Figure, *panels: Any) -> None:
+    named = {}
+    for ax in panels:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    columns = 2 if len(named) > 3 and figure.get_figwidth() < 4 else 3
+    figure.legend(named.values(), named, loc="outside upper center", ncols=columns)
