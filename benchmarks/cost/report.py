@@ -1,7 +1,7 @@
-"""From the results of `make bench`: the tables of the documentation, and the figure of the page on
-performance.
+"""From the results of `make bench`: tables of the documentation, and the figures of the pages on
+performance and on differential-algebraic equations.
 
-Prints the tables; `--write` puts each between its two markers and redraws the figure. A test holds
+Prints the tables; `--write` puts each between its two markers and redraws the figures. A test holds
 the tables of the pages to the results.
 """
 
@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [DOCS / "performance.md", DOCS / "many-constraints.md"]
-NAMES = ("scaling", "many_constraints")
+PAGES = [DOCS / f"{x}.md" for x in ("performance", "many-constraints", "differential-algebraic")]
+NAMES = ("scaling", "many_constraints", "dae")
 # Of each system: the integrals that are kept, and the numbers in its state.
 SIZES = {"rigid body": (2, 3), "three vortices": (4, 6), "ten vortices": (4, 20)}
 
@@ -60,6 +60,18 @@ def many_table(results: Results) -> list[str]:
     return lines
 
 
+def dae_table(results: Results) -> list[str]:
+    """Radau beside IDA at a tolerance of 1e-6."""
+    heads = "problem | error | steps | ms | constraints"
+    lines = [f"| {heads} | IDA: error | evaluations | constraints |", "|" + "---|" * 8]
+    for name, rows in results["dae"]["problems"].items():
+        ours, ida = next((x["ours"], x["ida"]) for x in rows if x["rtol"] == 1e-6)
+        cells = [name, f"{ours['error']:.0e}", f"{ours['work']:,}", f"{1e3 * ours['seconds']:.1f}"]
+        cells += [f"{ours['constraints']:.0e}", f"{ida['error']:.0e}", f"{ida['work']:,}"]
+        lines.append(f"| {' | '.join(cells)} | {ida['constraints']:.0e} |")
+    return lines
+
+
 def machine_lines(results: Results) -> list[str]:
     """One line: what `scaling.py` ran on, and when it began."""
     about = results["scaling"]["machine"]
@@ -77,6 +89,7 @@ def tables(results: Results) -> dict[str, list[str]]:
         "by integrals": integrals_table(results),
         "machine": machine_lines(results),
         "many constraints": many_table(results),
+        "beside IDA": dae_table(results),
     }
 
 
@@ -93,20 +106,36 @@ def filled(text: str, results: Results) -> str:
 # ---- The figure ----
 
 
-def draw(results: Results) -> None:
+def draw_batches(results: Results) -> Figure:
     """The time of a step against the size of the batch; plain solves are dashed."""
-    with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
-        figure = Figure()
-        ax = figure.subplots()
-        rows = results["scaling"]["parts"]["batch"]
-        for method, colour in (("RK4", "#CC79A7"), ("Tsit5", "#D55E00")):
-            for kind, line in (("plain", "--"), ("projected", "-")):
-                name = f"{kind} {method}"
-                x, y = zip(*((r["batch"], r["rows"][name]["ns"]) for r in rows), strict=True)
-                ax.loglog(x, y, line, marker="o", color=colour, label=name)
-        ax.set(xlabel="trajectories", ylabel="ns per step and trajectory")
-        runpy.run_path(str(DOCS / "drawing.py"))["label"](ax)
-        figure.savefig(DOCS / "images" / "scaling.svg", metadata={"Date": None})
+    figure = Figure()
+    ax = figure.subplots()
+    rows = results["scaling"]["parts"]["batch"]
+    for method, colour in (("RK4", "#CC79A7"), ("Tsit5", "#D55E00")):
+        for kind, line in (("plain", "--"), ("projected", "-")):
+            name = f"{kind} {method}"
+            x, y = zip(*((r["batch"], r["rows"][name]["ns"]) for r in rows), strict=True)
+            ax.loglog(x, y, line, marker="o", color=colour, label=name)
+    ax.set(xlabel="trajectories", ylabel="ns per step and trajectory")
+    runpy.run_path(str(DOCS / "drawing.py"))["label"](ax)
+    return figure
+
+
+def draw_dae(results: Results) -> Figure:
+    """The errors of Radau and IDA against their time."""
+    figure = Figure(figsize=(9.6, 5.4))
+    problems = results["dae"]["problems"]
+    for ax, (name, rows) in zip(figure.subplots(2, 3).flat, problems.items(), strict=True):
+        for key, label in (("ours", "DAE and Radau"), ("ida", "IDA, from Python")):
+            found = [row[key] for row in rows if row[key]]
+            x, y = zip(*((1e3 * z["seconds"], z["error"]) for z in found), strict=True)
+            ax.loglog(x, y, "o-", markersize=4, label=label)
+        ax.set(title=name, xlabel="ms", ylabel="error")
+    figure.axes[0].legend(fontsize=8)
+    return figure
+
+
+FIGURES = {"scaling": draw_batches, "dae": draw_dae}
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -119,7 +148,10 @@ def main(argv: list[str] | None = None) -> None:
     if options.write:
         for page in PAGES:
             page.write_text(filled(page.read_text(encoding="utf-8"), results), encoding="utf-8")
-        draw(results)
+        with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
+            for name, draw in FIGURES.items():
+                path = DOCS / "images" / f"{name}.svg"
+                draw(results).savefig(path, metadata={"Date": None})
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ invariants are found in `linear_invariants.py`.
 """
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -25,7 +26,14 @@ from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
 from .._tree import key_of, tree_size
 from .compared_solves import Task, drifts, references, sizes_of, switched, timed
-from .comparison import NOTHING, ComparisonReport, ComparisonRow, distance
+from .comparison import (
+    NOTHING,
+    ComparisonReport,
+    ComparisonRow,
+    by_errors,
+    distance,
+    worsened,
+)
 from .linear_invariants import changes, linear_invariants
 
 # States are compared at about so many times, evenly spread.
@@ -35,6 +43,8 @@ _LEFT_OUT = 8
 # An adaptive solve that must keep its dense output, as balances need it, takes at most so many
 # steps.
 _DENSE_STEPS = 4096
+# What is added to the name of a row with the metric by errors.
+_BY_ERRORS = ", metric by errors"
 # Linear invariants are searched for in states of at most so many components.
 _COMPONENTS = 300
 
@@ -60,9 +70,11 @@ def compare(
     r"""Prints and returns whether projecting makes a solution better, and says what to keep.
 
     The equation is solved without projection, with all entries of the manifold kept, and with each
-    entry left out; each with the default metric, with `metric=1.0`, and with the `metric` that you
-    give. The error of a state is judged by a solve at a tight tolerance that steps exactly to the
-    times at which states are compared,
+    entry left out; each with the default metric, with `metric=1.0`, with the `metric` that you
+    give, and with a metric by errors: the weight of a component is the inverse square of its error
+    without projection, so that what is accurate already is hardly moved, such as the outer planets
+    beside Mercury. The error of a state is judged by a solve at a tight tolerance that steps
+    exactly to the times at which states are compared,
 
     $$e(t) = \max_{\text{leaves}} \frac{\max_k |y_k(t) - y^*_k(t)|}{\max_{k, t} |y^*_k(t)|}.$$
 
@@ -74,8 +86,9 @@ def compare(
     batch, unless one before it in the table has at most 1.5 times this error: then the first of
     these, because errors grow faster where less is kept. Only what has an error of less than 0.9
     times that without projection gains. If nothing does, the first is taken that has at most 1.1
-    times that error, and in no lane 1.5 times, and is said to be for what it keeps only; otherwise
-    no projection is. Of more than eight entries none is left out.
+    times that error, in no lane 1.5 times, and in no component 10 times, and is said to be for what
+    it keeps only; otherwise no projection is. A component that becomes 10 times less accurate is
+    told in any case. Of more than eight entries none is left out.
 
     An error counts relative to the largest value of its leaf, so that of an angle which goes round
     many times, or of a place far from the origin, counts little.
@@ -155,11 +168,18 @@ def compare(
         None if dt0 is None else jnp.asarray(dt0, dtype), steps.controller, steps.saveat,
         batch, steps.most,
     )  # fmt: skip
-    variants = _variants(solver, manifold, projection, metric, first)
+    if projection is None:
+        projection = ManifoldProjection(solver, manifold).projection
+    metrics = _metrics(projection, metric)
     if reference is None:
         implicit = isinstance(solver, dfx.AbstractImplicitSolver)
         reference = dfx.Kvaerno5() if implicit else dfx.Dopri8()
-    report = _report(task, variants, entries, reference, steps.ts)
+
+    def variants(weights: Any) -> list[_Variant]:
+        more = metrics if weights is None or not metrics else metrics | {_BY_ERRORS: weights}
+        return _variants(solver, manifold, projection, more, first)
+
+    report = _report(task, solver, variants, entries, reference, steps.ts)
     print(report)
     return report
 
@@ -279,22 +299,23 @@ class _Variant(NamedTuple):
 
 
 def _variants(
-    solver: dfx.AbstractSolver, manifold: Manifold, projection: Any, metric: Any, y0: Any
+    solver: dfx.AbstractSolver,
+    manifold: Manifold,
+    projection: AbstractProjection,
+    metrics: dict[str, Any],
+    y0: Any,
 ) -> list[_Variant]:
-    """Without projection first."""
-    entries = entries_of(manifold)
-    if projection is None:
-        projection = ManifoldProjection(solver, manifold).projection
-    projections = _projections(projection, metric, y0)
-    found = [_Variant(NOTHING, (), solver, solver)]
-    leave_out = len(projections) > 1 and 1 < len(entries) <= _LEFT_OUT
+    """The solvers with projections. Without metrics all entries are kept only."""
+    entries, found = entries_of(manifold), []
+    leave_out = metrics and 1 < len(entries) <= _LEFT_OUT
+    changed = {name: dataclasses.replace(projection, metric=x) for name, x in metrics.items()}
     for left_out in (None, *(entries if leave_out else ())):
         kept = {name: entry for name, entry in entries.items() if name != left_out}
         part = shared = manifold if left_out is None else kept
         if leave_out:
             shared = {name: switched(entry, name != left_out) for name, entry in entries.items()}
         name = "all kept" if left_out is None else f"all but {left_out}"
-        for suffix, chosen in projections.items():
+        for suffix, chosen in (changed or {"": projection}).items():
             wrapped = ManifoldProjection(solver, part, projection=chosen)
             if suffix:  # weights of all components are one program, whatever the weights
                 chosen = dataclasses.replace(chosen, metric=_spread(chosen.metric, y0))
@@ -303,21 +324,18 @@ def _variants(
     return found
 
 
-def _projections(projection: Any, metric: Any, y0: Any) -> dict[str, AbstractProjection]:
-    """The projection with each metric, by what is added to its name."""
-    options = {x.name for x in dataclasses.fields(projection) if x.init}
-    if "metric" not in options:
+def _metrics(projection: Any, metric: Any) -> dict[str, Any]:
+    """The metrics to try, by what is added to a name; none for a projection that has none."""
+    if "metric" not in {x.name for x in dataclasses.fields(projection) if x.init}:
         if metric is not None:
             raise ValueError(
                 f"`projection` is a `{type(projection).__name__}`, which has no metric. Leave out "
                 "`metric`, or pass `SimplifiedNewton`."
             )
-        return {"": projection}
+        return {}
     metric = projection.metric if metric is None else metric
-    metrics = {"": None, ", metric=1.0": 1.0}
-    if metric is not None:
-        metrics[", given metric"] = metric
-    return {name: dataclasses.replace(projection, metric=x) for name, x in metrics.items()}
+    found = {"": None, ", metric=1.0": 1.0}
+    return found if metric is None else found | {", given metric": metric}
 
 
 def _spread(metric: Any, y0: Any) -> Any:
@@ -339,29 +357,37 @@ def _spread(metric: Any, y0: Any) -> Any:
 
 def _report(
     task: Task,
-    variants: list[_Variant],
+    solver: dfx.AbstractSolver,
+    variants: Callable[[Any], list[_Variant]],
     entries: dict[str, Any],
     reference: dfx.AbstractSolver,
     ts: np.ndarray,
 ) -> ComparisonReport:
-    plain, *_ = results = [timed(task, variant.shared) for variant in variants]
+    plain, seconds = timed(task, solver)
     length = len(ts)
-    known = np.asarray(plain[0].ts)[0, :length]
+    known = np.asarray(plain.ts)[0, :length]
     ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
-    sizes = sizes_of(task.y0s, plain[0].ys)
+    sizes = sizes_of(task.y0s, plain.ys)
     exact, rough = references(task, reference, ts, sizes)
     invariants = _invariants(task, ts, exact, sizes, entries)
+    states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
+    others = variants(by_errors(states(plain), exact))
+    given = [_Variant(NOTHING, (), solver, solver), *others]
+    results = [(plain, seconds), *(timed(task, variant.shared) for variant in others)]
     rows = []
-    for variant, (sols, seconds) in zip(variants, results, strict=True):
-        ys = jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)
-        success = np.asarray(sols.result == dfx.RESULTS.successful)
+    for variant, (sols, seconds) in zip(given, results, strict=True):
+        ys, success = states(sols), np.asarray(sols.result == dfx.RESULTS.successful)
         row = ComparisonRow(
             variant.name, variant.kept, variant.solver, distance(ys, exact), success,
             _message(sols, success), drifts(task, sols, entries), changes(invariants, ys, sizes),
             np.asarray(sols.stats["num_steps"]), seconds,
         )  # fmt: skip
         rows.append(row)
-    return ComparisonReport(tuple(rows), ts, distance(rough, exact), len(invariants))
+    report = ComparisonReport(tuple(rows), ts, distance(rough, exact), len(invariants))
+    judge = ft.partial(worsened, states(plain), exact, rough, report.last)
+    pairs = zip(rows, results, strict=True)
+    rows = [dataclasses.replace(row, worsened=judge(states(sols))) for row, (sols, _) in pairs]
+    return dataclasses.replace(report, rows=tuple(rows))
 
 
 def _message(sols: dfx.Solution, success: np.ndarray) -> str:

@@ -26,6 +26,9 @@ _MARGIN = 1.5
 # Where a projection is about as accurate as none in the mean, it is not taken if a lane is worse by
 # this factor.
 _RISK = 1.5
+# A component that is less accurate by this factor is told, and without another gain it is a reason
+# not to project.
+_WORSE = 10
 # An error below this is roundoff. It stands in the place of zero, which has no logarithm.
 _TINY = 1e-18
 # A change of a conserved combination that is larger than this is more than roundoff.
@@ -46,6 +49,52 @@ def distance(ys: Any, exact: Any) -> Float[np.ndarray, "lanes times"]:
     return np.max(found, axis=0)
 
 
+def by_errors(ys: Any, exact: Any) -> Any:
+    """The weights of a metric, with a leaf for each leaf of a state: the inverse squares of the
+    largest errors of the components, in units of the largest of their leaf. An error counts as at
+    least `√ε` of the largest. `None` if no error is known.
+
+    Of all states with the given values the nearest in this metric is the most likely one, if errors
+    are independent, with these sizes.
+    """
+    sizes, errors = [], []
+    for y, x in zip(jtu.tree_leaves(ys), jtu.tree_leaves(exact), strict=True):
+        off, size = (np.where(np.isfinite(a), np.abs(a), 0) for a in (y - x, x))
+        sizes.append(np.max(size, initial=0) or 1.0)
+        errors.append(np.max(off, axis=(0, 1)) / sizes[-1])
+    top = max((np.max(e, initial=0) for e in errors), default=0)
+    if top == 0:
+        return None
+    leaves, tree = jtu.tree_flatten(ys)
+    least = [float(np.finfo(y.dtype).eps) ** 0.5 for y in leaves]
+    parts = zip(errors, sizes, least, strict=True)
+    return jtu.tree_unflatten(tree, [(size * np.maximum(e / top, a)) ** -2 for e, size, a in parts])
+
+
+def worsened(
+    plain: Any, exact: Any, rough: Any, last: Int[np.ndarray, " lanes"], ys: Any
+) -> tuple[str, float]:
+    """The component that is least accurate beside the solve without projection, and by which
+    factor, in the geometric mean over the lanes. Errors are the largest up to the last time that is
+    judged, and count if they are larger than roundoff and than the doubt about the reference."""
+    judged, found = last > 0, [("", 1.0)]
+    if not judged.any():
+        return found[0]
+    paths, _ = jtu.tree_flatten_with_path(ys)
+    others = (jtu.tree_leaves(x) for x in (plain, rough, exact))
+    for (path, y), before, doubt, x in zip(paths, *others, strict=True):
+        early = (np.arange(y.shape[1]) <= last[:, None]).reshape(y.shape[:2] + (1,) * (y.ndim - 2))
+        largest = lambda a, early=early: np.max(np.abs(a), 1, where=early, initial=0)[judged]  # noqa: E731
+        least = np.maximum(3 * largest(doubt - x), _BROKEN * np.max(largest(x), initial=0)) + _TINY
+        now, then = (np.maximum(largest(a - x), least) for a in (y, before))
+        factor = np.nan_to_num(np.exp(np.mean(np.log(now / then), axis=0)), nan=np.inf)
+        if factor.size:
+            place = np.unravel_index(np.argmax(factor), factor.shape)
+            where = f"[{', '.join(map(str, place))}]" if place else ""
+            found.append((f"y{jtu.keystr(path)}{where}", float(np.max(factor))))
+    return max(found, key=lambda pair: pair[1])
+
+
 @dataclasses.dataclass(frozen=True)
 class ComparisonRow:
     """One solver of a comparison.
@@ -58,6 +107,8 @@ class ComparisonRow:
     - `drift`: the largest drift of each entry in each lane, kept or not.
     - `linear`: the largest change in each lane of linear invariants that nobody declared.
     - `steps`: the number of steps in each lane; `seconds`: the time of one solve.
+    - `worsened`: the component that is least accurate beside the solve without projection, and by
+        which factor.
     """
 
     name: str
@@ -70,6 +121,7 @@ class ComparisonRow:
     linear: Float[np.ndarray, " lanes"]
     steps: Int[np.ndarray, " lanes"]
     seconds: float
+    worsened: tuple[str, float] = ("", 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +177,7 @@ class ComparisonReport:
     @property
     def index(self) -> int | None:
         """The row to take; `None` if that cannot be said."""
-        return _chosen(self.error)
+        return _chosen(self.error, np.array([row.worsened[1] for row in self.rows]))
 
     @property
     def choice(self) -> str | None:
@@ -157,7 +209,8 @@ class ComparisonReport:
             if _mean(ratios[self.index]) >= 1 - _EQUAL:
                 told = f"Projecting changes the error little: `{self.choice}` is good for what it "
                 told += "keeps, and "
-            return f"{told}{self._until}{_compared(ratios[self.index])}{self._linear}."
+            found = f"{told}{self._until}{_compared(ratios[self.index])}"
+            return f"{found}{self._worse(self.index)}{self._linear}."
         rivals = [i for i in range(1, len(ratios)) if np.isfinite(ratios[i]).all()]
         if not rivals:
             where = " in some lane" if error.shape[1] > 1 else ""
@@ -165,7 +218,11 @@ class ComparisonReport:
         best = min(rivals, key=lambda i: _mean(ratios[i]))
         name = self.rows[best].name
         told = f"Do not project: {self._until}with `{name}`, the best of the projections, "
-        return f"{told}{_compared(ratios[best])}."
+        return f"{told}{_compared(ratios[best])}{self._worse(best)}."
+
+    def _worse(self, index: int) -> str:
+        name, factor = self.rows[index].worsened
+        return f", but `{name}` is {factor:.2g} times less accurate" * (factor > _WORSE)
 
     def _unjudged(self) -> str:
         if not np.isfinite(self.doubt).all():
@@ -247,9 +304,13 @@ class ComparisonReport:
         ]
 
     def _units(self) -> list[str]:
-        if self.choice is None or "metric=1.0" not in self.choice:
-            return []
-        return ["`metric=1.0` depends on the units of the state."]
+        about = {
+            "metric=1.0": "depends on the units of the state",
+            "metric by errors": "is `report.solver.projection.metric`",
+        }
+        return [
+            f"`{name}` {words}." for name, words in about.items() if name in (self.choice or "")
+        ]
 
     def __str__(self) -> str:
         lanes = self.doubt.shape[0]
@@ -324,9 +385,10 @@ def _mean(errors: np.ndarray) -> float:
     return float(np.exp(np.mean(np.log(known)))) if known.size else np.nan
 
 
-def _chosen(error: np.ndarray) -> int | None:
+def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     """Of the rows that fail in the fewest lanes, the first with a projection of which the geometric
-    mean of the errors is about the least; if none gains, the first that changes little."""
+    mean of the errors is about the least; if none gains, the first that changes little, in every
+    component."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
     failures = np.sum(np.isinf(error), axis=1)
     able = np.flatnonzero(failures == failures.min())
@@ -337,9 +399,10 @@ def _chosen(error: np.ndarray) -> int | None:
     near = [i for i, mean in means.items() if mean <= _MARGIN * min(means.values())]
     if 0 not in means:
         return near[0]
-    worst = np.max(error[:, common] / error[0, common], axis=1)
+    worst = {i: np.max(error[i, common] / error[0, common]) for i in means}
     gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
-    equal = [i for i in near if means[i] <= (1 + _EQUAL) * means[0] and worst[i] <= _RISK]
+    little = [i for i in near if means[i] <= (1 + _EQUAL) * means[0]]
+    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= _WORSE]
     return next((i for i in [*gains, *equal] if i > 0), 0)
 
 
