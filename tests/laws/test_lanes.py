@@ -77,13 +77,6 @@ def test_bad_lanes_of_an_adaptive_batch_change_no_other(solver, kinds, y0):
 
 
 @pytest.mark.slow
-@given(kinds=st.permutations([GOOD, GOOD, NAN, FAILED]), turn=st.floats(0.5, 1.5))
-def test_bad_lanes_of_a_batch_of_fixed_steps_change_no_other(kinds, turn):
-    y0 = jnp.asarray(turn) * jnp.array([[1.0, 1, 1], [1, 0.5, 1], [0.5, 1, 1], [1, 1, 0.5]])
-    check(dfx.Euler(), dfx.ConstantStepSize(), y0, kinds, jnp.full(4, 1e-2))
-
-
-@pytest.mark.slow
 def test_bad_lanes_change_no_gradient():
     controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
 
