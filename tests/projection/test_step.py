@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
 
 from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution
 from ..thinned import some_of
@@ -51,12 +50,6 @@ def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(i
 
     coarse, fine = errors(0.05), errors(0.025)
     np.testing.assert_allclose(np.log2(coarse / fine), [order - 1, order], rtol=0, atol=0.15)
-
-
-@pytest.mark.slow
-def test_derivatives_of_relaxation_agree_with_differences():
-    end = lambda y0: solve(RELAXED, y0, t1=1.0).ys  # noqa: E731
-    dct.assert_gradients(end, EXPONENTIAL0, rtol=1e-7, forward=False)
 
 
 @pytest.mark.parametrize("direction", ["error", "step"])
