@@ -2,7 +2,6 @@
 
 import functools as ft
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -174,17 +173,6 @@ def test_formulas_do_not_depend_on_units_and_precision():
     assert f"{kinetic} p1 p1 + {kinetic} p2 p2 - /r" in found
     like = jax.tree.map(lambda x: x[0], states)
     assert all(e.fn(0.0, like, None).dtype == jnp.float32 for e in found.values())
-
-
-def test_the_result_is_a_manifold():
-    found = find_invariants(pendulum, with_angle, basis=PENDULUM)
-    assert list(found) == ["0.5 v^2 - cos(q)"]
-    solver = dfc.ManifoldProjection(dfc.RK4(), found)
-    sol = dfx.diffeqsolve(dfx.ODETerm(pendulum), solver, 0, 9, 0.1, jnp.array([2.0, 0.0]))
-    expected = dfx.diffeqsolve(dfx.ODETerm(pendulum), dfx.Dopri8(), 0, 9, 1e-2, jnp.array([2.0, 0]))
-    np.testing.assert_allclose(sol.ys, expected.ys, rtol=0, atol=1e-5)
-    energy = sol.ys[-1, 1] ** 2 / 2 - jnp.cos(sol.ys[-1, 0])
-    np.testing.assert_allclose(energy, -jnp.cos(2.0), rtol=4e-15)
 
 
 def test_names_of_components():

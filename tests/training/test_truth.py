@@ -42,18 +42,6 @@ def true_error(network):
 
 
 @pytest.mark.slow
-def test_the_estimate_is_the_error():
-    """With jumps of the state between windows."""
-    network = pinn(windows=3)
-    square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    options = dict(key=KEY, recipe=recipe(network, 12, retries=0), manifold=square)
-    trained, log = dfc.fit(network, oscillator, **options)
-    assert trained.edges == network.edges
-    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.02)
-    assert log.errors.shape == (network.windows,)
-
-
-@pytest.mark.slow
 def test_each_leaf_counts_in_its_own_units():
     y0 = {"q": jnp.array(1e-3), "p": jnp.array(0.0)}
     network = dfc.PINN(y0, 0.0, 2.0, width=8, depth=1, slope=2.0, key=KEY)
