@@ -1,11 +1,8 @@
-"""Projection part by part, and along the error estimate."""
-
-import functools as ft
+"""Projection part by part."""
 
 import diffrax as dfx
 import equinox as eqx
 import hypothesis.strategies as st
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,7 +11,6 @@ from hypothesis import given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from .. import problems
 from ..problems import refused, solve
 
 GRAVITY = 13.7503716373294544  # that of cvPendulum: the period is 2
@@ -104,66 +100,4 @@ test_mistakes_are_named = refused(
     (of(("no", FIRST)), ValueError, "Give each entry one stage"),
     (of(FIRST), TypeError, "must be a pair"),
     (of(("circle", ALONG_ERROR)), TypeError, "a projection with `sees_step = False`"),
-)
-
-
-TODA = dfc.systems.get("toda-lattice")
-
-
-def energy(t, y, args):
-    return args * TODA.energy(t, y, None)
-
-
-TODA_ENERGY, TODA_TERM, TODA0 = dfc.FirstIntegral(energy), dfx.ODETerm(TODA.vector_field), TODA.y0
-ONE = jnp.array(1.0)
-
-
-def along(inner, y0=TODA0, args=ONE, t1=3.0, dt0=0.05, **options):
-    solver = dfc.ManifoldProjection(inner, TODA_ENERGY, projection=ALONG_ERROR)
-    options = dict(t1=t1, dt0=dt0, args=args) | options
-    return problems.solve(TODA.vector_field, solver, y0, **options)
-
-
-def test_it_lies_on_the_line_along_the_embedded_difference():
-    """One step against Bosh3 by hand."""
-
-    @jax.jit
-    def by_hand():
-        state = dfx.Bosh3().init(TODA_TERM, 0.0, 0.2, TODA0, ONE)
-        return dfx.Bosh3().step(TODA_TERM, 0.0, 0.2, TODA0, ONE, state, False)[:2]
-
-    plain, error = by_hand()
-    found = along(dfx.Bosh3(), t1=0.2, dt0=0.2).ys
-    w = np.concatenate(error)
-    moved = np.concatenate([a[-1] - b for a, b in zip(found, plain, strict=True)])
-    np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), rtol=0, atol=1e-15)
-    assert abs(energy(0.0, plain, ONE) - energy(0.0, TODA0, ONE)) > 1e-9
-
-
-def test_a_tangent_direction_is_a_failure():
-    """On a circle whose field is constant speed, the error estimate is made tangent by hand."""
-
-    class Tangent(dfx.Euler):
-        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-            y1, _, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-            return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
-
-    circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    solver = dfc.ManifoldProjection(Tangent(), circle, projection=ALONG_ERROR)
-    field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-    sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
-    assert sol.result != dfx.RESULTS.successful
-
-
-def solved(inner, manifold=TODA_ENERGY):
-    kept = ft.partial(dfc.ManifoldProjection, inner, manifold, projection=ALONG_ERROR)
-    return lambda: dfx.diffeqsolve(TODA_TERM, kept(), 0, 1, 0.1, TODA0, ONE)
-
-
-ALONE = ft.partial(dfc.project, TODA_ENERGY, TODA0, args=ONE, value=0.0, projection=ALONG_ERROR)
-test_what_cannot_be_is_refused_before_compilation = refused(
-    (solved(dfx.Tsit5(), (TODA_ENERGY, TODA_ENERGY)), ValueError, "2 scalar constraints"),
-    (solved(dfx.HalfSolver(dfc.RK4())), ValueError, "without its sign"),
-    (solved(dfc.RK4()), ValueError, "embedded method"),
-    (ALONE, ValueError, r"outside a solve. Pass `projection=Newton\(\)`"),
 )

@@ -1,4 +1,5 @@
-"""What a projection sees of the step: relaxation, and projections of a user."""
+"""What a projection sees of the step: relaxation, a line along the error estimate, and projections
+of a user."""
 
 from typing import ClassVar
 
@@ -11,11 +12,11 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution
+from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution, refused
 from ..thinned import some_of
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)
-STEP = dfc.AlongLine(direction="step")
+STEP, ALONG_ERROR = (dfc.AlongLine(direction=direction) for direction in ("step", "error"))
 RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=STEP)
 
 
@@ -99,12 +100,51 @@ def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
     assert "was not reached" in dfx.RESULTS[sol.result]
 
 
-def test_relaxation_is_refused_without_a_step_and_with_two_integrals():
-    with pytest.raises(ValueError, match="no step outside a solve"):
-        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=STEP)
-    twice = dfc.ManifoldProjection(dfx.Heun(), (ENERGY, ENERGY), projection=STEP)
-    with pytest.raises(ValueError, match="has one unknown, but `manifold` has 2"):
-        solve(twice)
+def test_it_lies_on_the_line_along_the_embedded_difference():
+    """One step against Bosh3 by hand."""
+    inner, along = dfx.Bosh3(), dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=ALONG_ERROR)
+
+    @jax.jit
+    def found(y0):
+        given = TERM, 0.0, 0.2, y0, None
+        plain, error, *_ = inner.step(*given, inner.init(*given), False)
+        return solve(along, y0, t1=0.2, dt0=0.2).ys[-1] - plain, error
+
+    moved, w = map(np.asarray, found(EXPONENTIAL0))
+    np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), rtol=0, atol=1e-15)
+    assert np.linalg.norm(moved) > 1e-6
+
+
+def test_a_tangent_direction_is_a_failure():
+    """On a circle whose field is constant speed, the error estimate is made tangent by hand."""
+
+    class Tangent(dfx.Euler):
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            y1, _, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+            return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
+
+    circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(Tangent(), circle, projection=ALONG_ERROR)
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+    sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
+def alone(projection):
+    return lambda: dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=projection)
+
+
+def solved(inner, manifold=ENERGY, projection=ALONG_ERROR):
+    return lambda: solve(dfc.ManifoldProjection(inner, manifold, projection=projection))
+
+
+test_what_cannot_be_is_refused_before_compilation = refused(
+    (alone(STEP), ValueError, "no step outside a solve"),
+    (alone(ALONG_ERROR), ValueError, r"outside a solve. Pass `projection=Newton\(\)`"),
+    (solved(dfx.Heun(), (ENERGY, ENERGY), STEP), ValueError, "one unknown, but `manifold` has 2"),
+    (solved(dfx.HalfSolver(dfc.RK4())), ValueError, "without its sign"),
+    (solved(dfc.RK4()), ValueError, "embedded method"),
+)
 
 
 class Seen(dfc.AbstractProjection):

@@ -90,17 +90,6 @@ def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
 
 
 @pytest.mark.slow
-def test_a_conservative_window_is_as_accurate_and_on_the_manifold():
-    square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-    network = turns(3.0, layer=dfc.learned.ConservativeLayer(square))
-    pinn, log = dfc.fit(network, oscillator, key=KEY)
-    assert error(pinn) < 1e-8
-    np.testing.assert_allclose(log.error, error(pinn), rtol=0.5)
-    ys = jax.jit(jax.vmap(pinn))(jnp.linspace(0, 3, 50))
-    np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 1, rtol=1e-14)
-
-
-@pytest.mark.slow
 def test_a_flow_map_does_not_depend_on_the_units_of_components():
     def losses(units):
         here = units * states()
