@@ -1,17 +1,18 @@
-"""Plants a defect in each trap of the design, one at a time, and runs tests that must notice.
+"""Plants a defect in each trap of the design, one at a time, and runs the test that must notice.
 
-`make mutants`, or `python tests/mutants.py [NAME ...]`. Prints, for each defect, the first test
-that fails; exits with status 1 if any defect survives. When all are planted, `mutants.md` is
-written, with a line for each.
+`make mutants`, or `python tests/mutants.py [NAME ...]`. Prints, for each defect, what fails; exits
+with status 1 if any defect survives. `mutants.md` says which test must notice which defect, and is
+written anew when all are planted.
 
-A defect is a function that replaces functions and methods of the package, which it finds by their
-names wherever they are. The tests that must notice run with this file as a pytest plugin, which
-plants the defect before any test is imported.
+A defect is a function of a `package`, which replaces functions and methods that it finds by their
+names wherever they are. The test runs with this file as a pytest plugin, which plants the defect
+before any test is imported.
 """
 
 import contextlib
 import dataclasses
 import importlib
+import inspect
 import os
 import re
 import subprocess
@@ -37,8 +38,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "diffrax_conserve"
 TABLE = Path(__file__).with_suffix(".md")
 TITLE = "What `make mutants` found.\n\n| defect | first test that fails |\n|---|---|\n"
-MUTANTS: dict[str, Callable[["Package"], None]] = {}
-TESTS: dict[str, tuple[str, ...]] = {}
 
 
 class Package:
@@ -86,51 +85,34 @@ class Package:
         self.patch.setattr(sys.modules[self.find(name).__module__], attribute, value)
 
 
-def noticed_by(*tests: str) -> Callable:
-    """Marks a defect. `tests` are the arguments for pytest."""
-
-    def register(plant: Callable[[Package], None]) -> Callable[[Package], None]:
-        name = plant.__name__.replace("_", " ")
-        MUTANTS[name], TESTS[name] = plant, tests
-        return plant
-
-    return register
-
-
 # ---- The core ----
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "either_direction")
 def drop_the_sign_of_time(package):
     package.replace("time_direction", lambda terms, t: jnp.ones((), jnp.result_type(t)))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "adjoints_agree")
 def drop_scan_kind(package):
     package.replace("ForwardingSolver.scan_kind", property(lambda self: None))
 
 
-@noticed_by("tests/solver/test_conformance.py", "-k", "every_solver")
 def drop_root_finder(package):
     detached = property(lambda self: diffrax.VeryChord(rtol=1e-3, atol=1e-3))
     package.replace("ForwardingSolver.root_finder", detached)
 
 
-@noticed_by("tests/laws/test_solve.py", "-k", "succeeds_is_conserved")
 def do_not_project_the_interpolant(package):
     @package.around("ManifoldInterpolation.evaluate")
     def _(old, self, t0, t1=None, left=True):
         return self.inner.evaluate(t0, t1, left)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "without_hope")
 def call_nan_a_success(package):
     @package.around("Equations.level")
     def _(level, self, *values):
         return level(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "continued_solve")
 def take_the_conserved_value_anew_at_every_step(package):
     conserved_values = package.find("conserved_values")
 
@@ -146,7 +128,6 @@ def _inner_step(self, terms, t0, t1, y0, args, state, _):
     return self.solver.step(terms, t0, t1, y0, args, state.inner, True)
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "retried")
 def accept_a_step_whose_projection_failed(package):
     @package.around("ManifoldProjection.step")
     def _(step, *arguments):
@@ -154,14 +135,12 @@ def accept_a_step_whose_projection_failed(package):
         return y, _inner_step(*arguments)[1], *rest
 
 
-@noticed_by("tests/solver/test_failure.py")
 def report_a_failed_projection_as_a_success(package):
     @package.around("ManifoldProjection.step")
     def _(step, *arguments):
         return *step(*arguments)[:-1], _inner_step(*arguments)[-1]
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "max_correction")
 def ignore_max_correction(package):
     @package.around("ManifoldProjection.step")
     def _(step, self, *arguments):
@@ -169,7 +148,6 @@ def ignore_max_correction(package):
         return step(eqx.tree_at(limit, self, None, is_leaf=lambda x: x is None), *arguments)
 
 
-@noticed_by("tests/projection/test_derivatives.py", "-k", "finite_differences")
 def forget_the_curvature_in_the_derivative(package):
     @package.around("SimplifiedNewton.solve")
     def _(solve, self, problem, candidate):
@@ -180,13 +158,11 @@ def forget_the_curvature_in_the_derivative(package):
         return moved - inverse @ problem.residual(moved), info
 
 
-@noticed_by("tests/projection/test_laws.py", "-k", "lane_of_a_batch")
 def leave_a_lane_of_a_batch_unfinished(package):
     wrong = SimpleNamespace(**{**vars(jnp), "any": jnp.all})
     package.in_module_of("_any_lane", "jnp", wrong)
 
 
-@noticed_by("tests/laws/test_never_silent.py", "-k", "success_means")
 def decide_success_by_the_scale_at_the_candidate(package):
     def wrong(solve, self, problem, candidate):
         equations = problem.equations
@@ -201,17 +177,14 @@ def decide_success_by_the_scale_at_the_candidate(package):
     package.around("after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "satellites")
 def polish_along_nearly_parallel_gradients(package):
     package.around("corrected")(lambda given, *x, least=None: given(*x))
 
 
-@noticed_by("tests/laws/test_never_silent.py", "-k", "parallel")
 def divide_by_every_pivot_in_derivatives(package):
     package.replace("least_pivot", lambda rows: 0.0)
 
 
-@noticed_by("tests/projection/test_bounds.py", "-k", "cannot_be_projected")
 def return_a_state_that_was_not_projected_as_nan(package):
     @package.around("ManifoldInterpolation.projected")
     def _(projected, self, t, left):
@@ -219,50 +192,41 @@ def return_a_state_that_was_not_projected_as_nan(package):
         return jax.tree.map(lambda y, moved: jnp.where(y == moved, jnp.nan, y), y, moved)
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "units")
 def measure_corrections_in_the_numbers_of_the_state(package):
     @package.around("ManifoldProjection._target")
     def _(target, *arguments):
         return dataclasses.replace(target(*arguments), units=None)
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "quantity")
 def give_each_component_of_a_vector_its_own_unit(package):
     package.replace("largest_of_vector", lambda x, like: x)
 
 
-@noticed_by("tests/projection/test_laws.py", "-k", "circular_orbit")
 def keep_the_frozen_directions(package):
     package.in_module_of("nearby", "FROZEN_STEPS", 100)
 
 
-@noticed_by("tests/projection/test_linear.py", "-k", "independent_rows")
 def leave_what_was_added_to_the_diagonal(package):
     package.replace("refined", lambda solve, product, b: solve(b))
 
 
-@noticed_by("tests/projection/test_linear.py", "-k", "dependent_rows")
 def divide_by_the_roundoff_of_a_pivot(package):
     package.in_module_of("eliminated", "ROUNDOFF", 0)
 
 
-@noticed_by("tests/projection/test_bounds.py", "-k", "every_balance")
 def cross_kinks_in_full_steps(package):
     package.replace("_share", lambda *arguments: 1.0)
 
 
-@noticed_by("tests/solver/test_random_features.py", "-k", "second_derivatives")
 def differentiate_at_constant_unknowns(package):
     constant = lambda self, solved: lax.stop_gradient(solved.y)  # noqa: E731
     package.replace("SquareSystem.unknowns", constant)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "without_hope")
 def never_give_up(package):
     package.replace("is_final", lambda *arguments: jnp.asarray(False))
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def give_up_once_a_step_is_short(package):
     @package.around("is_final")
     def _(is_final, state, t0, t1, moved, candidate):
@@ -270,7 +234,6 @@ def give_up_once_a_step_is_short(package):
         return short | is_final(state, t0, t1, moved, candidate)
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def forget_the_roundoff_that_is_not_in_the_gradient(package):
     package.around("hidden_terms")(lambda measure, fn, y: (*measure(fn, y)[:2], 0 * fn(y)))
 
@@ -289,7 +252,6 @@ class _Passing(eqx.Module):
         return self.solver.step(terms, t0, t1, y0, args, state, self.made_jump)
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "slope_at_the_projected_state")
 def keep_the_last_stage_of_the_candidate(package):
     @package.around("ManifoldProjection.step")
     def _(step, self, *rest):
@@ -300,14 +262,12 @@ def keep_the_last_stage_of_the_candidate(package):
 # ---- Systems and learned solvers ----
 
 
-@noticed_by("tests/systems/test_paper.py", "-k", "printed")
 def hang_the_double_pendulum_in_a_gravity_of_1(package):
     @package.around("DoublePendulum.__init__")
     def _(init, self, *arguments, gravity=1.0, **options):
         init(self, *arguments, gravity=gravity, **options)
 
 
-@noticed_by("tests/solver/test_random_features.py", "-k", "rigid_body")
 def stop_the_newton_iteration_of_random_features_at_once(package):
     solved = package.find("Solved")
 
@@ -318,7 +278,6 @@ def stop_the_newton_iteration_of_random_features_at_once(package):
         return solved(start - change, jnp.asarray(True), jnp.asarray(1))
 
 
-@noticed_by("tests/solver/test_random_features.py", "-k", "say_so")
 def report_unsolved_equations_as_a_success(package):
     @package.around("_newton")
     def _(newton, *arguments):
@@ -329,7 +288,6 @@ def report_unsolved_equations_as_a_success(package):
 # ---- What a stranger planted, who had read the package and not its tests ----
 
 
-@noticed_by("tests/test_clipped.py", "-k", "from_inside")
 def take_the_derivative_at_an_upper_bound_from_outside(package):
     @package.around("Bounds.clip")
     def _(clip, self, z, **options):
@@ -337,13 +295,11 @@ def take_the_derivative_at_an_upper_bound_from_outside(package):
         return jnp.where(z == self.upper, lax.stop_gradient(y), y)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "name_the_entry")
 def name_an_element_in_the_place_of_its_entry(package):
     wrong = SimpleNamespace(**{**vars(np), "repeat": lambda _, sizes: np.arange(sum(sizes))})
     package.in_module_of("Target", "np", wrong)
 
 
-@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
 def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
     @package.around("ManifoldInterpolation.projected")
     def _(projected, self, t, left):
@@ -352,14 +308,12 @@ def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
         return projected(step, self.t1, left)
 
 
-@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
 def integrate_rates_forwards_in_a_solve_backwards(package):
     @package.around("integrated_rates")
     def _(integrated, *given):
         return jax.tree.map(lambda x: x * given[-1], integrated(*given))
 
 
-@noticed_by("tests/solver/test_keep_linear.py", "-k", "five_integrals")
 def forget_how_the_state_changed_in_the_last_step(package):
     @package.around("State.next")
     def _(following, self, **fields):
@@ -367,14 +321,12 @@ def forget_how_the_state_changed_in_the_last_step(package):
         return following(self, **fields | {"preferred": later if later is None else 0 * later})
 
 
-@noticed_by("tests/mechanics/test_rattle.py", "-k", "there_and_back")
 def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
     @package.around("RATTLE._linear")
     def _(linear, self, equations, t, q, args, direction, *rest):
         return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
 
 
-@noticed_by("tests/mechanics/test_symmetric_projection.py", "-k", "any_metric")
 def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
     def along(equations, y, multiplier):
         return jax.vjp(equations.residual, y)[1](multiplier)[0]
@@ -382,7 +334,6 @@ def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
     package.in_module_of("SymmetricProjection", "_along", along)
 
 
-@noticed_by("tests/solver/test_radau.py", "-k", "names_of_their")
 def take_one_dae_for_another_of_the_same_shapes(package):
     @package.around("tree_key")
     def _(old, tree):
@@ -390,12 +341,10 @@ def take_one_dae_for_another_of_the_same_shapes(package):
         return treedef, tuple(jnp.shape(x) for x in leaves if eqx.is_array_like(x))
 
 
-@noticed_by("tests/test_check.py", "-k", "worst_state")
 def forget_the_sign_of_a_defect_of_an_invariant(package):
     package.in_module_of("check_invariance", "relative", lambda *x: jnp.maximum(relative(*x), 0))
 
 
-@noticed_by("tests/test_serialisation.py", "-k", "given_again")
 def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):
     describe = package.find("_describe")
 
@@ -409,7 +358,6 @@ def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):
         return found
 
 
-@noticed_by("tests/systems/test_chemistry.py", "-k", "rates_are")
 def round_the_rates_of_reactions_to_float32(package):
     @package.around("Mechanism.vector_field")
     def _(field, self, *arguments):
@@ -420,27 +368,37 @@ def round_the_rates_of_reactions_to_float32(package):
 
 # ---- How they are planted and noticed ----
 
+MUTANTS = {
+    name.replace("_", " "): plant
+    for name, plant in list(globals().items())
+    if inspect.isfunction(plant) and [*inspect.signature(plant).parameters] == ["package"]
+}
+
 
 def pytest_sessionstart():
     """As a plugin: plants the defect that the environment names."""
     MUTANTS[os.environ["DEFECT"]](Package(pytest.MonkeyPatch()))
 
 
-def unselected(name: str) -> str | None:
-    """The `-k` of a defect, if it selects no fast test of its file."""
-    file, *selection = TESTS[name]
+def finder(name: str) -> str:
+    """The test that must notice a defect, by the table."""
+    rows = re.findall(r"^\| (.+?) \| (tests/.+) \|$", TABLE.read_text("utf-8"), re.MULTILINE)
+    return dict(rows)[name]
+
+
+def is_fast(test: str) -> bool:
+    """Whether there is such a test, and it is not slow."""
+    file, _, name = test.partition("[")[0].partition("::")
     parts = (ROOT / file).read_text(encoding="utf-8").split("\n\n\n")
-    fast = (x for x in parts if not re.search(r"^@(pytest\.mark\.slow|SLOW)$", x, re.MULTILINE))
-    tests = re.findall(r"^def (test_\w+)", "\n".join(fast), re.MULTILINE)
-    word = selection[-1] if selection else "test_"
-    return None if any(word in test for test in tests) else word
+    (part,) = [part for part in parts if f"def {name}(" in part] or ["@pytest.mark.slow"]
+    return not re.search(r"^@(pytest\.mark\.slow|SLOW)$", part, re.MULTILINE)
 
 
 def found_by(name: str) -> str | None:
     """The first fast test that fails because of a defect; `None` if the defect survives."""
     command = [sys.executable, "-m", "pytest", "-p", "tests.mutants", "-p", "no:cacheprovider"]
     run = subprocess.run(
-        [*command, "-x", "-q", "-m", "not slow and not examples", *TESTS[name]],
+        [*command, "-x", "-q", "-m", "not slow and not examples", finder(name).partition("[")[0]],
         cwd=ROOT,
         env={**os.environ, "DEFECT": name, "CI": "1"},
         capture_output=True,
@@ -467,7 +425,7 @@ def main() -> int:
     noticed = [test for test in found.values() if test]
     print(f"{len(noticed)} of {len(found)} defects noticed")
     if list(found) == list(MUTANTS):
-        rows = (f"| {name} | {test or '**none**'} |\n" for name, test in found.items())
+        rows = (f"| {name} | {test or finder(name)} |\n" for name, test in found.items())
         TABLE.write_text(TITLE + "".join(rows), encoding="utf-8")
     return 0 if len(noticed) == len(found) else 1
 
