@@ -15,23 +15,12 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 
 from .. import problems
-from ..learned import DRIVEN0, EAST, LORENZ, Still, Within, flow_map, states, unchecked
+from ..learned import DRIVEN0, EAST, LORENZ, Rotation, Still, Within, flow_map, states, unchecked
 from ..problems import oscillator, refused
 from ..thinned import some_of
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
-
-
-class Rotation(eqx.Module):
-    """The exact flow map of the oscillator, but for an error in proportion to the step."""
-
-    error: float = 0.0
-    max_step: float = 0.5
-
-    def __call__(self, y0, h):
-        c, s = jnp.cos(h), jnp.sin(h)
-        return jnp.stack([c * y0[0] + s * y0[1], c * y0[1] - s * y0[0]]) + self.error * h
 
 
 # The rotation from (1, 0) leaves it between the third and the fourth step of length 0.5.

@@ -14,7 +14,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from .. import problems
-from ..learned import LORENZ, flow_map, solution, unchecked
+from ..learned import LORENZ, Still, flow_map, solution, unchecked
 from ..problems import refused
 from ..thinned import some_of
 
@@ -94,12 +94,6 @@ def test_backsolve_adjoint_explains(name):
 
 
 def test_a_largest_step_that_is_an_array(errors_raise):
-    class Still(eqx.Module):
-        max_step: jax.Array
-
-        def __call__(self, y0, h):
-            return y0 + 0 * h
-
     still = unchecked(Still(jnp.array(0.25)))
     with pytest.raises(RuntimeError, match="a step is longer than the flow map was trained for"):
         jax.block_until_ready(solve(still, dt0=0.5).ys)

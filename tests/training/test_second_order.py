@@ -13,22 +13,10 @@ import diffrax_conserve as dfc
 from diffrax_conserve.learned._networks.cores import Gated
 from diffrax_conserve.learned._training.second_order import _by_gram_matrix, _by_triangular_factor
 
-from ..learned import EAST, LORENZ, SMALL, flow_map, states
+from ..learned import LORENZ, SMALL, error_of_turning, flow_map, states, turning
 from ..problems import oscillator
 
 KEY = jr.key(5)
-
-
-def turns(t1, seed=0, unit=1.0, **options):
-    """A PINN for the rotation, of the shape that Levenberg-Marquardt is made for."""
-    sizes = dict(width=30, depth=1, slope=2.0)
-    return dfc.PINN(unit * EAST, 0.0, t1, key=jr.key(seed), **(sizes | options))
-
-
-def error(pinn, unit=1.0):
-    ts = jnp.linspace(0, pinn.t1, 50)
-    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
-    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) / unit - exact)))
 
 
 # ---- One update, against what it is defined to be ----
@@ -83,8 +71,8 @@ def test_the_update_in_single_precision_is_that_in_double(shape):
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-20, 1e15])
 def test_a_window_is_learned_to_ten_digits_in_any_unit(unit):
-    pinn, log = dfc.fit(turns(3.0, unit=unit), oscillator, key=KEY)
-    assert error(pinn, unit) < 1e-8
+    pinn, log = dfc.fit(turning(unit=unit, width=30), oscillator, key=KEY)
+    assert error_of_turning(pinn, unit) < 1e-8
     assert log.criteria.min() < 1e-15 * unit**2
     assert log.skipped == 0
 
@@ -108,8 +96,8 @@ def test_a_flow_map_does_not_depend_on_the_units_of_components():
 
 @pytest.mark.slow
 def test_the_recipe_goes_by_size():
-    made = eqx.filter_jit(turns)  # in one program
-    small = dfc.learned.second_order(made(3.0, windows=5))
+    made = eqx.filter_jit(turning)  # in one program
+    small = dfc.learned.second_order(made(3.0, width=30, windows=5))
     assert small.optimiser == "levenberg-marquardt"
     large = dfc.learned.second_order(made(3.0, width=40, depth=4))
     assert large.optimiser == "spring"

@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import EAST, LORENZ, flow_map
+from ..learned import EAST, LORENZ, error_of_turning, flow_map, turning
 from ..problems import oscillator, refused
 
 KEY = jr.key(5)
@@ -25,20 +25,9 @@ def pair_oscillator(t, y, args):
     return {"q": 1e-9 * y["p"], "p": -1e9 * y["q"]}
 
 
-def pinn(t1=3.0, windows=1, seed=0, **options):
-    sizes = dict(width=12, depth=1, slope=2.0)
-    return dfc.PINN(EAST, 0.0, t1, windows=windows, key=jr.key(seed), **(sizes | options))
-
-
 def recipe(network, epochs=5, **options):
     found = dfc.learned.second_order(network, epochs=epochs)
     return dataclasses.replace(found, **(dict(points=40, check_every=5) | options))
-
-
-def true_error(network):
-    ts = jnp.linspace(network.t0, network.t1, 400)
-    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
-    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(network))(ts) - exact)))
 
 
 @pytest.mark.slow
@@ -71,17 +60,17 @@ def test_the_estimate_of_a_flow_map_is_its_error():
 @pytest.mark.slow
 def test_a_window_that_failed_is_trained_until_it_is_right():
     """Three turns in one window are too many for so few units."""
-    network = pinn(t1=20.0, width=20)
+    network = turning(t1=20.0, width=20)
     once = recipe(network, 40, points=80, retries=0)
     with pytest.warns(UserWarning, match=r"Window 0 of 1, from 0 to 20, has an estimated error"):
         trained, log = dfc.fit(network, oscillator, key=KEY, recipe=once)
-    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.02)
+    np.testing.assert_allclose(log.error, error_of_turning(trained), rtol=0.02)
     assert log.error > 1e-2
     again = recipe(network, 40, points=80)
     trained, log = dfc.fit(network, oscillator, key=KEY, recipe=again, target=1e-5)
     assert log.ended == "target"
     assert trained.windows == log.errors.size > 1
-    np.testing.assert_allclose(log.error, true_error(trained), rtol=0.05, atol=1e-12)
+    np.testing.assert_allclose(log.error, error_of_turning(trained), rtol=0.05, atol=1e-12)
     assert log.error < 1e-5
 
 
@@ -93,14 +82,14 @@ def taught(field=LORENZ.vector_field, make=flow_map, sample=LORENZ.sample, **opt
     def teach():
         network = make()
         chosen = dict(recipe=recipe(network, points=30)) | options
-        dfc.fit(network, field, key=KEY, sample=None if make is pinn else sample, **chosen)
+        dfc.fit(network, field, key=KEY, sample=None if make is turning else sample, **chosen)
 
     return teach
 
 
 test_what_cannot_be_learned_is_refused = refused(
     (
-        taught(lambda t, y, args: jnp.nan * y, pinn),
+        taught(lambda t, y, args: jnp.nan * y, turning),
         ValueError,
         "not finite at 1 of 1 initial states",
     ),
@@ -108,7 +97,7 @@ test_what_cannot_be_learned_is_refused = refused(
     (taught(lambda t, y, args: jnp.cos(t) * y), ValueError, "depends on time.*autonomous"),
     (taught(lambda t, y, args: jnp.where(t > 5, 2.0, 1.0) * y), ValueError, "depends on time"),
     (
-        taught(lambda t, y, args: jnp.ones(3), pinn),
+        taught(lambda t, y, args: jnp.ones(3), turning),
         ValueError,
         r"returns the structure \(3,\).*has \(2,\)",
     ),
@@ -123,11 +112,11 @@ test_what_cannot_be_learned_is_refused = refused(
 @pytest.mark.slow
 def test_a_layer_that_cannot_be_kept_is_told():
     wrong = dfc.FirstIntegral(lambda t, y, args: y[0] ** 2 + 2 * y[1] ** 2)
-    network = pinn(layer=dfc.learned.ConservativeLayer(wrong))
+    network = turning(layer=dfc.learned.ConservativeLayer(wrong))
     with pytest.warns(UserWarning, match="does not conserve `manifold` of the `layer`"):
         dfc.fit(network, oscillator, key=KEY, recipe=recipe(network, retries=0))
     root = dfc.FirstIntegral(lambda t, y, args: jnp.log(-y[0]))
-    network = pinn(layer=dfc.learned.ConservativeLayer(root))
+    network = turning(layer=dfc.learned.ConservativeLayer(root))
     with pytest.raises(ValueError, match="values of the `layer` are not finite at 1 of 1 initial"):
         dfc.fit(network, oscillator, key=KEY)
 
@@ -138,7 +127,7 @@ def test_a_training_without_an_update_is_an_error():
     def trap(t, y, args):
         return jnp.where(jnp.all(y == EAST), 1.0, jnp.nan) * oscillator(t, y, args)
 
-    network = pinn()
+    network = turning()
     chosen = dfc.learned.Recipe(epochs=4, points=10, optimiser=optax.adam(1e-3))
     with pytest.raises(FloatingPointError, match="None of the 4 updates was finite"):
         dfc.fit(network, trap, key=KEY, recipe=chosen)
@@ -173,7 +162,7 @@ def small_flow_map():
 
 def small_pinn():
     """Whose second window is trained again and cut, before it is right."""
-    network = pinn(t1=12.0, windows=2)
+    network = turning(t1=12.0, windows=2)
     return network, dict(vector_field=oscillator, key=KEY, recipe=recipe(network, 20, retries=3))
 
 
