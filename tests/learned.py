@@ -156,6 +156,7 @@ SAVED = {
         2,
     ),
     "single": lambda: in_single(saved("deeponet")),
+    "half": lambda: jax.tree.map(lambda x: x.astype(jnp.bfloat16), saved("deeponet")),
 }  # fmt: skip
 
 

@@ -31,20 +31,16 @@ def test_relaxation_keeps_the_energy_at_every_saved_time():
     np.testing.assert_allclose(kept, np.sum(np.exp(EXPONENTIAL0)), rtol=4e-15)
 
 
-def carrying(t, y, args):
-    """The field with its time as a component."""
-    return {"y": exponential(t, y["y"], args), "time": jnp.ones(())}
-
-
 @some_of("inner, order", [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"], period=2)
 def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(inner, order):
     kept = dfc.FirstIntegral(lambda t, y, args: ENERGY.fn(t, y["y"], args))
+    field = lambda t, y, args: {"y": exponential(t, y["y"], args), "time": jnp.ones(())}  # noqa: E731
     solver = dfc.ManifoldProjection(inner, kept, projection=STEP)
     y0 = {"y": EXPONENTIAL0, "time": jnp.zeros(())}
 
     @jax.jit
     def errors(h):
-        ys = dfx.diffeqsolve(dfx.ODETerm(carrying), solver, 0.0, 2.0, h, y0).ys
+        ys = dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 2.0, h, y0).ys
         y, time = ys["y"][-1], ys["time"][-1]
         exact = exponential_solution(2.0), exponential_solution(time)
         return jnp.stack([jnp.max(jnp.abs(y - other)) for other in exact])
