@@ -17,12 +17,8 @@ from ..thinned import some_of
 GRAVITY = np.array([0.0, -1.0])
 
 
-def links(t, q, args):
-    return jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2)))
-
-
 def rods(t, q, args):
-    return jnp.sum(links(t, q, args) ** 2, axis=1) - 1
+    return jnp.sum(jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2))) ** 2, axis=1) - 1
 
 
 def loop(t, q, args):

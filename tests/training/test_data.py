@@ -34,10 +34,6 @@ def network():
     return dfc.DeepONet(Y0S, 0.5, key=jr.key(0), core="concatenated", **SMALL)
 
 
-def explosive(t, y, args):
-    return y**2
-
-
 def test_every_pair_of_times_within_a_step_is_drawn_and_no_other():
     ts = np.array([[0.0, 0.2, 0.5, 0.6]])  # the longest step is 0.5
     pairs = as_data((ts, np.stack([ts, 2 * ts], axis=2)), network()).draw(1000, KEY)
@@ -53,7 +49,7 @@ def test_trajectories_are_solutions():
     np.testing.assert_array_equal(ts, TS[:4])
     np.testing.assert_allclose(ys, EXACT[:4], rtol=0, atol=1e-8)
     solve = lambda y0s: dfc.learned.trajectories(  # noqa: E731
-        explosive, jnp.array(y0s), [0.0, 0.5, 1.0], solver=dfx.Tsit5()
+        lambda t, y, args: y**2, jnp.array(y0s), [0.0, 0.5, 1.0], solver=dfx.Tsit5()
     )
     ts, ys = solve([0.5, 2.0])
     # The other one ends in finite time.
