@@ -16,11 +16,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._solver.diffrax_private import member, register
 
 from .learned import LORENZ, flow_map, unchecked
 
@@ -182,6 +184,23 @@ def test_private_names_of_other_packages_are_those_allowed():
         if is_private(name)
     }
     assert used == PRIVATE_ALLOWED
+
+
+def test_a_registered_message_is_a_result_like_those_of_diffrax(errors_raise):
+    """Fails when diffrax keeps its messages otherwise."""
+    messages = dfx.RESULTS._index_to_message
+    before = list(messages)
+    try:
+        first = register("the moon is in the way")
+        assert messages == [*before, "diffrax_conserve: the moon is in the way"]
+        result = eqx.filter_jit(member)(jnp.asarray(first))
+        assert dfx.RESULTS[result] == messages[-1]
+        assert dfx.RESULTS[dfx.RESULTS.successful] == ""
+        chosen = dfx.RESULTS.where(result != dfx.RESULTS.successful, result, dfx.RESULTS.successful)
+        with pytest.raises(RuntimeError, match="diffrax_conserve: the moon is in the way"):
+            chosen.error_if(jnp.ones(1), chosen == result).block_until_ready()
+    finally:
+        del messages[len(before) :]
 
 
 # ---- A new interpreter, without the settings of the tests ----

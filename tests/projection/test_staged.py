@@ -1,6 +1,5 @@
 """Projection part by part."""
 
-import diffrax as dfx
 import equinox as eqx
 import hypothesis.strategies as st
 import jax.numpy as jnp
@@ -11,16 +10,9 @@ from hypothesis import given, settings
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import refused, solve
+from ..problems import refused
 
-GRAVITY = 13.7503716373294544  # that of cvPendulum: the period is 2
 INF = jnp.inf
-
-
-def pendulum(t, y, args):
-    q, v = y
-    tension = jnp.sum(v**2) - args * q[1]
-    return v, -q * tension - jnp.stack([jnp.zeros_like(args), args])
 
 
 MANIFOLD = {
@@ -65,16 +57,6 @@ def test_what_an_earlier_stage_reached_is_held():
     found, info = dfc.project((radius, total), 1.01 * y, value=(1.29, 1.117), projection=staged)
     assert info.ok
     np.testing.assert_allclose([found @ found, jnp.sum(found**3)], [1.29, 1.117], rtol=4e-15)
-
-
-def test_saved_states_are_on_both():
-    # The simplest of all solvers, as it is the projection that is in question.
-    solver = dfc.ManifoldProjection(dfx.Euler(), MANIFOLD, projection=STAGED)
-    saveat = dfx.SaveAt(ts=jnp.linspace(0, 2, 41))
-    sol = solve(pendulum, solver, Y0, args=GRAVITY, t1=2.0, dt0=0.02, saveat=saveat)
-    q, v = map(np.asarray, sol.ys)
-    np.testing.assert_allclose(np.sum(q**2, axis=1), 1, rtol=0, atol=4e-15)
-    np.testing.assert_allclose(np.sum(q * v, axis=1), 0, rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._solver.diffrax_private import member, register
 
 from ..problems import oscillator, solve
 from ..thinned import some_of
@@ -242,20 +241,3 @@ def test_a_constraint_that_jumps_is_told_at_a_declared_jump():
     assert CANNOT_START in told
     assert "`project`, and go on" in told
     assert result(1.0) == dfx.RESULTS.successful
-
-
-def test_a_registered_message_is_a_result_like_those_of_diffrax(errors_raise):
-    """Fails when diffrax keeps its messages otherwise."""
-    messages = dfx.RESULTS._index_to_message
-    before = list(messages)
-    try:
-        first = register("the moon is in the way")
-        assert messages == [*before, "diffrax_conserve: the moon is in the way"]
-        result = eqx.filter_jit(member)(jnp.asarray(first))
-        assert dfx.RESULTS[result] == messages[-1]
-        assert dfx.RESULTS[dfx.RESULTS.successful] == ""
-        chosen = dfx.RESULTS.where(result != dfx.RESULTS.successful, result, dfx.RESULTS.successful)
-        with pytest.raises(RuntimeError, match="diffrax_conserve: the moon is in the way"):
-            chosen.error_if(jnp.ones(1), chosen == result).block_until_ready()
-    finally:
-        del messages[len(before) :]
