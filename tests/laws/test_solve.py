@@ -16,7 +16,7 @@ import diffrax_conserve.testing as dct
 from .. import problems
 from ..problems import EPS, RIGID_BODY, final, rigid_body
 from ..thinned import some_of
-from .common import PARALLEL, SYSTEMS, check, every_law_on_every_system, inputs, project, within
+from .common import PARALLEL, SYSTEMS, every_law_on_every_system, project, within
 
 STEPS = 8
 
@@ -55,14 +55,9 @@ def there_and_back_again(system, y, displacement):
     return okay(there, back), final(back), jax.tree.map(jnp.asarray, y)
 
 
-@every_law_on_every_system(
+test_law = every_law_on_every_system(
     [the_negative_field_backwards_is_the_field_forwards, there_and_back_again]
 )
-@settings(max_examples=6)
-@given(data=st.data())
-def test_law(law, name, data):
-    system = SYSTEMS[name]
-    check(law, system, data.draw(inputs(system)))
 
 
 @eqx.filter_jit
@@ -114,12 +109,7 @@ def on_the_manifold_it_is_the_orthogonal_projector_that_keeps_the_flow(system, y
 LAW = on_the_manifold_it_is_the_orthogonal_projector_that_keeps_the_flow
 
 
-@every_law_on_every_system([LAW], skip={(LAW.__name__, PARALLEL)})
-@settings(max_examples=6)
-@given(data=st.data())
-def test_derivative(law, name, data):
-    system = SYSTEMS[name]
-    check(law, system, data.draw(inputs(system)))
+test_derivative = every_law_on_every_system([LAW], skip={(LAW.__name__, PARALLEL)})
 
 
 def balancing(t, y, args):
