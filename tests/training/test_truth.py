@@ -39,7 +39,7 @@ def test_each_leaf_counts_in_its_own_units():
         jnp.max(jnp.abs(found["q"] - 1e-3 * jnp.cos(ts))) / jnp.max(jnp.abs(found["q"])),
         jnp.max(jnp.abs(found["p"] / 1e6 + jnp.sin(ts))),
     ]
-    np.testing.assert_allclose(log.error, max(errors), rtol=0.02)
+    np.testing.assert_allclose(log.error, np.max(errors), rtol=0.02)
     assert log.error < 1e-3
 
 
