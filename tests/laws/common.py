@@ -67,17 +67,13 @@ def displaced(y, displacement, size=1e-3):
     return jax.tree.map(move, y, displacement)
 
 
-def is_entry(x):
-    return isinstance(x, dfc.FirstIntegral | dfc.Constraint)
-
-
 def project(manifold, candidate, y, projection=None):
     """`candidate` projected to the level set of `y`, and whether that succeeded."""
     projection = dfc.SimplifiedNewton() if projection is None else projection
     value = jax.tree.map(
         lambda entry: entry.fn(0.0, y, None) if isinstance(entry, dfc.FirstIntegral) else None,
         manifold,
-        is_leaf=is_entry,
+        is_leaf=lambda x: isinstance(x, dfc.FirstIntegral | dfc.Constraint),
     )
     out, info = dfc.project(manifold, candidate, value=value, projection=projection)
     return out, info.result == optx.RESULTS.successful

@@ -112,21 +112,15 @@ LAW = on_the_manifold_it_is_the_orthogonal_projector_that_keeps_the_flow
 test_derivative = every_law_on_every_system([LAW], skip={(LAW.__name__, PARALLEL)})
 
 
-def balancing(t, y, args):
-    rate, angle = args
-    return jnp.stack([y[1], -jnp.sin(rate * y[0] - angle)])
-
-
-def balancing_energy(t, y, args):
-    rate, angle = args
-    return y[1] ** 2 / 2 - jnp.cos(rate * y[0] - angle) / rate
+lean = lambda y, args: args[0] * y[0] - args[1]  # noqa: E731
+BALANCING = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -jnp.sin(lean(y, args))]))
+LEANING = dfc.FirstIntegral(lambda t, y, a: y[1] ** 2 / 2 - jnp.cos(lean(y, a)) / a[0])
 
 
 @eqx.filter_jit
 def sensitivity(solver, y0, args):
     def end(y0):
-        sol = dfx.diffeqsolve(dfx.ODETerm(balancing), solver, 0, 0.5, 0.05, y0, args)
-        return sol.ys[-1]
+        return dfx.diffeqsolve(BALANCING, solver, 0, 0.5, 0.05, y0, args).ys[-1]
 
     return jax.jacrev(end)(y0)
 
@@ -142,7 +136,7 @@ def test_a_start_near_an_unstable_equilibrium(rate, angle, exponent, side):
     """The gradient of the energy is small there."""
     args, distance = jnp.array([rate, angle]), side * 10**exponent
     y0 = jnp.array([(angle + jnp.pi) / rate + distance, 0.0])
-    projected = dfc.ManifoldProjection(dfc.RK4(), dfc.FirstIntegral(balancing_energy))
+    projected = dfc.ManifoldProjection(dfc.RK4(), LEANING)
     found, plain = (sensitivity(solver, y0, args) for solver in (projected, dfc.RK4()))
     if abs(distance) > 1e-4:
         assert jnp.all(jnp.isfinite(found))

@@ -157,12 +157,6 @@ def small_flow_map():
     )
 
 
-def small_pinn():
-    """Whose second window is trained again and cut, before it is right."""
-    network = turning(t1=12.0, windows=2)
-    return network, dict(vector_field=oscillator, key=KEY, recipe=recipe(network, 20, retries=3))
-
-
 def same(found, expected):
     (model, log), (other, other_log) = found, expected
     assert eqx.tree_equal(model, other)
@@ -190,7 +184,9 @@ def test_a_training_goes_on_from_a_file(tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_training_goes_on():
-    network, options = small_pinn()
+    """Whose second window is trained again and cut, before it is right."""
+    network = turning(t1=12.0, windows=2)
+    options = dict(vector_field=oscillator, key=KEY, recipe=recipe(network, 20, retries=3))
     whole = dfc.fit(network, **options)
     model, state, stops = network, None, Interrupt(4, 45)
     for _ in range(3):
