@@ -220,10 +220,9 @@ def solved(flow_map, args, check_field=False, term=TERM, saveat=END, **options):
     return dfx.diffeqsolve(term, solver, 0.0, 2.0, 0.5, Y0, args, **options)
 
 
-@pytest.mark.parametrize("order", [0, 1])
-@pytest.mark.parametrize("core", CORES)
-def test_it_starts_at_its_state_and_sees_all_args(core, order):
-    flow_map = family(order, core=core)
+@KINDS
+def test_it_starts_at_its_state_and_sees_all_args(core):
+    flow_map = family(core=core)
 
     @jax.jit
     def found(h):
