@@ -74,13 +74,6 @@ def test_statistics_need_the_solver_state():
 # ---- Every way to save, to stop, and to choose steps that diffrax has ----
 
 
-SOLVER = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
-
-
-def saved(saveat, **kwargs):
-    return solve(rigid_body, SOLVER, OMEGA0, saveat=saveat, **kwargs)
-
-
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 
 
@@ -96,7 +89,11 @@ ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 def test_every_controller_hits_its_times_on_the_manifold(controller, times):
     dt0 = None if isinstance(controller, dfx.StepTo) else 0.1
     options = dict(stepsize_controller=controller, dt0=dt0, max_steps=64)
-    sol = saved(dfx.SaveAt(t0=True, steps=True), **options)
+    solver, saveat = (
+        dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY),
+        dfx.SaveAt(t0=True, steps=True),
+    )
+    sol = solve(rigid_body, solver, OMEGA0, saveat=saveat, **options)
     assert largest(drift_of(sol, RIGID_BODY)) <= 4e-16
     for t in times:
         assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6
