@@ -59,6 +59,34 @@ class Still(eqx.Module):
         return jax.tree.map(lambda x: x + 0 * h, y0)
 
 
+class Rotation(eqx.Module):
+    """The exact flow map of a spring of some stiffness, but for an error in proportion to the step;
+    with `bend` = -1 its derivative by the stiffness points the wrong way at 1."""
+
+    off: float = 0.0
+    bend: float = 1.0
+    max_step: float = 0.5
+    args_domain: Any = None
+
+    def __call__(self, y0, *step):
+        *stiffness, h = step
+        w = jnp.sqrt(1 + self.bend * (stiffness[0] - 1)) if stiffness else 1.0
+        c, s = jnp.cos(w * h), jnp.sin(w * h)
+        return jnp.stack([c * y0[0] + s / w * y0[1], c * y0[1] - w * s * y0[0]]) + self.off * h
+
+
+def turning(t1=3.0, unit=1.0, **options):
+    """A PINN for `oscillator` from the east."""
+    sizes = dict(width=12, depth=1, slope=2.0, key=jr.key(0))
+    return dfc.PINN(unit * EAST, 0.0, t1, **(sizes | options))
+
+
+def error_of_turning(pinn, unit=1.0):
+    ts = jnp.linspace(pinn.t0, pinn.t1, 400)
+    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
+    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) / unit - exact)))
+
+
 class Within(eqx.Module):
     """A flow map that knows its domain."""
 
@@ -128,6 +156,7 @@ SAVED = {
         2,
     ),
     "single": lambda: in_single(saved("deeponet")),
+    "half": lambda: jax.tree.map(lambda x: x.astype(jnp.bfloat16), saved("deeponet")),
 }  # fmt: skip
 
 

@@ -1,17 +1,18 @@
-"""Plants a defect in each trap of the design, one at a time, and runs tests that must notice.
+"""Plants a defect in each trap of the design, one at a time, and runs the test that must notice.
 
-`make mutants`, or `python tests/mutants.py [NAME ...]`. Prints, for each defect, the first test
-that fails; exits with status 1 if any defect survives. When all are planted, `mutants.md` is
-written, with a line for each.
+`make mutants`, or `python tests/mutants.py [NAME ...]`. Prints, for each defect, what fails; exits
+with status 1 if any defect survives. `mutants.md` says which test must notice which defect, and is
+written anew when all are planted.
 
-A defect is a function that replaces functions and methods of the package, which it finds by their
-names wherever they are. The tests that must notice run with this file as a pytest plugin, which
-plants the defect before any test is imported.
+A defect is a function of a `package`, which replaces functions and methods that it finds by their
+names wherever they are. The test runs with this file as a pytest plugin, which plants the defect
+before any test is imported.
 """
 
 import contextlib
 import dataclasses
 import importlib
+import inspect
 import os
 import re
 import subprocess
@@ -37,8 +38,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "diffrax_conserve"
 TABLE = Path(__file__).with_suffix(".md")
 TITLE = "What `make mutants` found.\n\n| defect | first test that fails |\n|---|---|\n"
-MUTANTS: dict[str, Callable[["Package"], None]] = {}
-TESTS: dict[str, tuple[str, ...]] = {}
 
 
 class Package:
@@ -62,254 +61,181 @@ class Package:
             raise LookupError(f"{PACKAGE} defines {len(found)} functions or classes named {name}")
         return next(iter(found.values()))
 
-    def method(self, name: str, mutate: Callable[[Any], Any]) -> None:
-        """Replaces `Class.method` by what `mutate` makes of it."""
-        owner, _, attribute = name.partition(".")
-        cls = self.find(owner)
-        if attribute not in vars(cls):
-            raise LookupError(f"{owner} defines no {attribute}")
-        self.patch.setattr(cls, attribute, mutate(vars(cls)[attribute]))
-
-    def function(self, name: str, mutate: Callable[[Any], Any]) -> None:
-        """Replaces a function in every module that imports it."""
+    def replace(self, name: str, new: Any) -> None:
+        """Puts `new` in the place of `Class.attribute`, or of a function in all that import it."""
+        owner, _, attribute = name.rpartition(".")
+        if owner:
+            if attribute not in vars(cls := self.find(owner)):
+                raise LookupError(f"{owner} defines no {attribute}")
+            self.patch.setattr(cls, attribute, new)
+            return
         old = self.find(name)
-        new = mutate(old)
         for module in self.modules:
-            for attribute, value in list(vars(module).items()):
-                if value is old:
-                    self.patch.setattr(module, attribute, new)
+            for attribute in [key for key, value in vars(module).items() if value is old]:
+                self.patch.setattr(module, attribute, new)
+
+    def around(self, name: str) -> Callable:
+        """Decorates what is called in the place of a function or method, with the old one first."""
+        owner, _, attribute = name.rpartition(".")
+        old = vars(self.find(owner)).get(attribute) if owner else self.find(name)
+        return lambda new: self.replace(name, lambda *x, **y: new(old, *x, **y))
 
     def in_module_of(self, name: str, attribute: str, value: Any) -> None:
         """Replaces what the module that defines `name` calls `attribute`."""
         self.patch.setattr(sys.modules[self.find(name).__module__], attribute, value)
 
 
-def noticed_by(*tests: str) -> Callable:
-    """Marks a defect. `tests` are the arguments for pytest."""
-
-    def register(plant: Callable[[Package], None]) -> Callable[[Package], None]:
-        name = plant.__name__.replace("_", " ")
-        MUTANTS[name], TESTS[name] = plant, tests
-        return plant
-
-    return register
-
-
 # ---- The core ----
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "either_direction")
 def drop_the_sign_of_time(package):
-    package.function("time_direction", lambda _: lambda terms, t: jnp.ones((), jnp.result_type(t)))
+    package.replace("time_direction", lambda terms, t: jnp.ones((), jnp.result_type(t)))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "adjoints_agree")
 def drop_scan_kind(package):
-    package.method("ForwardingSolver.scan_kind", lambda _: property(lambda self: None))
+    package.replace("ForwardingSolver.scan_kind", property(lambda self: None))
 
 
-@noticed_by("tests/solver/test_conformance.py", "-k", "every_solver")
 def drop_root_finder(package):
     detached = property(lambda self: diffrax.VeryChord(rtol=1e-3, atol=1e-3))
-    package.method("ForwardingSolver.root_finder", lambda _: detached)
+    package.replace("ForwardingSolver.root_finder", detached)
 
 
-@noticed_by("tests/laws/test_solve.py", "-k", "succeeds_is_conserved")
 def do_not_project_the_interpolant(package):
-    def evaluate(self, t0, t1=None, left=True):
+    @package.around("ManifoldInterpolation.evaluate")
+    def _(old, self, t0, t1=None, left=True):
         return self.inner.evaluate(t0, t1, left)
 
-    package.method("ManifoldInterpolation.evaluate", lambda _: evaluate)
 
-
-@noticed_by("tests/solver/test_failure.py", "-k", "without_hope")
 def call_nan_a_success(package):
-    def mutate(level):
-        return lambda self, *values: level(
-            self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values)
-        )
-
-    package.method("Equations.level", mutate)
+    @package.around("Equations.level")
+    def _(level, self, *values):
+        return level(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "continued_solve")
 def take_the_conserved_value_anew_at_every_step(package):
     conserved_values = package.find("conserved_values")
 
-    def mutate(step):
-        def mutated(self, terms, t0, t1, y0, args, state, made_jump):
-            values = conserved_values(self.manifold, t0, y0, args)
-            values = jax.flatten_util.ravel_pytree(values)[0]
-            state = eqx.tree_at(lambda s: s.values, state, values)
-            return step(self, terms, t0, t1, y0, args, state, made_jump)
-
-        return mutated
-
-    package.method("ManifoldProjection.step", mutate)
+    @package.around("ManifoldProjection.step")
+    def _(step, self, terms, t0, t1, y0, args, state, made_jump):
+        values = conserved_values(self.manifold, t0, y0, args)
+        values = jax.flatten_util.ravel_pytree(values)[0]
+        state = eqx.tree_at(lambda s: s.values, state, values)
+        return step(self, terms, t0, t1, y0, args, state, made_jump)
 
 
 def _inner_step(self, terms, t0, t1, y0, args, state, _):
     return self.solver.step(terms, t0, t1, y0, args, state.inner, True)
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "retried")
 def accept_a_step_whose_projection_failed(package):
-    def mutate(step):
-        def mutated(*arguments):
-            y, _, dense_info, state, result = step(*arguments)
-            return y, _inner_step(*arguments)[1], dense_info, state, result
-
-        return mutated
-
-    package.method("ManifoldProjection.step", mutate)
+    @package.around("ManifoldProjection.step")
+    def _(step, *arguments):
+        y, _, *rest = step(*arguments)
+        return y, _inner_step(*arguments)[1], *rest
 
 
-@noticed_by("tests/solver/test_failure.py")
 def report_a_failed_projection_as_a_success(package):
-    def mutate(step):
-        return lambda *arguments: (*step(*arguments)[:-1], _inner_step(*arguments)[-1])
+    @package.around("ManifoldProjection.step")
+    def _(step, *arguments):
+        return *step(*arguments)[:-1], _inner_step(*arguments)[-1]
 
-    package.method("ManifoldProjection.step", mutate)
 
-
-@noticed_by("tests/solver/test_failure.py", "-k", "max_correction")
 def ignore_max_correction(package):
-    def mutate(step):
-        def mutated(self, *arguments):
-            limit = lambda s: s.max_correction  # noqa: E731
-            return step(eqx.tree_at(limit, self, None, is_leaf=lambda x: x is None), *arguments)
-
-        return mutated
-
-    package.method("ManifoldProjection.step", mutate)
+    @package.around("ManifoldProjection.step")
+    def _(step, self, *arguments):
+        limit = lambda s: s.max_correction  # noqa: E731
+        return step(eqx.tree_at(limit, self, None, is_leaf=lambda x: x is None), *arguments)
 
 
-@noticed_by("tests/projection/test_derivatives.py", "-k", "finite_differences")
 def forget_the_curvature_in_the_derivative(package):
-    def mutate(solve):
-        def mutated(self, problem, candidate):
-            y, info = lax.stop_gradient(solve(self, problem, candidate))
-            moved = y + candidate - lax.stop_gradient(candidate)
-            # The multipliers follow the candidate, but not the direction in which they move it.
-            inverse = jnp.linalg.pinv(lax.stop_gradient(jax.jacobian(problem.residual)(y)))
-            return moved - inverse @ problem.residual(moved), info
-
-        return mutated
-
-    package.method("SimplifiedNewton.solve", mutate)
+    @package.around("SimplifiedNewton.solve")
+    def _(solve, self, problem, candidate):
+        y, info = lax.stop_gradient(solve(self, problem, candidate))
+        moved = y + candidate - lax.stop_gradient(candidate)
+        # The multipliers follow the candidate, but not the direction in which they move it.
+        inverse = jnp.linalg.pinv(lax.stop_gradient(jax.jacobian(problem.residual)(y)))
+        return moved - inverse @ problem.residual(moved), info
 
 
-@noticed_by("tests/projection/test_laws.py", "-k", "lane_of_a_batch")
 def leave_a_lane_of_a_batch_unfinished(package):
     wrong = SimpleNamespace(**{**vars(jnp), "any": jnp.all})
     package.in_module_of("_any_lane", "jnp", wrong)
 
 
-@noticed_by("tests/laws/test_never_silent.py", "-k", "success_means")
 def decide_success_by_the_scale_at_the_candidate(package):
-    def mutate(solve):
-        def mutated(self, problem, candidate):
-            equations = problem.equations
-            scale = equations.scale(equations.linearise(candidate)[1], candidate)
-            limit = 16 * jnp.finfo(candidate.dtype).eps * scale
-            equations = dataclasses.replace(equations, rtol=0.0, atol=limit)
-            return solve(self, dataclasses.replace(problem, equations=equations), candidate)
-
-        return mutated
+    def wrong(solve, self, problem, candidate):
+        equations = problem.equations
+        scale = equations.scale(equations.linearise(candidate)[1], candidate)
+        limit = 16 * jnp.finfo(candidate.dtype).eps * scale
+        equations = dataclasses.replace(equations, rtol=0.0, atol=limit)
+        return solve(self, dataclasses.replace(problem, equations=equations), candidate)
 
     for name in ("SimplifiedNewton", "Newton"):
-        package.method(f"{name}.solve", mutate)
+        package.around(f"{name}.solve")(wrong)
     # One more iteration would bring such a state to roundoff after all.
-    package.function("after_test", lambda test: lambda *x, **y: test(*x, **y | {"polish": False}))
+    package.around("after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "satellites")
 def polish_along_nearly_parallel_gradients(package):
-    package.function("corrected", lambda given: lambda *x, least=None: given(*x))
+    package.around("corrected")(lambda given, *x, least=None: given(*x))
 
 
-@noticed_by("tests/laws/test_never_silent.py", "-k", "parallel")
 def divide_by_every_pivot_in_derivatives(package):
-    package.function("least_pivot", lambda _: lambda rows: 0.0)
+    package.replace("least_pivot", lambda rows: 0.0)
 
 
-@noticed_by("tests/projection/test_bounds.py", "-k", "cannot_be_projected")
 def return_a_state_that_was_not_projected_as_nan(package):
-    def mutate(projected):
-        def mutated(self, t, left):
-            y, moved = projected(self, t, left), self.moved(t, left)
-            return jax.tree.map(lambda y, moved: jnp.where(y == moved, jnp.nan, y), y, moved)
-
-        return mutated
-
-    package.method("ManifoldInterpolation.projected", mutate)
+    @package.around("ManifoldInterpolation.projected")
+    def _(projected, self, t, left):
+        y, moved = projected(self, t, left), self.moved(t, left)
+        return jax.tree.map(lambda y, moved: jnp.where(y == moved, jnp.nan, y), y, moved)
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "units")
 def measure_corrections_in_the_numbers_of_the_state(package):
-    def mutate(target):
-        def mutated(*arguments):
-            return dataclasses.replace(target(*arguments), units=None)
-
-        return mutated
-
-    package.method("ManifoldProjection._target", mutate)
+    @package.around("ManifoldProjection._target")
+    def _(target, *arguments):
+        return dataclasses.replace(target(*arguments), units=None)
 
 
-@noticed_by("tests/laws/test_units.py", "-k", "quantity")
 def give_each_component_of_a_vector_its_own_unit(package):
-    package.function("largest_of_vector", lambda _: lambda x, like: x)
+    package.replace("largest_of_vector", lambda x, like: x)
 
 
-@noticed_by("tests/projection/test_laws.py", "-k", "circular_orbit")
 def keep_the_frozen_directions(package):
     package.in_module_of("nearby", "FROZEN_STEPS", 100)
 
 
-@noticed_by("tests/projection/test_linear.py", "-k", "independent_rows")
 def leave_what_was_added_to_the_diagonal(package):
-    package.function("refined", lambda _: lambda solve, product, b: solve(b))
+    package.replace("refined", lambda solve, product, b: solve(b))
 
 
-@noticed_by("tests/projection/test_linear.py", "-k", "dependent_rows")
 def divide_by_the_roundoff_of_a_pivot(package):
     package.in_module_of("eliminated", "ROUNDOFF", 0)
 
 
-@noticed_by("tests/projection/test_bounds.py", "-k", "every_balance")
 def cross_kinks_in_full_steps(package):
-    package.function("_share", lambda _: lambda *arguments: 1.0)
+    package.replace("_share", lambda *arguments: 1.0)
 
 
-@noticed_by("tests/solver/test_random_features.py", "-k", "second_derivatives")
 def differentiate_at_constant_unknowns(package):
     constant = lambda self, solved: lax.stop_gradient(solved.y)  # noqa: E731
-    package.method("SquareSystem.unknowns", lambda _: constant)
+    package.replace("SquareSystem.unknowns", constant)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "without_hope")
 def never_give_up(package):
-    package.function("is_final", lambda _: lambda *arguments: jnp.asarray(False))
+    package.replace("is_final", lambda *arguments: jnp.asarray(False))
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def give_up_once_a_step_is_short(package):
-    def mutate(is_final):
-        def mutated(state, t0, t1, moved, candidate):
-            short = jnp.all(moved <= 1e-3 * jnp.abs(ravel(candidate)))
-            return short | is_final(state, t0, t1, moved, candidate)
-
-        return mutated
-
-    package.function("is_final", mutate)
+    @package.around("is_final")
+    def _(is_final, state, t0, t1, moved, candidate):
+        short = jnp.all(moved <= 1e-3 * jnp.abs(ravel(candidate)))
+        return short | is_final(state, t0, t1, moved, candidate)
 
 
-@noticed_by("tests/laws/test_refused.py", "-k", "right_solves")
 def forget_the_roundoff_that_is_not_in_the_gradient(package):
-    def mutate(measure):
-        return lambda fn, y: (*measure(fn, y)[:2], 0 * fn(y))
-
-    package.function("hidden_terms", mutate)
+    package.around("hidden_terms")(lambda measure, fn, y: (*measure(fn, y)[:2], 0 * fn(y)))
 
 
 class _Passing(eqx.Module):
@@ -326,125 +252,81 @@ class _Passing(eqx.Module):
         return self.solver.step(terms, t0, t1, y0, args, state, self.made_jump)
 
 
-@noticed_by("tests/solver/test_diffrax.py", "-k", "slope_at_the_projected_state")
 def keep_the_last_stage_of_the_candidate(package):
-    def mutate(step):
-        def mutated(self, *rest):
-            inner = _Passing(self.solver, rest[-1])
-            return step(eqx.tree_at(lambda s: s.solver, self, inner), *rest)
-
-        return mutated
-
-    package.method("ManifoldProjection.step", mutate)
+    @package.around("ManifoldProjection.step")
+    def _(step, self, *rest):
+        inner = _Passing(self.solver, rest[-1])
+        return step(eqx.tree_at(lambda s: s.solver, self, inner), *rest)
 
 
-# ---- Systems ----
+# ---- Systems and learned solvers ----
 
 
-@noticed_by("tests/systems/test_paper.py", "-k", "printed")
 def hang_the_double_pendulum_in_a_gravity_of_1(package):
-    def mutate(init):
-        def mutated(self, *arguments, gravity=1.0, **options):
-            init(self, *arguments, gravity=gravity, **options)
-
-        return mutated
-
-    package.method("DoublePendulum.__init__", mutate)
+    @package.around("DoublePendulum.__init__")
+    def _(init, self, *arguments, gravity=1.0, **options):
+        init(self, *arguments, gravity=gravity, **options)
 
 
-# ---- Learned solvers ----
-
-
-@noticed_by("tests/solver/test_random_features.py", "-k", "rigid_body")
 def stop_the_newton_iteration_of_random_features_at_once(package):
     solved = package.find("Solved")
 
-    def newton(equations, start):
+    @package.around("_newton")
+    def _(old, equations, start):
         states = equations.states(start)
         change = equations.solve_linear(equations.jacobians(states), equations.residual(start))
         return solved(start - change, jnp.asarray(True), jnp.asarray(1))
 
-    package.function("_newton", lambda _: newton)
 
-
-@noticed_by("tests/solver/test_random_features.py", "-k", "say_so")
 def report_unsolved_equations_as_a_success(package):
-    def mutate(newton):
-        def mutated(*arguments):
-            found = newton(*arguments)
-            return found._replace(ok=jnp.ones_like(found.ok))
-
-        return mutated
-
-    package.function("_newton", mutate)
+    @package.around("_newton")
+    def _(newton, *arguments):
+        found = newton(*arguments)
+        return found._replace(ok=jnp.ones_like(found.ok))
 
 
 # ---- What a stranger planted, who had read the package and not its tests ----
 
 
-@noticed_by("tests/test_clipped.py", "-k", "from_inside")
 def take_the_derivative_at_an_upper_bound_from_outside(package):
-    def mutate(clip):
-        def mutated(self, z, **options):
-            y = clip(self, z, **options)
-            return jnp.where(z == self.upper, lax.stop_gradient(y), y)
-
-        return mutated
-
-    package.method("Bounds.clip", mutate)
+    @package.around("Bounds.clip")
+    def _(clip, self, z, **options):
+        y = clip(self, z, **options)
+        return jnp.where(z == self.upper, lax.stop_gradient(y), y)
 
 
-@noticed_by("tests/solver/test_failure.py", "-k", "name_the_entry")
 def name_an_element_in_the_place_of_its_entry(package):
     wrong = SimpleNamespace(**{**vars(np), "repeat": lambda _, sizes: np.arange(sum(sizes))})
     package.in_module_of("Target", "np", wrong)
 
 
-@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
 def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
-    def mutate(projected):
-        def mutated(self, t, left):
-            moved = self.moved(t, left)
-            step = SimpleNamespace(**vars(self), moved=lambda *_: moved)
-            return projected(step, self.t1, left)
-
-        return mutated
-
-    package.method("ManifoldInterpolation.projected", mutate)
+    @package.around("ManifoldInterpolation.projected")
+    def _(projected, self, t, left):
+        moved = self.moved(t, left)
+        step = SimpleNamespace(**vars(self), moved=lambda *_: moved)
+        return projected(step, self.t1, left)
 
 
-@noticed_by("tests/solver/test_balance.py", "-k", "kept_to_roundoff")
 def integrate_rates_forwards_in_a_solve_backwards(package):
-    def mutate(integrated):
-        return lambda *given: jax.tree.map(lambda x: x * given[-1], integrated(*given))
+    @package.around("integrated_rates")
+    def _(integrated, *given):
+        return jax.tree.map(lambda x: x * given[-1], integrated(*given))
 
-    package.function("integrated_rates", mutate)
 
-
-@noticed_by("tests/solver/test_keep_linear.py", "-k", "five_integrals")
 def forget_how_the_state_changed_in_the_last_step(package):
-    def mutate(following):
-        def mutated(self, **fields):
-            later = fields["preferred"]
-            return following(self, **fields | {"preferred": later if later is None else 0 * later})
-
-        return mutated
-
-    package.method("State.next", mutate)
+    @package.around("State.next")
+    def _(following, self, **fields):
+        later = fields["preferred"]
+        return following(self, **fields | {"preferred": later if later is None else 0 * later})
 
 
-@noticed_by("tests/mechanics/test_rattle.py", "-k", "there_and_back")
 def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
-    def mutate(linear):
-        def mutated(self, equations, t, q, args, direction, *rest):
-            return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
-
-        return mutated
-
-    package.method("RATTLE._linear", mutate)
+    @package.around("RATTLE._linear")
+    def _(linear, self, equations, t, q, args, direction, *rest):
+        return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
 
 
-@noticed_by("tests/mechanics/test_symmetric_projection.py", "-k", "any_metric")
 def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
     def along(equations, y, multiplier):
         return jax.vjp(equations.residual, y)[1](multiplier)[0]
@@ -452,53 +334,45 @@ def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
     package.in_module_of("SymmetricProjection", "_along", along)
 
 
-@noticed_by("tests/solver/test_radau.py", "-k", "names_of_their")
 def take_one_dae_for_another_of_the_same_shapes(package):
-    def key(tree):
+    @package.around("tree_key")
+    def _(old, tree):
         leaves, treedef = jax.tree.flatten(tree)
         return treedef, tuple(jnp.shape(x) for x in leaves if eqx.is_array_like(x))
 
-    package.function("tree_key", lambda _: key)
 
-
-@noticed_by("tests/test_check.py", "-k", "worst_state")
 def forget_the_sign_of_a_defect_of_an_invariant(package):
     package.in_module_of("check_invariance", "relative", lambda *x: jnp.maximum(relative(*x), 0))
 
 
-@noticed_by("tests/test_serialisation.py", "-k", "given_again")
 def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):
     describe = package.find("_describe")
 
-    def mutate(describe_field):
-        def mutated(field, value, arrays):
-            before, left = len(arrays), []
-            with contextlib.suppress(TypeError):
-                describe(value, left)
-            found = describe_field(field, value, arrays)
-            arrays[before:] = left
-            return found
-
-        return mutated
-
-    package.function("_describe_field", mutate)
+    @package.around("_describe_field")
+    def _(describe_field, field, value, arrays):
+        before, left = len(arrays), []
+        with contextlib.suppress(TypeError):
+            describe(value, left)
+        found = describe_field(field, value, arrays)
+        arrays[before:] = left
+        return found
 
 
-@noticed_by("tests/systems/test_chemistry.py", "-k", "rates_are")
 def round_the_rates_of_reactions_to_float32(package):
-    def mutate(field):
-        def mutated(self, *arguments):
-            if not callable(self.rates):
-                rounded = self.rates.astype(jnp.float32)
-                self = eqx.tree_at(lambda m: m.rates, self, rounded)
-            return field(self, *arguments)
-
-        return mutated
-
-    package.method("Mechanism.vector_field", mutate)
+    @package.around("Mechanism.vector_field")
+    def _(field, self, *arguments):
+        if not callable(self.rates):
+            self = eqx.tree_at(lambda m: m.rates, self, self.rates.astype(jnp.float32))
+        return field(self, *arguments)
 
 
 # ---- How they are planted and noticed ----
+
+MUTANTS = {
+    name.replace("_", " "): plant
+    for name, plant in list(globals().items())
+    if inspect.isfunction(plant) and [*inspect.signature(plant).parameters] == ["package"]
+}
 
 
 def pytest_sessionstart():
@@ -506,21 +380,25 @@ def pytest_sessionstart():
     MUTANTS[os.environ["DEFECT"]](Package(pytest.MonkeyPatch()))
 
 
-def unselected(name: str) -> str | None:
-    """The `-k` of a defect, if it selects no fast test of its file."""
-    file, *selection = TESTS[name]
+def finder(name: str) -> str:
+    """The test that must notice a defect, by the table."""
+    rows = re.findall(r"^\| (.+?) \| (tests/.+) \|$", TABLE.read_text("utf-8"), re.MULTILINE)
+    return dict(rows)[name]
+
+
+def is_fast(test: str) -> bool:
+    """Whether there is such a test, and it is not slow."""
+    file, _, name = test.partition("[")[0].partition("::")
     parts = (ROOT / file).read_text(encoding="utf-8").split("\n\n\n")
-    fast = (x for x in parts if not re.search(r"^@(pytest\.mark\.slow|SLOW)$", x, re.MULTILINE))
-    tests = re.findall(r"^def (test_\w+)", "\n".join(fast), re.MULTILINE)
-    word = selection[-1] if selection else "test_"
-    return None if any(word in test for test in tests) else word
+    (part,) = [part for part in parts if f"def {name}(" in part] or ["@pytest.mark.slow"]
+    return not re.search(r"^@(pytest\.mark\.slow|SLOW)$", part, re.MULTILINE)
 
 
 def found_by(name: str) -> str | None:
     """The first fast test that fails because of a defect; `None` if the defect survives."""
     command = [sys.executable, "-m", "pytest", "-p", "tests.mutants", "-p", "no:cacheprovider"]
     run = subprocess.run(
-        [*command, "-x", "-q", "-m", "not slow and not examples", *TESTS[name]],
+        [*command, "-x", "-q", "-m", "not slow and not examples", finder(name).partition("[")[0]],
         cwd=ROOT,
         env={**os.environ, "DEFECT": name, "CI": "1"},
         capture_output=True,
@@ -547,7 +425,7 @@ def main() -> int:
     noticed = [test for test in found.values() if test]
     print(f"{len(noticed)} of {len(found)} defects noticed")
     if list(found) == list(MUTANTS):
-        rows = (f"| {name} | {test or '**none**'} |\n" for name, test in found.items())
+        rows = (f"| {name} | {test or finder(name)} |\n" for name, test in found.items())
         TABLE.write_text(TITLE + "".join(rows), encoding="utf-8")
     return 0 if len(noticed) == len(found) else 1
 

@@ -30,7 +30,8 @@ PAGES = [
     ROOT / "README.md",
     *(file for file in sorted((ROOT / "docs").rglob("*.md")) if file.parent.name != "appendix"),
 ]
-CHECK = re.compile(r"^<!-- check$.*?^-->$", re.DOTALL | re.MULTILINE)
+
+
 FIGURES = ROOT / "docs" / "images" / "pages"
 FENCE = re.compile(
     r"^(?P<indent>[ ]*)```[ ]*(?P<language>\w+)[^\n]*\n(?P<code>.*?)^(?P=indent)```[ ]*$"

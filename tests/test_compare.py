@@ -44,18 +44,14 @@ def compared(coupling, factor, capsys, y0=Y0, dt0=DT, stiffness=1.0):
     return report
 
 
-def rk4_of_an_oscillator():
-    """Its steps are powers of the Taylor polynomial of a rotation."""
-    a = DT * np.array([[0, 1], [-1, 0]])
-    step = np.eye(2) + a + a @ a / 2 + a @ a @ a / 6 + a @ a @ a @ a / 24
-    start = Y0.reshape(2, 2)
-    return np.stack([np.linalg.matrix_power(step, n) @ start for n in range(STEPS + 1)])
-
-
 def test_errors_and_drifts_are_those_of_the_closed_form(capsys):
-    """RK4 on an oscillator loses amplitude and phase; with the energy kept only the phase."""
+    """RK4 on an oscillator loses amplitude and phase; with the energy kept only the phase. A step
+    is a power of the Taylor polynomial of a rotation."""
     report = compared(0.0, 1.0, capsys)
-    ys, t = rk4_of_an_oscillator(), DT * np.arange(STEPS + 1)
+    a, t = DT * np.array([[0, 1], [-1, 0]]), DT * np.arange(STEPS + 1)
+    step = np.eye(2) + a + a @ a / 2 + a @ a @ a / 6 + a @ a @ a @ a / 24
+    powers = [np.linalg.matrix_power(step, n) for n in range(STEPS + 1)]
+    ys = np.stack(powers) @ Y0.reshape(2, 2)
     rotations = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]]).transpose(2, 0, 1)
     exact = rotations @ Y0.reshape(2, 2)
     shown = np.arange(0, STEPS + 1, STEPS // 100)
@@ -375,13 +371,9 @@ def test_starts_in_float32_have_a_reference_in_float64():
     np.testing.assert_allclose(exact[0, -1], np.exp(-1.0), rtol=1e-12)
 
 
-def test_float64_is_asked_for(monkeypatch):
-    jax.config.update("jax_enable_x64", False)
-    try:
-        with pytest.raises(RuntimeError, match="jax_enable_x64"):
-            dfc.compare(henon_heiles, dfc.RK4(), KEPT, jnp.ones(4), t1=1.0, dt0=0.1)
-    finally:
-        jax.config.update("jax_enable_x64", True)
+def test_float64_is_asked_for():
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
+        of(y0=jnp.ones(4))()
 
 
 def test_the_command_passes_on_what_it_is_given_and_draws(monkeypatch, tmp_path):

@@ -1,4 +1,4 @@
-"""A batch that is spread over devices, or over processes, is the batch on one device.
+"""A batch that is spread over devices is the batch on one device.
 
 Bit for bit: a lane is computed by the same instructions wherever it is. The number of devices is
 fixed when JAX starts, so each test starts its own interpreters, which run a function of this file.
@@ -74,34 +74,30 @@ def train_over_two_devices():
     print(json.dumps([*losses, len(weight.sharding.device_set), refused]))
 
 
-def start(devices, *arguments):
+def answer(devices, function):
     # Optimised: else products are added with one rounding or with two, as the batch is long.
     flags = f"{OPTIMISED} --xla_force_host_platform_device_count={devices}"
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.test_devices", *map(str, arguments)],
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.test_devices", function],
         cwd=ROOT,
         env={**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        capture_output=True,
         text=True,
+        timeout=600,
     )
-
-
-def answer(process):
-    out, err = process.communicate(timeout=600)
-    assert process.returncode == 0, err
-    return json.loads(out.splitlines()[-1])
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.slow
 def test_a_batch_over_eight_devices_is_the_batch_on_one():
-    found = answer(start(8, "spread_over_eight_devices"))
+    found = answer(8, "spread_over_eight_devices")
     assert found == {"equal": True, "devices": 8, "all-reduces": 0}
 
 
 @pytest.mark.slow
 def test_a_training_over_two_devices_is_that_on_one():
-    alone, spread, devices, refused = answer(start(2, "train_over_two_devices"))
+    alone, spread, devices, refused = answer(2, "train_over_two_devices")
     assert devices == 2
     np.testing.assert_allclose(spread, alone, rtol=1e-6)
     assert spread != alone  # each device summed its share
@@ -109,4 +105,4 @@ def test_a_training_over_two_devices_is_that_on_one():
 
 
 if __name__ == "__main__":
-    globals()[sys.argv[1]](*sys.argv[2:])
+    globals()[sys.argv[1]]()

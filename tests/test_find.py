@@ -2,7 +2,6 @@
 
 import functools as ft
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -120,12 +119,9 @@ def test_all_that_is_known_is_found(name):
             assert rank(found | scalars) == rank(found)
 
 
-def damped(size):
-    def field(t, y, args):
-        q, p = jnp.split(y, 2)
-        return jnp.concatenate([p, -q - size * p])
-
-    return field
+def damped_oscillators(t, y, args):
+    q, p = jnp.split(y, 2)
+    return jnp.concatenate([p, -q - jnp.array([1e-6, 2e-3]) * p])
 
 
 def henon_heiles(t, y, args):
@@ -134,23 +130,16 @@ def henon_heiles(t, y, args):
 
 
 NOT = {
-    "oscillator": (damped(1e-6), 2),
-    "two oscillators": (damped(jnp.array([1e-3, 2e-3])), 4),
+    "two oscillators": (damped_oscillators, 4),
     "Hénon-Heiles": (henon_heiles, 4),
     "pendulum": (lambda t, y, a: jnp.stack([y[1], -jnp.sin(y[0]) - 1e-9 * y[1]]), 2),
-    "Lorenz": (
-        lambda t, y, a: jnp.stack(
-            [10 * (y[1] - y[0]), y[0] * (28 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]]
-        ),
-        3,
-    ),
     "logistic": (lambda t, y, a: y * (1 - y), 1),
     "heat": (lambda t, y, a: jnp.convolve(y, jnp.array([1.0, -2.0, 1.0]), "same"), 4),
     "Thomas": (lambda t, y, a: jnp.sin(jnp.roll(y, -1)) - y / 5, 3),
 }
 
 
-@some_of("name", NOT, ids=NOT, period=7)
+@some_of("name", NOT, ids=NOT, period=6)
 def test_where_nothing_is_conserved_nothing_is_found(name):
     field, size = NOT[name]
     assert find_invariants(field, normal(size), basis=3) == {}
@@ -174,17 +163,6 @@ def test_formulas_do_not_depend_on_units_and_precision():
     assert f"{kinetic} p1 p1 + {kinetic} p2 p2 - /r" in found
     like = jax.tree.map(lambda x: x[0], states)
     assert all(e.fn(0.0, like, None).dtype == jnp.float32 for e in found.values())
-
-
-def test_the_result_is_a_manifold():
-    found = find_invariants(pendulum, with_angle, basis=PENDULUM)
-    assert list(found) == ["0.5 v^2 - cos(q)"]
-    solver = dfc.ManifoldProjection(dfc.RK4(), found)
-    sol = dfx.diffeqsolve(dfx.ODETerm(pendulum), solver, 0, 9, 0.1, jnp.array([2.0, 0.0]))
-    expected = dfx.diffeqsolve(dfx.ODETerm(pendulum), dfx.Dopri8(), 0, 9, 1e-2, jnp.array([2.0, 0]))
-    np.testing.assert_allclose(sol.ys, expected.ys, rtol=0, atol=1e-5)
-    energy = sol.ys[-1, 1] ** 2 / 2 - jnp.cos(sol.ys[-1, 0])
-    np.testing.assert_allclose(energy, -jnp.cos(2.0), rtol=4e-15)
 
 
 def test_names_of_components():

@@ -62,26 +62,20 @@ def looped(t, y, args):
     return jax.lax.while_loop(lambda x: x[0] < 3, lambda x: (x[0] + 1, x[1] * y[0]), (0, y[1]))[1]
 
 
-def branched(t, y, args):
-    return y[0] if y[1] > 0 else y[2]
-
-
 NOT_TRACEABLE = (
     (looped, ValueError),
-    (branched, jax.errors.TracerBoolConversionError),
+    (lambda t, y, args: y[0] if y[1] > 0 else y[2], jax.errors.TracerBoolConversionError),
     (lambda t, y, args: jnp.asarray(float(y[0])), jax.errors.ConcretizationTypeError),
     (lambda t, y, args: jnp.asarray(np.sin(y[0])), jax.errors.TracerArrayConversionError),
 )
-
-
-def to_unit(integral):
-    return dfc.project({"a": integral}, OMEGA0, value={"a": jnp.array(1.0)})
 
 
 def check(field=rigid_body, integral=ENERGY, states=OMEGA0[None]):
     return dfc.check_invariance(field, {"a": integral}, states)
 
 
+IN_A_SOLVE = lambda integral: run({"a": integral})  # noqa: E731
+TO_UNIT = lambda integral: dfc.project({"a": integral}, OMEGA0, value={"a": 1.0})  # noqa: E731
 NEEDS_ARGS = lambda t, y, args: args["scale"] * y[0]  # noqa: E731
 A_CALLED = r"`fn` of `manifold\['a'\]` was called as `fn\(t, y, args\)`, here with t = .*, y = f64"
 SUBS = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=[0.0, 1.0]), dfx.SubSaveAt(t1=True)])
@@ -109,12 +103,12 @@ test_mistakes_are_named = refused(
     (lambda: check(states=lambda: OMEGA0), TypeError, r"`states` has .* `states\(key\)`"),
     *(
         (lambda f=f: f(integral=FirstIntegral(NEEDS_ARGS)), TypeError, A_CALLED + ".*need `args`")
-        for f in (check, lambda integral: run({"a": integral}))
+        for f in (check, IN_A_SOLVE)
     ),
     *(
         (lambda f=f, fn=fn: f(integral=FirstIntegral(fn)), error, f"{A_CALLED}.*`jnp.where`")
         for fn, error in NOT_TRACEABLE
-        for f in (check, lambda integral: run({"a": integral}), to_unit)
+        for f in (check, IN_A_SOLVE, TO_UNIT)
     ),
     (lambda: dfc.systems.hamiltonian_vector_field(ENERGY), TypeError, "is of type `FirstIntegral`"),
     (lambda: dfc.ClosedForm(lambda t, y, args: y), TypeError, r"`fn\(t, y, args, values\)`"),

@@ -12,6 +12,7 @@ from diffrax_conserve._constants import OPERATIONS
 from diffrax_conserve._fast.jaxprs import jaxprs_inside
 from diffrax_conserve._fast.scalars import components, in_scalars, written_out
 
+from .problems import INERTIA, rotational_energy, squared_momentum
 from .thinned import some_of
 
 
@@ -35,16 +36,9 @@ def test_zero_times_nan_is_nan_in_a_batch_too():
 
 # ---- What is written out, told by what remains in arrays, not by time ----
 
-INERTIA = np.array([0.1, 0.2, 0.3])
 ORDER = jnp.array([2, 0, 1])
-
-
-def energy(y):
-    return jnp.sum(jnp.asarray(INERTIA, y.dtype) * y**2) / 2
-
-
-def momentum(y):
-    return jnp.sum((jnp.asarray(INERTIA, y.dtype) * y) ** 2)
+energy = lambda y: rotational_energy(0.0, y, None)  # noqa: E731
+momentum = lambda y: squared_momentum(0.0, y, None)  # noqa: E731
 
 
 def both(y):
@@ -199,16 +193,6 @@ def loops_of(eqn):
     return [loop for jaxpr in inner for loop in innermost_loops(jaxpr) if loop is not jaxpr]
 
 
-def projected_batch(field, manifold, y0):
-    """A solve of a batch, and the states at which it starts."""
-
-    def solve(y0):
-        solver = dfc.ManifoldProjection(dfc.RK4(), manifold)
-        return dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 0.1, 0.01, y0, throw=False).ys
-
-    return jax.vmap(solve), jax.tree.map(lambda x: jnp.stack([x] * LANES), y0)
-
-
 # The systems whose projections are not written out: ten and five integrals are too many, and the
 # waves have too many operations.
 IN_ARRAYS = {"outer-solar-system", "rigid-body-attitude", "korteweg-de-vries"}
@@ -218,9 +202,15 @@ IN_ARRAYS = {"outer-solar-system", "rigid-body-attitude", "korteweg-de-vries"}
 def test_the_projections_of_the_catalogue_are_written_out_in_a_batch(name):
     """Scalars have the lanes as their only axis."""
     system = dfc.systems.get(name)
-    solve, ys = projected_batch(system.vector_field, system.manifold, system.y0)
+    term = dfx.ODETerm(system.vector_field)
+
+    def solve(y0):
+        solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
+        return dfx.diffeqsolve(term, solver, 0.0, 0.1, 0.01, y0, throw=False).ys
+
+    ys = jax.tree.map(lambda x: jnp.stack([x] * LANES), system.y0)
     of_lanes = lambda aval: aval.ndim > 1 and aval.shape[0] == LANES  # noqa: E731
-    loops = innermost_loops(jax.make_jaxpr(solve)(ys).jaxpr)
+    loops = innermost_loops(jax.make_jaxpr(jax.vmap(solve))(ys).jaxpr)
     arrays = set().union(*(names_of_arrays(loop, of_lanes) for loop in loops))
     assert bool(arrays) == (name in IN_ARRAYS)
 

@@ -10,7 +10,7 @@ from .soak import far, oracle
 from .soak.families import FAMILIES
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", [name for name in FAMILIES if not FAMILIES[name].hides])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_the_oracle_takes_a_rounded_answer_and_refuses_one_that_is_off(name, dtype):
     rng = np.random.default_rng(0)
@@ -67,7 +67,7 @@ def test_a_run_continues_from_its_file(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize("which", [("exponential", "simplified"), ("quartic", "closed form")])
 def test_far_candidates_in_short(which):
     index = far.PROGRAMS.index((*which, np.float64))
-    number = next(n for n in range(len(far.PROGRAMS)) if 7 * n % len(far.PROGRAMS) == index)
+    number = pow(far.STRIDE, -1, len(far.PROGRAMS)) * index % len(far.PROGRAMS)
     tally = far.run(0, number, 500)
     assert tally.tried == 500
     assert tally.success > 100

@@ -60,14 +60,6 @@ def test_there_and_back_on_the_manifold(periods):
     assert dfc.statistics(there).num_iterations < 4 * periods * 200
 
 
-@pytest.mark.slow
-def test_a_projection_at_one_end_is_not_symmetric():
-    one_end = dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER)
-    there = solve(kepler, one_end, Y0, 0.0, 20 * 200 * H, H)
-    back = solve(kepler, one_end, final(there), 20 * 200 * H, 0.0, -H)
-    assert difference(final(back), Y0) > 1e-6
-
-
 def test_one_step_solves_the_equations():
     """The step in the book, solved by another method for state and multiplier together. The
     integral is not quadratic, because the midpoint rule keeps those by itself."""

@@ -13,7 +13,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from ..learned import EAST, LORENZ, RADIUS, flow_map, solution
-from ..problems import OMEGA0, RIGID_BODY
+from ..problems import OMEGA0, RIGID_BODY, largest
 from ..thinned import some_of
 
 ONE = jnp.ones(())
@@ -22,7 +22,7 @@ ONE = jnp.ones(())
 def residual(layer, y, values):
     now = layer.values(0.0, y)
     ratios = jax.tree.map(lambda a, b: np.abs(np.subtract(a, b)) / (1 + np.abs(b)), now, values)
-    return max(float(np.max(x)) for x in jax.tree.leaves(ratios))
+    return largest(ratios)
 
 
 @eqx.filter_jit

@@ -1,4 +1,6 @@
-"""Density matrices, rotation matrices and unit vectors, by formulas."""
+"""Density matrices, rotation matrices and unit vectors, by formulas, and those of a user."""
+
+import functools as ft
 
 import diffrax as dfx
 import jax
@@ -11,7 +13,7 @@ from scipy.optimize import minimize
 import diffrax_conserve as dfc
 from diffrax_conserve import closed_forms
 
-from ..problems import EPS
+from ..problems import EPS, difference, oscillator, refused, solve
 from ..thinned import some_of
 
 
@@ -78,41 +80,24 @@ def test_large_matrices_have_positive_density_matrices_too():
     np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)
 
 
-def lindblad(hamiltonian, decays):
-    def field(t, rho, args):
-        h = hamiltonian(t)
-        rates = [c @ rho @ c.conj().T for c in decays]
-        losses = [c.conj().T @ c for c in decays]
-        inner = sum(losses, jnp.zeros_like(rho))
-        return -1j * (h @ rho - rho @ h) + sum(rates) - (inner @ rho + rho @ inner) / 2
-
-    return field
+Z, X = np.diag([1.0 + 0j, -1]), np.array([[0j, 1], [1, 0]])
+DOWN = np.array([[0j, 1], [0, 0]])
 
 
-X, Z = np.array([[0, 1], [1, 0]]) + 0j, np.diag([1.0, -1.0]) + 0j
-DOWN, ONE = np.array([[0, 1], [0, 0]]) + 0j, np.eye(2) + 0j
-QUBIT = lindblad(lambda t: Z / 2 + 2 * jnp.cos(t) * X, [0.1 * DOWN])
-PAIR = lindblad(
-    lambda t: np.kron(Z, Z) + jnp.cos(t) * np.kron(X, ONE),
-    [0.3 * np.kron(DOWN, ONE), 0.1 * np.kron(ONE, DOWN)],
-)
+def decaying_qubit(t, rho, args):
+    """A driven qubit in the equation of Lindblad."""
+    h, excited = Z / 2 + 2 * jnp.cos(t) * X, DOWN.T @ DOWN
+    lost = (excited @ rho + rho @ excited) / 2
+    return -1j * (h @ rho - rho @ h) + 0.01 * (DOWN @ rho @ DOWN.T - lost)
 
 
 @pytest.mark.filterwarnings("ignore:Complex dtype")
-@some_of("name", ["pair", "qubit"], period=2)
-def test_a_density_matrix_stays_one(name):
-    """From a pure state, whose other eigenvalues are zero."""
-    field, n = (QUBIT, 2) if name == "qubit" else (PAIR, 4)
+def test_a_density_matrix_stays_one():
+    """From a pure state, whose other eigenvalue is zero."""
     trace = dfc.Constraint(lambda t, rho, args: jnp.trace(rho).real - 1)
     solver = dfc.ManifoldProjection(dfx.Tsit5(), trace, projection=closed_forms.density_matrix())
-    rho0, saveat = (
-        jnp.zeros((n, n), complex).at[0, 0].set(1),
-        dfx.SaveAt(ts=jnp.linspace(0, 50, 1000)),
-    )
-    solve = jax.jit(
-        lambda rho0: dfx.diffeqsolve(dfx.ODETerm(field), solver, 0, 50, 0.05, rho0, saveat=saveat)
-    )
-    states = np.asarray(solve(rho0).ys)
+    saveat, rho0 = dfx.SaveAt(ts=jnp.linspace(0, 50, 1000)), jnp.diag(jnp.array([1.0 + 0j, 0]))
+    states = np.asarray(solve(decaying_qubit, solver, rho0, t1=50, dt0=0.05, saveat=saveat).ys)
     assert np.all(states == states.conj().swapaxes(1, 2))
     assert np.max(np.abs(np.trace(states, axis1=1, axis2=2) - 1)) <= EPS
     assert np.min(np.linalg.eigvalsh(states)) >= -1e-16
@@ -125,22 +110,72 @@ def test_rotations_in_a_part_of_the_state():
     unit = dfc.Constraint(lambda t, y, args: y["R"].mT @ y["R"] - jnp.eye(3))
     projection = closed_forms.rotation_matrix(lambda y: y["R"])
     solver = dfc.ManifoldProjection(dfc.RK4(), unit, projection=projection)
-    field = dfx.ODETerm(lambda t, y, args: {"R": spin @ y["R"], "x": -y["x"]})
+    field = lambda t, y, args: {"R": spin @ y["R"], "x": -y["x"]}  # noqa: E731
     y0, saveat = {"R": jnp.eye(3), "x": jnp.ones(())}, dfx.SaveAt(ts=jnp.linspace(0, 1000, 1000))
-    solve = jax.jit(
-        lambda y0: dfx.diffeqsolve(field, solver, 0, 1000, 0.1, y0, saveat=saveat, max_steps=10_001)
-    )
-    ys = solve(y0).ys
+    ys = solve(field, solver, y0, t1=1000, saveat=saveat, max_steps=10_001).ys
     assert np.max(np.abs(ys["R"].mT @ ys["R"] - np.eye(3))) <= 4 * EPS
     np.testing.assert_allclose(ys["x"][10], np.exp(-10_000 / 999), rtol=1e-4)
 
 
-def test_wrong_input_is_explained():
-    with pytest.raises(ValueError, match="no square matrix"):
-        formula(closed_forms.density_matrix())(jnp.ones((2, 3)))
-    with pytest.raises(TypeError, match="is real"):
-        formula(closed_forms.rotation_matrix())(jnp.eye(2) + 0j)
-    with pytest.raises(TypeError, match="`where` is of type `str`"):
-        closed_forms.unit_vector("R")
+def test_the_zero_vector_has_no_direction():
     unit = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - 1)
     assert not dfc.project(unit, jnp.zeros(3), projection=closed_forms.unit_vector())[1].ok
+
+
+# ---- A formula of the user is used as it is, and checked; half precision ----
+
+SQUARE = {"square": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))}
+
+
+def rescale(t, y, args, values):
+    return y * jnp.sqrt(values["square"] / jnp.sum(y**2))
+
+
+@ft.partial(jax.jit, static_argnums=2)
+def rescaled(y, value, projection):
+    return dfc.project(SQUARE, y, value={"square": value}, projection=projection)[0]
+
+
+def test_it_agrees_with_newton_and_so_do_its_derivatives():
+    gradient = jax.value_and_grad(lambda *given: jnp.sum(rescaled(*given) ** 3), (0, 1))
+    given = jnp.array([3.0, 4.1]), jnp.array(25.0)
+    closed, newton = (gradient(*given, p) for p in (dfc.ClosedForm(rescale), dfc.Newton()))
+    assert difference(closed, newton) < 1e-9
+
+
+WORK = {
+    "simplified": dfc.SimplifiedNewton(),
+    "bounded": dfc.SimplifiedNewton(lower=-2.0),
+    "formula": dfc.ClosedForm(rescale),
+    "along a line": dfc.AlongLine(direction="error"),
+    "staged": dfc.Staged(("square", dfc.SimplifiedNewton())),
+}
+
+
+def in_half_precision(projection, dtype):
+    solver = dfc.ManifoldProjection(dfx.Bosh3(), SQUARE, projection=projection)
+    saveat = dfx.SaveAt(ts=jnp.array([0.25, 0.4, 1], dtype))
+    return solve(oscillator, solver, jnp.array([1.0, 0.5], dtype), dt0=0.125, saveat=saveat)
+
+
+@some_of("dtype", [jnp.float16, jnp.bfloat16], ids=["float16", "bfloat16"], period=2)
+@some_of("name", WORK, ids=WORK, period=5)
+def test_it_works_in_half_precision(name, dtype):
+    ys = in_half_precision(WORK[name], dtype).ys
+    assert ys.dtype == dtype
+    squares = np.sum(np.asarray(ys, np.float64) ** 2, axis=1)
+    # The tolerance, of a scale of three times the square, and what rounding the state costs.
+    limit = (16 * 3 + 4) * 1.25 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(squares, 1.25, rtol=0, atol=limit)
+
+
+test_mistakes_are_named = refused(
+    (lambda: formula(closed_forms.density_matrix())(jnp.ones((2, 3))), ValueError, "no square"),
+    (lambda: formula(closed_forms.rotation_matrix())(jnp.eye(2) + 0j), TypeError, "is real"),
+    (lambda: closed_forms.unit_vector("R"), TypeError, "`where` is of type `str`"),
+    *(
+        (lambda fn=fn: rescaled(jnp.ones(2), 1.0, dfc.ClosedForm(fn)), ValueError, "`fn` of a `Cl")
+        for fn in (lambda t, y, args, values: (y,), lambda t, y, args, values: y[:1])
+    ),
+    (lambda: in_half_precision(dfc.Newton(), jnp.float16), TypeError, "the state to float32"),
+)

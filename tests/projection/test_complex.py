@@ -44,10 +44,7 @@ def join(y):
     return {"z": y["re"] + 1j * y["im"], "x": y["x"][..., 0, :] + 1j * y["x"][..., 1, :]}
 
 
-def real_field(t, y, args):
-    return split(field(t, join(y), args))
-
-
+real_field = lambda t, y, args: split(field(t, join(y), args))  # noqa: E731
 REAL_QUANTA = dfc.FirstIntegral(lambda t, y, args: quanta(t, join(y), args))
 
 

@@ -1,22 +1,25 @@
-"""What a projection sees of the step: relaxation, and projections of a user."""
+"""What a projection sees of the step: relaxation, a line along the error estimate, and projections
+of a user; and projection part by part."""
 
 from typing import ClassVar
 
 import diffrax as dfx
 import equinox as eqx
+import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
-from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution
+from ..problems import EXPONENTIAL, EXPONENTIAL0, exponential, exponential_solution, refused
 from ..thinned import some_of
 
 ENERGY, TERM = EXPONENTIAL, dfx.ODETerm(exponential)
-STEP = dfc.AlongLine(direction="step")
+STEP, ALONG_ERROR = (dfc.AlongLine(direction=direction) for direction in ("step", "error"))
 RELAXED = dfc.ManifoldProjection(dfx.Heun(), ENERGY, projection=STEP)
 
 
@@ -31,32 +34,22 @@ def test_relaxation_keeps_the_energy_at_every_saved_time():
     np.testing.assert_allclose(kept, np.sum(np.exp(EXPONENTIAL0)), rtol=4e-15)
 
 
-def carrying(t, y, args):
-    """The field with its time as a component."""
-    return {"y": exponential(t, y["y"], args), "time": jnp.ones(())}
-
-
 @some_of("inner, order", [(dfx.Heun(), 2), (dfc.RK4(), 4)], ids=["2", "4"], period=2)
 def test_the_order_of_relaxation_is_one_less_unless_the_state_carries_the_time(inner, order):
     kept = dfc.FirstIntegral(lambda t, y, args: ENERGY.fn(t, y["y"], args))
+    field = lambda t, y, args: {"y": exponential(t, y["y"], args), "time": jnp.ones(())}  # noqa: E731
     solver = dfc.ManifoldProjection(inner, kept, projection=STEP)
     y0 = {"y": EXPONENTIAL0, "time": jnp.zeros(())}
 
     @jax.jit
     def errors(h):
-        ys = dfx.diffeqsolve(dfx.ODETerm(carrying), solver, 0.0, 2.0, h, y0).ys
+        ys = dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 2.0, h, y0).ys
         y, time = ys["y"][-1], ys["time"][-1]
         exact = exponential_solution(2.0), exponential_solution(time)
         return jnp.stack([jnp.max(jnp.abs(y - other)) for other in exact])
 
     coarse, fine = errors(0.05), errors(0.025)
     np.testing.assert_allclose(np.log2(coarse / fine), [order - 1, order], rtol=0, atol=0.15)
-
-
-@pytest.mark.slow
-def test_derivatives_of_relaxation_agree_with_differences():
-    end = lambda y0: solve(RELAXED, y0, t1=1.0).ys  # noqa: E731
-    dct.assert_gradients(end, EXPONENTIAL0, rtol=1e-7, forward=False)
 
 
 @pytest.mark.parametrize("direction", ["error", "step"])
@@ -106,12 +99,51 @@ def test_relaxation_never_returns_to_the_start_of_a_step(inner, friction):
     assert "was not reached" in dfx.RESULTS[sol.result]
 
 
-def test_relaxation_is_refused_without_a_step_and_with_two_integrals():
-    with pytest.raises(ValueError, match="no step outside a solve"):
-        dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=STEP)
-    twice = dfc.ManifoldProjection(dfx.Heun(), (ENERGY, ENERGY), projection=STEP)
-    with pytest.raises(ValueError, match="has one unknown, but `manifold` has 2"):
-        solve(twice)
+def test_it_lies_on_the_line_along_the_embedded_difference():
+    """One step against Bosh3 by hand."""
+    inner, along = dfx.Bosh3(), dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=ALONG_ERROR)
+
+    @jax.jit
+    def found(y0):
+        given = TERM, 0.0, 0.2, y0, None
+        plain, error, *_ = inner.step(*given, inner.init(*given), False)
+        return solve(along, y0, t1=0.2, dt0=0.2).ys[-1] - plain, error
+
+    moved, w = map(np.asarray, found(EXPONENTIAL0))
+    np.testing.assert_allclose(moved, w * (moved @ w) / (w @ w), rtol=0, atol=1e-15)
+    assert np.linalg.norm(moved) > 1e-6
+
+
+def test_a_tangent_direction_is_a_failure():
+    """On a circle whose field is constant speed, the error estimate is made tangent by hand."""
+
+    class Tangent(dfx.Euler):
+        def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+            y1, _, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+            return y1, 1e-3 * jnp.array([-y1[1], y1[0]]), *rest
+
+    circle = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    solver = dfc.ManifoldProjection(Tangent(), circle, projection=ALONG_ERROR)
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+    sol = dfx.diffeqsolve(field, solver, 0, 1, 0.1, jnp.array([1.0, 0.0]), throw=False)
+    assert sol.result != dfx.RESULTS.successful
+
+
+def alone(projection):
+    return lambda: dfc.project(ENERGY, EXPONENTIAL0, value=0.0, projection=projection)
+
+
+def solved(inner, manifold=ENERGY, projection=ALONG_ERROR):
+    return lambda: solve(dfc.ManifoldProjection(inner, manifold, projection=projection))
+
+
+test_what_cannot_be_is_refused_before_compilation = refused(
+    (alone(STEP), ValueError, "no step outside a solve"),
+    (alone(ALONG_ERROR), ValueError, r"outside a solve. Pass `projection=Newton\(\)`"),
+    (solved(dfx.Heun(), (ENERGY, ENERGY), STEP), ValueError, "one unknown, but `manifold` has 2"),
+    (solved(dfx.HalfSolver(dfc.RK4())), ValueError, "without its sign"),
+    (solved(dfc.RK4()), ValueError, "embedded method"),
+)
 
 
 class Seen(dfc.AbstractProjection):
@@ -156,3 +188,74 @@ def test_what_asks_for_no_step_gets_none_and_saves_none_and_its_result_is_checke
         sol = solve(solver, saveat=dfx.SaveAt(dense=True), throw=False)
         assert sol.interpolation.infos["error"] is None
         assert (sol.result == dfx.RESULTS.successful) == right
+
+
+# ---- Part by part ----
+
+MANIFOLD = {
+    "tangent": dfc.Constraint(lambda t, y, args: jnp.sum(y[0] * y[1])),
+    "circle": dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1),
+}
+FIRST, SECOND = (
+    dfc.SimplifiedNewton(metric=(1.0, jnp.inf), atol=1e-15),
+    dfc.SimplifiedNewton(metric=(jnp.inf, 1.0), atol=1e-15),
+)
+STAGED = dfc.Staged(("circle", FIRST), ("tangent", SECOND))
+Y0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
+
+
+@eqx.filter_jit
+def projected(y):
+    return dfc.project(MANIFOLD, y, projection=STAGED)
+
+
+vector = st.tuples(st.floats(-1, 1), st.floats(-1, 1)).map(np.array)
+
+
+@settings(max_examples=20)
+@given(st.floats(0, 6.3), vector, vector, vector)
+def test_it_is_the_two_projections_by_hand(angle, velocity, dq, dv):
+    """Radially to the circle, then the velocity along it: CVODE's `proj`."""
+    q = np.array([np.cos(angle), np.sin(angle)]) + 1e-2 * dq
+    v, unit = velocity + 1e-2 * dv, q / np.linalg.norm(q)
+    (found_q, found_v), info = projected((q, v))
+    assert info.ok
+    np.testing.assert_allclose(found_q, unit, rtol=0, atol=4e-15)
+    np.testing.assert_allclose(found_v, v - unit * (unit @ v), rtol=0, atol=4e-15)
+
+
+def test_what_an_earlier_stage_reached_is_held():
+    """Even where a later one may move everything."""
+    radius = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**3))
+    y = jnp.array([1.0, 0.5, -0.2])
+    staged = dfc.Staged((0, dfc.SimplifiedNewton()), (1, dfc.SimplifiedNewton()))
+    found, info = dfc.project((radius, total), 1.01 * y, value=(1.29, 1.117), projection=staged)
+    assert info.ok
+    np.testing.assert_allclose([found @ found, jnp.sum(found**3)], [1.29, 1.117], rtol=4e-15)
+
+
+@pytest.mark.slow
+def test_derivatives_in_both_modes_agree_with_finite_differences():
+    y = jnp.array([0.9, 0.5]), jnp.array([-0.4, 0.8])
+    dct.assert_gradients(lambda *y: projected(y)[0], *y, rtol=1e-6)
+
+
+def test_a_stage_that_cannot_hold_is_a_failure():
+    """Positions on the circle cannot be reached by moving velocities."""
+    wrong = dfc.Staged(("circle", SECOND), ("tangent", SECOND))
+    _, info = dfc.project(MANIFOLD, (jnp.array([1.1, 0.0]), jnp.ones(2)), projection=wrong)
+    assert not info.ok
+
+
+def of(*stages):
+    return lambda: dfc.project(MANIFOLD, Y0, projection=dfc.Staged(*stages))
+
+
+test_mistakes_with_stages_are_named = refused(
+    (of(("circle", FIRST)), ValueError, "Give each entry one stage"),
+    (of(("circle", FIRST), ("circle", SECOND)), ValueError, "Give each entry one stage"),
+    (of(("no", FIRST)), ValueError, "Give each entry one stage"),
+    (of(FIRST), TypeError, "must be a pair"),
+    (of(("circle", ALONG_ERROR)), TypeError, "a projection with `sees_step = False`"),
+)

@@ -28,7 +28,7 @@ from .oracle import Tally
 
 ROOT = Path(__file__).parents[2]
 # How much of the count is for each attack.
-SHARES = {"far": 0.5, "ordinary": 0.25, "nan": 0.249, "ending": 0.001}
+SHARES = {"far": 0.5, "ordinary": 0.25, "nan": 0.25}
 GRACE = 60.0  # seconds for an interpreter to start
 
 

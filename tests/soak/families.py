@@ -40,11 +40,34 @@ class Family(NamedTuple):
     # The range of each parameter.
     a: tuple[tuple[float, float], ...] = ()
     constraint: bool = False
+    # Its gradients do not show all that is added: it has more roundoff than the oracle allows.
+    hides: bool = False
 
     def draw(self, rng: Any, lanes: int) -> tuple[np.ndarray, np.ndarray]:
         """States and parameters."""
         y = self.state(rng, self.n, lanes)
         return y, np.stack([log_uniform(rng, *r, lanes) for r in (*self.a, (0.5, 2))])
+
+
+def _small(rng: Any, n: int, lanes: int) -> np.ndarray:
+    return rng.normal(size=(n, lanes)) * log_uniform(rng, 1e-4, 0.3, lanes)
+
+
+def _network(seed: int, gain: float) -> Any:
+    rng = np.random.default_rng(seed)
+    layers = [
+        (rng.normal(size=(m, n)) / np.sqrt(n), rng.normal(size=m))
+        for n, m in ((2, 32), (32, 32), (32, 1))
+    ]
+
+    def fn(xp: Any, y: Any, a: Any) -> list[Any]:
+        x = gain * xp.stack([y[0], y[1]])
+        for w, b in layers:
+            x = xp.tensordot(w, x, 1) + b.reshape(-1, *[1] * (x.ndim - 1))
+            x = xp.tanh(x) if len(b) > 1 else x
+        return [a[0] * x[0]]
+
+    return fn
 
 
 def _square(y: Any) -> Any:
@@ -128,5 +151,22 @@ FAMILIES: dict[str, Family] = {
     "sphere": Family(lambda xp, y, a: [_square(y) - 1], 3, _unit, constraint=True),
     "big sphere": Family(
         lambda xp, y, a: [1e8 * (_square(y) - 1), 1e8 * (_square(y) - 1)], 4, _unit, constraint=True
+    ),
+    "rest": Family(
+        lambda xp, y, a: [0.5 * y[1] ** 2 + a[0] * (1 - xp.cos(y[0]))], 2, _small, hides=True
+    ),
+    "offset": Family(
+        lambda xp, y, a: [a[0] + 0.5 * y[1] ** 2 - xp.cos(y[0])], 2, _small, ((1, 100),), hides=True
+    ),
+    "network": Family(_network(0, 1.0), 2, a=((0.1, 10),), hides=True),
+    "steep network": Family(_network(1, 4.0), 2, a=((0.1, 10),), hides=True),
+    "molecule": Family(
+        lambda xp, y, a: [y[1] ** 2 + a[0] * (1 - xp.exp(-1.9 * (y[0] - 1.4))) ** 2],
+        2,
+        lambda rng, n, lanes: np.stack(
+            [np.full(lanes, 1.4), rng.normal(size=lanes) * log_uniform(rng, 1e-3, 0.3, lanes)]
+        ),
+        ((0.1, 0.3),),
+        hides=True,
     ),
 }

@@ -1,6 +1,6 @@
 """Every public solver of diffrax, and what it is tested on inside `ManifoldProjection`.
 
-`test_conformance.py` runs each line; `docs/solvers.md` shows them.
+`test_conformance.py` runs each line; `docs/hooks.py` shows them.
 """
 
 EXPLICIT = "explicit Runge-Kutta"

@@ -62,43 +62,33 @@ def shake(t, y, args):
     return 0.3 * jnp.cross(AXIS, y)
 
 
-def spin_ito(t, y, args):
-    """With the drift that keeps the sphere in the sense of Itô."""
-    return spin(t, y, args) + 0.045 * jnp.cross(AXIS, jnp.cross(AXIS, y))
-
-
-def problem(kind):
-    """Terms, initial state and manifold."""
-    if kind in (kinds.EXPLICIT, kinds.IMPLICIT, kinds.MULTISTEP, kinds.WRAPPER):
-        return dfx.ODETerm(rigid_body), OMEGA0, RIGID_BODY
-    if kind == kinds.IMEX:
-        half = dfx.ODETerm(lambda t, y, args: rigid_body(t, y, args) / 2)
-        return dfx.MultiTerm(half, half), OMEGA0, RIGID_BODY
-    if kind == kinds.SPLIT:
-        terms = (dfx.ODETerm(lambda t, p, args: p), dfx.ODETerm(lambda t, q, args: -jnp.sin(q)))
-        energy = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
-        return terms, (jnp.array(1.0), jnp.array(0.5)), energy
-    if kind == kinds.ITO:
-        return sde(spin_ito, shake), AXIS[::-1], SPHERE
-    if kind == kinds.STRATONOVICH:
-        return sde(spin, shake), AXIS[::-1], SPHERE
-    if kind == kinds.ADDITIVE:
-        # Equal noise in both components.
-        terms = sde(
-            lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
-        )
-        difference = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
-        return terms, jnp.array([0.5, 1.0]), difference
-    if kind == kinds.LANGEVIN:
-        # A thermal bead on a circle: the position is constrained.
-        y0 = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
-        gamma, u = jnp.ones(2), jnp.ones(2)
-        terms = dfx.MultiTerm(
-            dfx.UnderdampedLangevinDriftTerm(gamma, u, lambda x, args: x),
-            dfx.UnderdampedLangevinDiffusionTerm(gamma, u, brownian((2,))),
-        )
-        return terms, y0, dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
-    raise AssertionError(kind)
+# With the drift that keeps the sphere in the sense of Itô.
+ITO = sde(lambda *x: spin(*x) + 0.045 * jnp.cross(AXIS, jnp.cross(AXIS, x[1])), shake)
+HALF = dfx.ODETerm(lambda t, y, args: rigid_body(t, y, args) / 2)
+SPLIT = dfx.ODETerm(lambda t, p, args: p), dfx.ODETerm(lambda t, q, args: -jnp.sin(q))
+ENERGY = dfc.FirstIntegral(lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]))
+# Equal noise in both components.
+ADDITIVE = sde(
+    lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
+)
+DIFFERENCE = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
+# A thermal bead on a circle: the position is constrained.
+LANGEVIN = dfx.MultiTerm(
+    dfx.UnderdampedLangevinDriftTerm(jnp.ones(2), jnp.ones(2), lambda x, args: x),
+    dfx.UnderdampedLangevinDiffusionTerm(jnp.ones(2), jnp.ones(2), brownian((2,))),
+)
+CIRCLE = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
+BODY = kinds.EXPLICIT, kinds.IMPLICIT, kinds.MULTISTEP, kinds.WRAPPER
+# Terms, initial state and manifold.
+PROBLEMS = {
+    **dict.fromkeys(BODY, (dfx.ODETerm(rigid_body), OMEGA0, RIGID_BODY)),
+    kinds.IMEX: (dfx.MultiTerm(HALF, HALF), OMEGA0, RIGID_BODY),
+    kinds.SPLIT: (SPLIT, (jnp.array(1.0), jnp.array(0.5)), ENERGY),
+    kinds.ITO: (ITO, AXIS[::-1], SPHERE),
+    kinds.STRATONOVICH: (sde(spin, shake), AXIS[::-1], SPHERE),
+    kinds.ADDITIVE: (ADDITIVE, jnp.array([0.5, 1.0]), DIFFERENCE),
+    kinds.LANGEVIN: (LANGEVIN, (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), CIRCLE),
+}
 
 
 # By default one solver of each kind that no other test has.
@@ -119,7 +109,7 @@ every_solver = pytest.mark.parametrize(
 @every_solver
 def test_every_solver_stays_on_the_manifold(name):
     kind = TABLE[name]
-    terms, y0, manifold = problem(kind)
+    terms, y0, manifold = PROBLEMS[kind]
     inner = dfx.HalfSolver(dfx.Heun()) if kind == kinds.WRAPPER else public_solvers()[name]()
     adaptive = kind in (kinds.IMPLICIT, kinds.IMEX)
     controller = dfx.PIDController(1e-5, 1e-5) if adaptive else dfx.ConstantStepSize()

@@ -58,17 +58,6 @@ def test_drift_is_at_roundoff_where_a_species_almost_dies_out(bounds):
     assert largest(drift_of(sol, manifold)) <= 16 * np.finfo(float).eps
 
 
-@pytest.mark.slow
-def test_drift_does_not_grow_over_many_steps():
-    system = dfc.systems.get("rigid-body")
-    saveat = dfx.SaveAt(t0=True, ts=jnp.linspace(0, 4e3, 20))
-    solver = dfc.ManifoldProjection(dfc.RK4(), system.manifold)
-    options = dict(saveat=saveat, max_steps=None, adjoint=dfx.ForwardMode())
-    sol = solve(system.vector_field, solver, system.y0, t1=4e3, dt0=0.02, **options)
-    assert sol.stats["num_steps"] >= 200_000
-    assert largest(drift_of(sol, system.manifold)) <= 4e-15
-
-
 ORBIT = dfc.systems.Kepler()
 
 
@@ -132,20 +121,6 @@ def test_published_error_of_kepler(manifold, error):
     assert float(f"{got:.2e}") == pytest.approx(error)
 
 
-ORDERS = {dfx.Euler(): 0.005, dfx.Heun(): 0.02, dfc.RK4(): 0.1, dfx.Tsit5(): 0.05,
-          dfx.Dopri5(): 0.1, dfx.Dopri8(): 0.17}  # fmt: skip
-
-
-@pytest.mark.slow
-@some_of("solver", ORDERS, ids=[type(s).__name__ for s in ORDERS], period=6)
-def test_the_order_survives(solver):
-    """On the Toda lattice, kept on its energy."""
-    system = dfc.systems.get("toda-lattice")
-    projected = dfc.ManifoldProjection(solver, system.manifold["energy"])
-    term = dfx.ODETerm(system.vector_field)
-    dct.assert_order(projected, term, system.y0, t1=2.0, dt0=ORDERS[solver])
-
-
 def test_dense_output_of_rk4_is_of_fourth_order():
     def error(num_steps):
         ts = jnp.linspace(0, 1, 37)
@@ -156,20 +131,12 @@ def test_dense_output_of_rk4_is_of_fourth_order():
     assert np.log2(error(20) / error(40)) == pytest.approx(4, abs=0.4)
 
 
-SOLVERS = [
-    dfx.Tsit5(),
-    dfx.Dopri5(),
-    dfx.Dopri8(),
-    dfx.Bosh3(),
-    dfx.Heun(),
-    dfx.Ralston(),
-    dfc.RK4(),
-]
+SOLVERS = [dfx.Tsit5(), dfx.Dopri8(), dfc.RK4()]
 ADAPTIVE, STEPS = dfx.PIDController(rtol=1e-6, atol=1e-6, error_order=5), dfx.ConstantStepSize()
 
 
 @pytest.mark.slow
-@some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=7)
+@some_of("solver", SOLVERS, ids=[type(s).__name__ for s in SOLVERS], period=3)
 def test_same_steps_and_dense_output(solver):
     """Of a tableau alone, which knows neither its order nor a dense output, the last state."""
 

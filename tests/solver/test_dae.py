@@ -1,4 +1,4 @@
-"""Index-1 equations: solutions that are known, another form of the same equations, and IDA."""
+"""Index-1 equations: solutions that are known, and another form of the same equations."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -43,18 +43,30 @@ def ends(x, a, adjoint):
     return jax.tree.map(lambda y: y[-1], found.ys)
 
 
-@some_of("solver", [dfx.Tsit5(), dfx.Kvaerno5()], ids=["Tsit5", "Kvaerno5"], period=2)
-def test_a_known_solution(solver):
+@some_of(
+    "solver, dtype, tol",
+    [
+        (dfx.Tsit5(), np.float64, 1e-11),
+        (dfx.Kvaerno5(), np.float64, 1e-11),
+        (dfx.Tsit5(), np.float32, 1e-6),
+    ],
+    ids=["Tsit5", "Kvaerno5", "float32"],
+    period=3,
+)
+def test_a_known_solution(solver, dtype, tol):
     """At saved times too, where Kvaerno5 has a dense output of order 3."""
-    a, start = np.array(0.7), jnp.array(2.0)
-    every = [dfx.SubSaveAt(t0=True, steps=True), dfx.SubSaveAt(ts=jnp.linspace(0, 1, 11))]
-    found = solve(CUBIC, solver, start, jnp.array(1.0), a, saveat=dfx.SaveAt(subs=every))
+    a, start, guess = (jnp.array(x, dtype) for x in (0.7, 2, 1))
+    ts = dfx.SubSaveAt(ts=jnp.linspace(0, 1, 11, dtype=dtype))
+    saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(t0=True, steps=True), ts])
+    options = dict(saveat=saveat, controller=dfx.PIDController(rtol=tol, atol=tol))
+    found = solve(CUBIC, solver, start, guess, a, **options)
     assert found.result == dfx.RESULTS.successful
     (ts, _), ((_, z), saved) = jax.tree.map(np.asarray, (found.ts, found.ys))
     ts, z = ts[np.isfinite(ts)], z[np.isfinite(ts)]
-    assert largest(constant(ts, z, a) - constant(0, z[0], a)) < 1e-9
+    assert largest(constant(ts, z, a) - constant(0, z[0], a)) < 100 * tol
     x, z = saved
-    assert largest((z**3 + z - x) / x) < 4 * EPS
+    assert z.dtype == dtype
+    assert largest((z**3 + z - x) / x) < 4 * np.finfo(dtype).eps
 
 
 MODES = [(jax.jacfwd, dfx.ForwardMode()), (jax.jacrev, dfx.RecursiveCheckpointAdjoint())]
@@ -107,53 +119,6 @@ def test_an_event():
     assert abs(found.ys[0][-1] - 0.625) < 4 * EPS
 
 
-@pytest.mark.slow
-def test_float32():
-    x, a = jnp.float32(2), jnp.float32(0.7)
-    controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
-    found = solve(CUBIC, dfx.Tsit5(), x, jnp.float32(1), a, controller=controller)
-    (x, z), ts = found.ys, found.ts
-    assert z.dtype == jnp.float32
-    assert largest((z**3 + z - x) / x) < 4 * np.finfo(np.float32).eps
-    assert largest(constant(ts, z, a) - constant(0, 1.0, a)) < 1e-5
-
-
-# ---- Robertson ----
-
-# By IDA of SUNDIALS at `rtol=1e-12`, `atol=1e-16` (`benchmarks/cost/dae.py`).
-ROBERTSON = {
-    0.4: (0.985172113861, 3.38639537897e-05, 0.0147940221852),
-    40: (0.715827068724, 9.18553476473e-06, 0.284163745741),
-    4000: (0.18320225778, 8.942371253e-07, 0.816796847982),
-    400000: (0.00493827452118, 1.98499408801e-08, 0.995061705629),
-    4e07: (5.20307184469e-05, 2.08133573212e-10, 0.999947969073),
-    4e09: (5.20827661748e-07, 2.08331171902e-12, 0.99999947917),
-    1e11: (2.08334023727e-08, 8.33336112063e-14, 0.999999979167),
-}
-
-
-def robertson(t, x, z, args):
-    a, b = x
-    return jnp.stack([-0.04 * a + 1e4 * b * z, 0.04 * a - 1e4 * b * z - 3e7 * b**2])
-
-
-@pytest.mark.slow
-def test_robertson_agrees_with_ida():
-    dae = pair(robertson, lambda t, x, z, args: jnp.sum(x) + z - 1)
-    ts = jnp.array([0.0, *ROBERTSON])
-    solver = dfx.Kvaerno5(root_finder=optx.Chord(rtol=1e-9, atol=1e-17))
-    controller = dfx.PIDController(rtol=1e-8, atol=1e-16)
-    options = dict(controller=dfx.ClipStepSizeController(controller, step_ts=ts), t1=1e11)
-    options |= dict(dt0=1e-6, saveat=dfx.SaveAt(ts=ts))
-    found = solve(dae, solver, jnp.array([1.0, 0.0]), jnp.array(0.0), None, **options)
-    ys = np.column_stack(found.ys)[1:]
-    assert largest(ys / np.array([*ROBERTSON.values()]) - 1) < 1e-6
-    assert largest(np.sum(ys, axis=1) - 1) < 2 * EPS
-
-
-# ---- A power system, whose network changes twice ----
-
-
 # ---- Poor guesses, and failures ----
 
 DIODE = pair(lambda t, x, z, args: 0 * x, lambda t, x, z, args: x - z - 1e-6 * jnp.expm1(z / 0.025))
@@ -174,21 +139,6 @@ def test_an_unknown_that_is_zero():
     dae = pair(lambda *_: 0.0, lambda t, x, z, a: a * (z + 0.1) - x)
     root = lambda a: dae.consistent(0.1 * a, 0 * a, args=a)[1]  # noqa: E731
     assert largest(jax.jit(jax.vmap(root))(np.array([3.0, 0.3, 49.0]))) <= EPS
-
-
-@pytest.mark.slow
-def test_a_solve_that_comes_to_rest():
-    """All that a gradient shows of `c exp(z) - c - x` vanishes there, and its roundoff does not."""
-    dae = pair(lambda t, x, z, c: -x, lambda t, x, z, c: c * jnp.exp(z) - c - x)
-
-    @jax.jit
-    @jax.vmap
-    def end(c):
-        steps = dict(controller=dfx.ConstantStepSize(), dt0=0.1, saveat=dfx.SaveAt(t1=True))
-        one = jnp.ones(())
-        return solve(dae, dfx.Tsit5(), one, one, args=c, t1=40.0, **steps).ys[1][0]
-
-    assert largest(end(10 ** jnp.linspace(-2.0, 2.0, 9))) < 4 * EPS
 
 
 @pytest.mark.slow

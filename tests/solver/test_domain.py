@@ -13,26 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
 
 from .. import problems
-from ..learned import DRIVEN0, EAST, LORENZ, Still, Within, flow_map, states, unchecked
+from ..learned import DRIVEN0, EAST, LORENZ, Rotation, Still, Within, flow_map, states, unchecked
 from ..problems import oscillator, refused
 from ..thinned import some_of
 
 TERM = dfx.ODETerm(oscillator)
 STATE = dfx.SaveAt(steps=True, solver_state=True)
-
-
-class Rotation(eqx.Module):
-    """The exact flow map of the oscillator, but for an error in proportion to the step."""
-
-    error: float = 0.0
-    max_step: float = 0.5
-
-    def __call__(self, y0, h):
-        c, s = jnp.cos(h), jnp.sin(h)
-        return jnp.stack([c * y0[0] + s * y0[1], c * y0[1] - s * y0[0]]) + self.error * h
 
 
 # The rotation from (1, 0) leaves it between the third and the fourth step of length 0.5.
@@ -138,22 +126,6 @@ def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
     assert sol.result == dfx.RESULTS.max_steps_reached
 
 
-@pytest.mark.slow
-def test_derivatives():
-    """Of steps of either kind, nowhere near the boundary."""
-
-    def f(error, y0):
-        solver = unchecked(Within(Rotation(error), EASTERN), outside=dfx.Bosh3())
-        times = jnp.array(0.0), jnp.array(0.5)
-        states = [solver.init(TERM, *times, y, None) for y in (y0, -y0)]
-        return [
-            solver.step(TERM, *times, y, None, state, False)[0]
-            for y, state in zip((y0, -y0), states, strict=True)
-        ]
-
-    dct.assert_gradients(f, jnp.array(0.1), jnp.array([0.9, 0.2]), rtol=1e-6, forward=False)
-
-
 Box = dfc.learned.Box
 NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
 
@@ -193,15 +165,6 @@ def end(solver, system, y0):
 
 
 OTHER = dfc.systems.ConservativeLorenz(sigma=1.01)
-
-
-@pytest.mark.slow
-def test_another_parameter_is_refused(errors_raise):
-    end(taylor(), LORENZ, LORENZ.y0)
-    with pytest.raises(RuntimeError, match=MESSAGE):
-        end(taylor(), OTHER, LORENZ.y0)
-    off = taylor(check_field=False)
-    np.testing.assert_array_equal(end(off, OTHER, LORENZ.y0), end(taylor(), LORENZ, LORENZ.y0))
 
 
 def test_one_lane_of_a_batch_is_refused_alone():

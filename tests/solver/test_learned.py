@@ -14,7 +14,7 @@ import pytest
 import diffrax_conserve as dfc
 
 from .. import problems
-from ..learned import LORENZ, flow_map, solution, unchecked
+from ..learned import LORENZ, Still, flow_map, solution, unchecked
 from ..problems import refused
 from ..thinned import some_of
 
@@ -94,12 +94,6 @@ def test_backsolve_adjoint_explains(name):
 
 
 def test_a_largest_step_that_is_an_array(errors_raise):
-    class Still(eqx.Module):
-        max_step: jax.Array
-
-        def __call__(self, y0, h):
-            return y0 + 0 * h
-
     still = unchecked(Still(jnp.array(0.25)))
     with pytest.raises(RuntimeError, match="a step is longer than the flow map was trained for"):
         jax.block_until_ready(solve(still, dt0=0.5).ys)
@@ -115,16 +109,12 @@ class Broken(eqx.Module):
         return jnp.where(jnp.max(jnp.abs(y0)) > 1.2, jnp.nan, y0 + h)
 
 
-def of_another_field():
-    return dfc.DeepONetSolver(flow_map(taylor=dfc.learned.Taylor(lambda t, y, args: 2 * y)))
-
-
 FLOW, FOLLOW = ft.partial(of, "deeponet"), ft.partial(of, "pinn")
-NAN = jnp.nan * LORENZ.y0
+NAN, GROWING = jnp.nan * LORENZ.y0, dfc.learned.Taylor(lambda t, y, args: 2 * y)
 CASES = {
     "backwards": (FLOW, dict(t1=-1.0, dt0=-0.25), "backwards in time"),
     "too long": (FLOW, dict(t1=2.0, dt0=0.5), "a step is longer"),
-    "another field": (of_another_field, {}, "not trained for this vector field"),
+    "another field": (lambda: dfc.DeepONetSolver(flow_map(taylor=GROWING)), {}, "not trained for"),
     "not a number": (FLOW, dict(y0=NAN), "not finite"),
     "no longer a number": (lambda: unchecked(Broken()), {}, "not finite"),
     "another start": (FOLLOW, dict(y0=LORENZ.y0 + 0.125), "not the state that the PINN has"),

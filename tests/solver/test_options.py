@@ -21,15 +21,10 @@ def run(t1=2.0, dt0=0.1, **options):
     return solve(rigid_body, solver, OMEGA0, t1=t1, dt0=dt0, saveat=STEPS, max_steps=64)
 
 
-def drifts(sol):
-    """The largest residual at each saved time."""
-    leaves = jax.tree.leaves(drift_of(sol, RIGID_BODY))
-    return np.max(np.abs(np.stack(leaves)), axis=0)[: int(sol.stats["num_steps"]) + 1]
-
-
 def test_every_projects_every_so_many_steps():
-    drift = drifts(run(every=3))
-    projected = np.arange(len(drift)) % 3 == 0
+    drift = np.stack(jax.tree.leaves(drift_of(run(every=3), RIGID_BODY)))[:, :21]
+    drift = np.max(np.abs(drift), axis=0)
+    projected = np.arange(21) % 3 == 0
     assert np.all(drift[projected] <= 4e-16)
     assert np.all(drift[~projected] >= 1e-10)
     assert dfc.statistics(run(every=3)).num_projections == 6
@@ -39,22 +34,6 @@ def test_nan_is_no_success_where_nothing_is_projected():
     solver = dfc.ManifoldProjection(dfc.RK4(), RIGID_BODY, every=2)
     sol = solve(lambda t, y, args: jnp.sqrt(-1 - t) * y, solver, OMEGA0, throw=False, t1=0.1)
     assert sol.result != dfx.RESULTS.successful
-
-
-@pytest.mark.slow
-def test_options_can_be_traced_and_batched():
-    @jax.jit
-    def final(rtol, max_correction):
-        projection = dfc.SimplifiedNewton(rtol=rtol, metric=2.0)
-        solver = dfc.ManifoldProjection(
-            dfc.RK4(), RIGID_BODY, projection=projection, max_correction=max_correction
-        )
-        return solve(rigid_body, solver, OMEGA0).ys[-1]
-
-    batch = jax.vmap(final, (0, None))(jnp.array([4e-15, 1e-3]), 0.5)
-    expected = run(t1=1.0, projection=dfc.SimplifiedNewton(metric=1.0))
-    np.testing.assert_allclose(batch[0], expected.ys[10], rtol=1e-14)
-    np.testing.assert_allclose(batch[1], batch[0], rtol=1e-3)
 
 
 def test_statistics_are_those_of_the_projections():
@@ -95,13 +74,6 @@ def test_statistics_need_the_solver_state():
 # ---- Every way to save, to stop, and to choose steps that diffrax has ----
 
 
-SOLVER = dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY)
-
-
-def saved(saveat, **kwargs):
-    return solve(rigid_body, SOLVER, OMEGA0, saveat=saveat, **kwargs)
-
-
 ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 
 
@@ -117,7 +89,11 @@ ADAPTIVE = dfx.PIDController(rtol=1e-6, atol=1e-6)
 def test_every_controller_hits_its_times_on_the_manifold(controller, times):
     dt0 = None if isinstance(controller, dfx.StepTo) else 0.1
     options = dict(stepsize_controller=controller, dt0=dt0, max_steps=64)
-    sol = saved(dfx.SaveAt(t0=True, steps=True), **options)
+    solver, saveat = (
+        dfc.ManifoldProjection(dfx.Tsit5(), RIGID_BODY),
+        dfx.SaveAt(t0=True, steps=True),
+    )
+    sol = solve(rigid_body, solver, OMEGA0, saveat=saveat, **options)
     assert largest(drift_of(sol, RIGID_BODY)) <= 4e-16
     for t in times:
         assert np.min(np.abs(np.asarray(sol.ts) - t)) <= 1e-6

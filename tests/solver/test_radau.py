@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 from scipy.special import ellipj
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
 
 from ..problems import EPS, largest, refused
 from ..test_benchmarks import benchmark
@@ -24,10 +23,6 @@ def solve(term, solver, t1, y0, args, tol, *, scale=1.0, saveat=dfx.SaveAt(t1=Tr
         term, solver, 0.0, t1, 1e-6, y0, args, stepsize_controller=controller, max_steps=10_000,
         saveat=saveat, throw=False,
     )  # fmt: skip
-
-
-def digits(found, known):
-    return float(-np.log10(np.max(np.abs(np.asarray(found) / known - 1))))
 
 
 # ---- Ordinary differential equations ----
@@ -65,61 +60,37 @@ def test_hires():
     """Published by the test set for initial value problem solvers (Bari)."""
     field, end, y0, scale = benchmark("stiff").PROBLEMS["HIRES"]
     found = solve(dfx.ODETerm(field), dfc.Radau(), end, jnp.array(y0), None, 1e-6, scale=scale)
-    assert digits(found.ys[-1], HIRES) > 5
+    np.testing.assert_allclose(found.ys[-1], HIRES, rtol=1e-5)
     assert found.stats["num_accepted_steps"] <= 156 * 1.3  # of scipy's `Radau`
 
 
 # ---- Index 1 ----
 
-CAPACITIES = np.arange(1, 6) * 1e-6
-MASS = np.zeros((8, 8))
-for (i, j), c in zip([(0, 1), (3, 4), (6, 7)], CAPACITIES[[0, 2, 4]], strict=True):
-    MASS[[i, j], [i, j]], MASS[[i, j], [j, i]] = -c, c
-MASS[2, 2], MASS[5, 5] = -CAPACITIES[1], -CAPACITIES[3]
-AMPLIFIED = [-0.5562145012262709e-2, 3.006522471903042, 2.849958788608128,
-             2.926422536206241, 2.704617865010554, 2.761837778393145, 4.770927631616772,
-             1.236995868091548]  # fmt: skip
-START = np.array([0.0, 3, 3, 6, 3, 3, 6, 0])
+MASS, START = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([2.0, 1.0])
 
 
-def amplifier(t, y, args):
-    ub, r, alpha = 6.0, 9e3 if args is None else args, 0.99
-    one, two = (1e-6 * jnp.expm1((y[k] - y[k + 1]) / 0.026) for k in (1, 4))
-    return jnp.stack([
-        (y[0] - 0.1 * jnp.sin(200 * jnp.pi * t)) / 1e3,
-        (2 * y[1] - ub) / r + (1 - alpha) * one, y[2] / r - one, (y[3] - ub) / r + alpha * one,
-        (2 * y[4] - ub) / r + (1 - alpha) * two, y[5] / r - two, (y[6] - ub) / r + alpha * two,
-        y[7] / r,
-    ])  # fmt: skip
+def condenser(t, y, args):
+    """The charge `u - v` flows off through a resistor beside one that is not linear."""
+    return (1.0 if args is None else args) * jnp.stack([-y[0], y[1] ** 3 + y[1]])
 
 
-AMPLIFIER = dfc.DAE(amplifier, mass=MASS)
+CONDENSER = dfc.DAE(condenser, mass=MASS)
 
 
 @pytest.mark.slow
-def test_a_transistor_amplifier():
-    """Published by the Bari test set; and what is differentiated are the charges."""
-    y0 = AMPLIFIER.consistent(START + 0.1)
-    assert np.allclose(MASS @ (y0 - START - 0.1), 0, rtol=0, atol=1e-21)
-    report = AMPLIFIER.report(START)
-    assert (report.index, report.freedom, len(report.algebraic)) == (1, 5, 3)
-    found = solve(AMPLIFIER.term, AMPLIFIER.wrap(dfc.Radau()), 0.2, START, None, 1e-6)
-    assert found.result == dfx.RESULTS.successful
-    assert largest(found.ys[-1] - np.array(AMPLIFIED)) < 1e-5
-
-
-@pytest.mark.slow
-def test_the_gradient_of_an_amplifier():
-    """Against differences, with steps of one length: those of a controller jump."""
+def test_a_singular_mass_matrix_and_a_gradient_through_it():
+    """`u = v³ + v`, so that `v² + 1 = 2 exp(-2/3 a t)`. `consistent` keeps the charge."""
     finder = dfx.VeryChord(rtol=1e-12, atol=1e-12)
-    solver = AMPLIFIER.wrap(dfc.Radau(root_finder=finder))
+    solver = CONDENSER.wrap(dfc.Radau(root_finder=finder))
 
-    def end(r):
-        y0 = AMPLIFIER.consistent(START, args=r)
-        steps = dict(dt0=2e-5, max_steps=256)
-        return dfx.diffeqsolve(AMPLIFIER.term, solver, 0.0, 0.005, y0=y0, args=r, **steps).ys[-1, 7]
+    @jax.jit
+    @jax.value_and_grad
+    def end(a):
+        y0 = CONDENSER.consistent(START + 0.1, args=a)
+        return dfx.diffeqsolve(CONDENSER.term, solver, 0.0, 0.5, 0.02, y0, a).ys[-1, 1]
 
-    dct.assert_gradients(end, 9e3, rtol=1e-6, forward=False)
+    v = np.sqrt(2 * np.exp(-1 / 3) - 1)
+    np.testing.assert_allclose(end(1.0), (v, -(v**2 + 1) / (6 * v)), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -208,8 +179,13 @@ def pendulum(t, y, args):
     return jnp.concatenate([v, WEIGHT - force * q, jnp.sum(q**2)[None] - 1])
 
 
-def test_a_pendulum_in_cartesian_coordinates():
-    """What is hidden holds at steps and between them."""
+@pytest.mark.parametrize(
+    "solver",
+    [dfc.Radau(), pytest.param(dfx.Tsit5(), marks=pytest.mark.slow)],
+    ids=["Radau", "Tsit5"],
+)
+def test_a_pendulum_in_cartesian_coordinates(solver):
+    """Of index 3. What is hidden holds at steps and between them."""
     dae = dfc.DAE(pendulum, mass=np.diag([1.0, 1, 1, 1, 0]))
     y0 = dae.consistent(jnp.array([1.0, 0, 0, 0, 0.3]))
     assert np.allclose(y0, [1, 0, 0, 0, 0], rtol=0, atol=EPS)
@@ -223,7 +199,7 @@ def test_a_pendulum_in_cartesian_coordinates():
     assert str(report).startswith("Index 3, with 2 degrees of freedom.")
     times = np.linspace(0.0, 2.0, 21)
     saveat = dfx.SaveAt(ts=times)
-    found = solve(dae.term, dae.wrap(dfc.Radau()), 2.0, y0, None, 1e-9, saveat=saveat)
+    found = solve(dae.term, dae.wrap(solver), 2.0, y0, None, 1e-9, saveat=saveat)
     q, v, force = np.split(np.asarray(found.ys), [2, 4], axis=1)
     centripetal = np.sum(v**2, axis=1) - force[:, 0] - 9.81 * q[:, 1]
     hidden = np.sum(q**2, axis=1) - 1, np.sum(q * v, axis=1), centripetal
@@ -231,45 +207,24 @@ def test_a_pendulum_in_cartesian_coordinates():
     assert largest(q - swing(times)) < 1e-8
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", [dfc.Radau(), dfx.Tsit5()], ids=["Radau", "Tsit5"])
-def test_jays_problem_of_index_3(solver):
-    """Jay, *Convergence of Runge-Kutta methods for differential-algebraic systems of index 3*,
-    Appl. Numer. Math. 17, 1995, with an exact solution."""
-
-    def jay(t, y, dy, args):
-        a, b, c, d, u = y
-        return dy[:4] - jnp.stack([
-            2 * a * b * c * d, -a * b * d**2, (a * b + c * d) * u, -a * b**2 * d**2 * u
-        ]), a * b**2 - 1  # fmt: skip
-
-    dae = dfc.DAE(residual=jay)
-    y0 = dae.consistent(jnp.ones(5))
-    assert np.array_equal(y0, np.ones(5))
-    assert dae.report(y0).index == 3
-    found = solve(dae.term, dae.wrap(solver), 1.0, y0, None, 1e-9)
-    e = np.exp
-    assert largest(found.ys[-1] - np.array([e(2), e(-1), e(2), e(-1), e(1)])) < 1e-7
-
-
 # ---- What is refused ----
 
 ONE = jnp.ones(2)
-DOUBLED = dfc.DAE(amplifier, mass=2 * MASS)
+DOUBLED = dfc.DAE(condenser, mass=2 * MASS)
 NOWHERE = dfc.DAE(residual=lambda t, y, dy, args: dy - jnp.log(-jnp.abs(y)))
 
 
 test_mistakes_are_named = refused(
     (lambda: dfc.DAE(lambda t, y, args: y), ValueError, r"`diffrax.ODETerm\(f\)`"),
-    (lambda: dfc.DAE(amplifier, mass=MASS, algebraic=stabilised), ValueError, "is given as"),
-    (lambda: dfc.DAE(residual=amplifier), TypeError, "`residual` of a `DAE`"),
-    (lambda: dfc.DAE(amplifier, mass=MASS[:3]), ValueError, "`mass` of a `DAE`"),
-    (lambda: dfc.DAE(amplifier, mass=MASS * np.nan), ValueError, "not finite"),
+    (lambda: dfc.DAE(condenser, mass=MASS, algebraic=stabilised), ValueError, "is given as"),
+    (lambda: dfc.DAE(residual=condenser), TypeError, "`residual` of a `DAE`"),
+    (lambda: dfc.DAE(condenser, mass=MASS[:1]), ValueError, "`mass` of a `DAE`"),
+    (lambda: dfc.DAE(condenser, mass=MASS * np.nan), ValueError, "not finite"),
     (lambda: dfc.DAE(stabilised, mass=MASS), TypeError, "`f` of a `DAE`"),
-    (lambda: AMPLIFIER.consistent(START[:2]), ValueError, "the state has 2|`f`"),
-    (lambda: AMPLIFIER.consistent(ONE, ONE), ValueError, "1 positional"),
-    (lambda: AMPLIFIER.consistent(START, fixed=(True, False)), ValueError, "`fixed`"),
-    (lambda: AMPLIFIER.consistent(jnp.ones(8, int)), TypeError, "floating-point"),
+    (lambda: CONDENSER.consistent(jnp.ones(3)), ValueError, "the state has 3"),
+    (lambda: CONDENSER.consistent(ONE, ONE), ValueError, "1 positional"),
+    (lambda: CONDENSER.consistent(START, fixed=(True, False)), ValueError, "`fixed`"),
+    (lambda: CONDENSER.consistent(jnp.ones(2, int)), TypeError, "floating-point"),
     (lambda: NOWHERE.report(ONE), ValueError, "not finite"),
     (
         lambda: dfc.DAE(residual=lambda t, y, dy, args: dy[:1] - y[:1]).consistent(ONE),
@@ -288,16 +243,16 @@ test_mistakes_are_named = refused(
     ),
     (
         lambda: jax.eval_shape(
-            lambda y: solve(DOUBLED.term, AMPLIFIER.wrap(dfc.Radau()), 1.0, y, None, 1e-6), START
+            lambda y: solve(DOUBLED.term, CONDENSER.wrap(dfc.Radau()), 1.0, y, None, 1e-6), START
         ),
         ValueError,
         "of the same `dae`",
     ),
-    (lambda: AMPLIFIER.wrap(AMPLIFIER.wrap(dfc.Radau())), TypeError, "itself"),
+    (lambda: CONDENSER.wrap(CONDENSER.wrap(dfc.Radau())), TypeError, "itself"),
     (lambda: dfc.Radau(root_finder=3), TypeError, "VeryChord"),
-    (lambda: AMPLIFIER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
+    (lambda: CONDENSER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
     (
-        lambda: jax.jit(lambda m: dfc.DAE(amplifier, mass=m).term.vf(0.0, START, None))(MASS),
+        lambda: jax.jit(lambda m: dfc.DAE(condenser, mass=m).term.vf(0.0, START, None))(MASS),
         TypeError,
         r"a function `mass\(t, y, args\)`",
     ),

@@ -26,9 +26,9 @@ LAYER = dfc.learned.ConservativeLayer(RADIUS, steps=2)
 KEY = jr.key(5)
 
 
-def circle(layer=None, seed=0):
+def circle():
     """A PINN for a quarter of a turn."""
-    return dfc.PINN(EAST, 0.0, 1.5, key=jr.key(seed), layer=layer, **SMALL)
+    return dfc.PINN(EAST, 0.0, 1.5, key=jr.key(0), **SMALL)
 
 
 def recipe(model, epochs=60, points=30, **options):
@@ -59,17 +59,20 @@ def defect(pinn, points=50):
     return float(jnp.mean(jax.jit(jax.vmap(one))(jnp.linspace(0, 1.5, points))))
 
 
-def error(pinn):
-    ts = jnp.linspace(0, 1.5, 20)
-    exact = jnp.stack([jnp.cos(ts), -jnp.sin(ts)], axis=1)
-    return float(jnp.max(jnp.abs(jax.jit(jax.vmap(pinn))(ts) - exact)))
+def test_the_first_loss_is_that_of_the_formula_and_progress_may_end_a_training():
+    model, calls = circle(), []
 
+    def progress(*numbers):
+        calls.append(numbers)
+        return numbers[0] >= 20
 
-def test_the_first_loss_is_that_of_the_formula():
-    model = circle()
-    _, log = train(model, times=grid)
+    _, log = train(model, times=grid, progress=progress)
     np.testing.assert_allclose(log.losses[0], defect(model, 30), rtol=1e-12)
     np.testing.assert_allclose(log.criteria[0], defect(model, 30), rtol=1e-12)
+    assert (log.ended, log.losses.size) == ("progress", 20)
+    np.testing.assert_array_equal(log.checked, [0, 20])
+    assert [call[:2] for call in calls] == [(0, 60), (20, 60)]
+    assert calls[-1][3] <= calls[0][3]
 
 
 @pytest.mark.slow
@@ -132,19 +135,6 @@ def test_the_second_of_several_seeds_compiles_nothing(kind, caplog):
         second, _ = of_seed(1)
     assert [r.message for r in caplog.records if "Compiling" in r.message] == []
     assert not eqx.tree_equal(first, second)
-
-
-def test_progress():
-    calls = []
-    train(circle(), times=grid, progress=lambda *numbers: calls.append(numbers))
-    assert [call[:2] for call in calls] == [(0, 60), (20, 60), (40, 60), (60, 60)]
-    assert calls[-1][3] <= calls[0][3]
-
-
-def test_progress_ends_a_training_by_returning_true():
-    _, log = train(circle(), times=grid, progress=lambda done, *rest: done >= 20)
-    assert (log.ended, log.losses.size) == ("progress", 20)
-    np.testing.assert_array_equal(log.checked, [0, 20])
 
 
 @pytest.mark.slow
