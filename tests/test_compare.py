@@ -60,7 +60,7 @@ def test_errors_and_drifts_are_those_of_the_closed_form(capsys):
     def errors(ys):
         return np.max(np.abs(ys - exact), axis=(1, 2))[shown] / np.max(np.abs(exact[shown]))
 
-    plain, kept, euclidean, _ = report.rows
+    plain, kept, euclidean = report.rows
     np.testing.assert_allclose(plain.errors[0], errors(ys), rtol=1e-6, atol=1e-10)
     np.testing.assert_allclose(report.error[0], np.max(errors(ys)), rtol=1e-6)
     np.testing.assert_allclose(report.error_at_end[0], errors(ys)[-1], rtol=1e-6)
@@ -121,7 +121,7 @@ def test_errors_of_a_batch_are_those_of_the_solver_that_it_hands_out():
     report = dfc.compare(kepler, dfc.RK4(), KEPLER, starts, t1=9.95, dt0=0.1, batch=True)
     names = [row.name for row in report.rows]
     assert names[0] == "nothing kept"
-    assert names[1::3] == ["all kept", "all but energy", "all but momentum"]
+    assert names[1::2] == ["all kept", "all but energy", "all but momentum"]
     assert "2 lanes" in report.verdict
     assert report.ts[-1] == 9.95
     row = report.rows[names.index("all but energy, metric=1.0")]
@@ -145,7 +145,7 @@ def test_adaptive_steps_and_a_balance():
         lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0]) - 0.1 * y[1]]), dfx.Tsit5(), balance,
         jnp.array([2.0, 0.0]), t1=20.0, rtol=1e-5, atol=1e-5,
     )  # fmt: skip
-    plain, kept, *_ = report.rows
+    plain, kept, _ = report.rows
     assert kept.drift["manifold"] < 1e-13 < 1e-8 < plain.drift["manifold"]
     assert report.last[0] == len(report.ts) - 1 == 100
     assert report.index is not None

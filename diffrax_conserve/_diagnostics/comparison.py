@@ -28,7 +28,7 @@ _MARGIN = 1.5
 _RISK = 1.5
 # A component that is less accurate by this factor is told, and without another gain it is a reason
 # not to project.
-_WORSE = 10
+WORSE = 10
 # An error below this is roundoff. It stands in the place of zero, which has no logarithm.
 _TINY = 1e-18
 # A change of a conserved combination that is larger than this is more than roundoff.
@@ -222,7 +222,7 @@ class ComparisonReport:
 
     def _worse(self, index: int) -> str:
         name, factor = self.rows[index].worsened
-        return f", but `{name}` is {factor:.2g} times less accurate" * (factor > _WORSE)
+        return f", but `{name}` is {factor:.2g} times less accurate" * (factor > WORSE)
 
     def _unjudged(self) -> str:
         if not np.isfinite(self.doubt).all():
@@ -402,7 +402,7 @@ def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     worst = {i: np.max(error[i, common] / error[0, common]) for i in means}
     gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
     little = [i for i in near if means[i] <= (1 + _EQUAL) * means[0]]
-    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= _WORSE]
+    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= WORSE]
     return next((i for i in [*gains, *equal] if i > 0), 0)
 
 
