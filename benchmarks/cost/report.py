@@ -13,6 +13,7 @@ from typing import Any
 import matplotlib as mpl
 import measuring
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
@@ -131,6 +132,9 @@ def draw_dae(results: Results) -> Figure:
             x, y = zip(*((1e3 * z["seconds"], z["error"]) for z in found), strict=True)
             ax.loglog(x, y, "o-", markersize=4, label=label)
         ax.set(title=name, xlabel="ms", ylabel="error")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("")
     figure.axes[0].legend(fontsize=8)
     return figure
 
