@@ -37,6 +37,13 @@ async whole => {
 """
 
 
+# The theme's script puts each table into a frame that scrolls, after the page has loaded.
+FRAMED = """
+() => [...document.querySelectorAll(".md-typeset table:not([class])")]
+  .every(table => table.closest(".md-typeset__scrollwrap"))
+"""
+
+
 def problems(site: Path, chromium: str) -> list[str]:
     """What is wrong with the site in this folder, one line each."""
     found = []
@@ -60,6 +67,7 @@ def problems(site: Path, chromium: str) -> list[str]:
         page.on("pageerror", lambda error: found.append(f"{page.url} says {error}"))
         for file in sorted(site.rglob("*.html")):
             page.goto(f"{HOST}/{file.relative_to(site).as_posix()}")
+            page.wait_for_function(FRAMED)
             for scheme in ("light", "dark"):
                 page.emulate_media(color_scheme=scheme)
                 for width in WIDTHS:
