@@ -104,7 +104,7 @@ def filled(text: str, results: Results) -> str:
     return text
 
 
-# ---- The figure ----
+# ---- The figures ----
 
 
 def draw_batches(results: Results) -> Figure:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import diffrax_conserve as dfc
+from diffrax_conserve._diagnostics.comparison import by_errors
 
 jax.config.update("jax_enable_x64", True)
 GRAVITY = 4 * np.pi**2
@@ -83,13 +84,12 @@ def main():
         (dfx.Dopri8(), dict(dt0=None, stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8))),
     ):
         plain = solved(solver, **steps)
-        largest = jax.tree.map(lambda y, x: jnp.max(jnp.abs(y - x), axis=0), plain, exact)
-        by_errors = jax.tree.map(lambda e: jnp.maximum(e, 1e-8 * jnp.max(e)) ** -2, largest)
+        weights = by_errors(*jax.tree.map(lambda x: np.asarray(x)[None], (plain, exact)))
         found = {"no projection": plain}
         for name, metric in {
             "default": None,
             "masses": 2 * (MASSES[:, None],),
-            "by errors": by_errors,
+            "by errors": weights,
         }.items():
             projection = dfc.SimplifiedNewton(metric=metric)
             projected = dfc.ManifoldProjection(solver, KEPT, projection=projection)

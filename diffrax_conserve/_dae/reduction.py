@@ -91,14 +91,12 @@ class Structure:
 
     def stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are
-        asked for, and which unknowns move. The last two ask for all, or with what each round has
-        brought the last one."""
+        asked for, and which unknowns move. In the last two all are asked for, and all move."""
         alone = self.brought if freely else ()
         asked = [np.arange(self.index) == k for k in range(len(alone))]
         moving = [np.isin(np.arange(self.size), found) for found in alone]
-        rest = 1 if alone else 2
-        every = rest * [np.full(self.index, True)], rest * [np.full(self.size, True)]
-        return np.stack(asked + every[0]), np.stack(moving + every[1])
+        last = np.full((2, self.index), True), np.full((2, self.size), True)
+        return np.stack([*asked, *last[0]]), np.stack([*moving, *last[1]])
 
     def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that

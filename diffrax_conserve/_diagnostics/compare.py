@@ -363,7 +363,7 @@ def _report(
     reference: dfx.AbstractSolver,
     ts: np.ndarray,
 ) -> ComparisonReport:
-    plain, _ = timed(task, solver)
+    plain, seconds = timed(task, solver)
     length = len(ts)
     known = np.asarray(plain.ts)[0, :length]
     ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
@@ -372,18 +372,17 @@ def _report(
     invariants = _invariants(task, ts, exact, sizes, entries)
     states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
 
-    def tried(variants: list[_Variant]) -> list[tuple[ComparisonRow, Any]]:
-        found = []
-        for variant in variants:
-            sols, seconds = timed(task, variant.shared)
-            ys, success = states(sols), np.asarray(sols.result == dfx.RESULTS.successful)
-            row = ComparisonRow(
-                variant.name, variant.kept, variant.solver, distance(ys, exact), success,
-                _message(sols, success), drifts(task, sols, entries),
-                changes(invariants, ys, sizes), np.asarray(sols.stats["num_steps"]), seconds,
-            )  # fmt: skip
-            found.append((row, ys))
-        return found
+    def told(variant: _Variant, sols: dfx.Solution, seconds: float) -> tuple[ComparisonRow, Any]:
+        ys, success = states(sols), np.asarray(sols.result == dfx.RESULTS.successful)
+        row = ComparisonRow(
+            variant.name, variant.kept, variant.solver, distance(ys, exact), success,
+            _message(sols, success), drifts(task, sols, entries), changes(invariants, ys, sizes),
+            np.asarray(sols.stats["num_steps"]), seconds,
+        )  # fmt: skip
+        return row, ys
+
+    def tried(metrics: dict[str, Any]) -> list[tuple[ComparisonRow, Any]]:
+        return [told(variant, *timed(task, variant.shared)) for variant in variants(metrics)]
 
     def judged(found: list[tuple[ComparisonRow, Any]]) -> ComparisonReport:
         rows = tuple(row for row, _ in found)
@@ -392,12 +391,13 @@ def _report(
         rows = (dataclasses.replace(row, worsened=beside(ys)) for row, ys in found)
         return dataclasses.replace(report, rows=tuple(rows))
 
-    found = tried([_Variant(NOTHING, (), solver, solver), *variants(metrics)])
-    report, weights = judged(found), by_errors(found[0][1], exact)
-    # These weights know the solution, so they seem better than they are elsewhere. They are tried
-    # only where the projection that keeps all spoils a component.
-    if metrics and weights is not None and report.rows[1].worsened[1] > WORSE:
-        report = judged(found + tried(variants({_BY_ERRORS: weights})))
+    nothing = told(_Variant(NOTHING, (), solver, solver), plain, seconds)
+    found = [nothing, *tried(metrics)]
+    report = judged(found)
+    # Weights by errors know the solution, so they seem better than they are elsewhere. They are
+    # tried only where the projection that keeps all spoils a component.
+    if metrics and report.rows[1].worsened[1] > WORSE:
+        report = judged(found + tried({_BY_ERRORS: by_errors(nothing[1], exact)}))
     return report
 
 

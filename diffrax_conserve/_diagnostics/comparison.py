@@ -51,8 +51,8 @@ def distance(ys: Any, exact: Any) -> Float[np.ndarray, "lanes times"]:
 
 def by_errors(ys: Any, exact: Any) -> Any:
     """The weights of a metric, with a leaf for each leaf of a state: the inverse squares of the
-    largest errors of the components, in units of the largest of their leaf. An error counts as at
-    least `√ε` of the largest. `None` if no error is known.
+    largest errors of the components. Relative to the largest value of its leaf an error counts as
+    at least `√ε` of the largest of all.
 
     Of all states with the given values the nearest in this metric is the most likely one, if errors
     are independent, with these sizes.
@@ -62,9 +62,7 @@ def by_errors(ys: Any, exact: Any) -> Any:
         off, size = (np.where(np.isfinite(a), np.abs(a), 0) for a in (y - x, x))
         sizes.append(np.max(size, initial=0) or 1.0)
         errors.append(np.max(off, axis=(0, 1)) / sizes[-1])
-    top = max((np.max(e, initial=0) for e in errors), default=0)
-    if top == 0:
-        return None
+    top = max(np.max(e, initial=0) for e in errors) or 1.0
     leaves, tree = jtu.tree_flatten(ys)
     least = [float(np.finfo(y.dtype).eps) ** 0.5 for y in leaves]
     parts = zip(errors, sizes, least, strict=True)
@@ -87,7 +85,8 @@ def worsened(
         largest = lambda a, early=early: np.max(np.abs(a), 1, where=early, initial=0)[judged]  # noqa: E731
         least = np.maximum(3 * largest(doubt - x), _BROKEN * np.max(largest(x), initial=0)) + _TINY
         now, then = (np.maximum(largest(a - x), least) for a in (y, before))
-        factor = np.nan_to_num(np.exp(np.mean(np.log(now / then), axis=0)), nan=np.inf)
+        # A lane that failed tells nothing here.
+        factor = np.exp(np.mean(np.nan_to_num(np.log(now / then)), axis=0))
         if factor.size:
             place = np.unravel_index(np.argmax(factor), factor.shape)
             where = f"[{', '.join(map(str, place))}]" if place else ""
