@@ -34,7 +34,17 @@ from .._constants import AT_BOUND, FROZEN_STEPS, ROUNDOFF, SHORTER, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
 from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
-from .linear import combined, corrected, factored, gram_matrix, roundoff_pivot, scaled_rows, solve
+from .linear import (
+    combined,
+    corrected,
+    factored,
+    gram_matrix,
+    in_order,
+    order_of,
+    roundoff_pivot,
+    scaled_rows,
+    solve,
+)
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -166,18 +176,22 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     dtype = equations.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
-    def first_rows(y: Any) -> Any:
-        """The gradients at the candidate, which the steps share."""
-        if directions is not None:
-            return directions
-        return scaled_rows(equations.in_units(equations.linearise(y)[1]))[1]
+    def shared(y: Any) -> Any:
+        """What the steps share: the order in which they eliminate the constraints, and in this
+        order the directions, or the gradients at the candidate."""
+        rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))[1]
+        along = rows if directions is None else directions
+        order = order_of(gram_matrix(rows, along))
+        return order, in_order(order, along)
 
-    def advance(first: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+    def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+        order, first = known
         seen = equations.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
         level, wrong = equations.level(g, equations.scale(jacobian, y))
         sizes, rows = scaled_rows(equations.in_units(jacobian))
+        rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
         # By the counter before the test, which goes down by one in each step. The test leaves one
         # for the last step, whenever that is.
@@ -191,14 +205,14 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - equations.change(corrected(rows, along, wrong / sizes, least=least))
+        moved = y - equations.change(corrected(rows, along, wrong, least=least, ordered=True))
         return keep_done(counter, moved, y), counter
 
     # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for
     # each use of the candidate.
-    loop: Any = first_rows, advance, candidate if lanes else lax.optimization_barrier(candidate)
+    loop: Any = shared, advance, candidate if lanes else lax.optimization_barrier(candidate)
     if lanes:
-        loop = written_out_loop(first_rows, advance, candidate, tests(max_steps))
+        loop = written_out_loop(shared, advance, candidate, tests(max_steps))
     start, step, y = loop
     found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
     return found._replace(y=joined(candidate, found.y))

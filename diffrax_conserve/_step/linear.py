@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
@@ -57,10 +57,15 @@ def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def corrected(
-    rows: Any, along: Any, b: Float[Array, " m"], *, least: float | Array | None = None
+    rows: Any,
+    along: Any,
+    b: Float[Array, " m"],
+    *,
+    least: float | Array | None = None,
+    ordered: bool = False,
 ) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
-    The `least` pivot that counts is that of `eliminated`.
+    The `least` pivot that counts, and whether the rows are `ordered`, are as in `eliminated`.
 
     If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
     the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
@@ -71,7 +76,7 @@ def corrected(
     gram = gram_matrix(rows, along)
     if _is_large(gram):
         return combined(solve(gram, b, least=least), along)
-    return combined(*eliminated(gram, b, along, least=least))
+    return combined(*eliminated(gram, b, along, least=least, ordered=ordered)[:2])
 
 
 def solve(
@@ -82,7 +87,7 @@ def solve(
         return refined(gram.factored(), gram.times, b)
     if _is_large(gram):
         return refined(factored(gram, least=least), lambda x: combined(x, gram.T), b)
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least))
+    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least)[:2])
 
 
 def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
@@ -137,7 +142,7 @@ def factored(gram: Any, *, least: float | Array | None = None) -> Solve:
     matrix = gram * unit[:, None] * unit
     if not _is_large(gram):
         one = jnp.eye(len(gram), dtype=gram.dtype)
-        below, above = eliminated(matrix, one, one)
+        below, above, _ = eliminated(matrix, one, one)
         return Factors((below, above.T), unit)
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
@@ -160,29 +165,38 @@ def refined(
     return x
 
 
+# For each two places, from the second on, whether the constraints there are exchanged.
+Order = tuple[Bool[Array, ""], ...]
+
+
 def eliminated(
-    gram: Float[Array, "m m"], b: Array, rows: Array, *, least: float | Array | None = None
-) -> tuple[Array, Array]:
-    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, in the order
-    of the elimination. The `combined` of both is `rowsᵀ gram⁻¹ b`.
+    gram: Float[Array, "m m"],
+    b: Array,
+    rows: Array,
+    *,
+    least: float | Array | None = None,
+    ordered: bool = False,
+) -> tuple[Array, Array, Order]:
+    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, and its
+    order. The `combined` of the first two is `rowsᵀ gram⁻¹ b`.
 
     Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
     angles between the gradient of each constraint and those before it. Next is always the
     constraint with the largest of them: if a nearly parallel one came earlier, its roundoff would
-    be magnified in the pivots of those that could replace it. A pivot of at most `least` of the
-    diagonal, by default roundoff, counts as infinite, so that its multiplier is zero."""
+    be magnified in the pivots of those that could replace it. What is given may be `ordered` in
+    this way already. A pivot of at most `least` of the diagonal, by default roundoff, counts as
+    infinite, so that its multiplier is zero."""
     m = len(gram)
     least = roundoff_pivot(gram.dtype) if least is None else least
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
-    b, rows = list(b), list(rows)  # pyright: ignore
+    b, rows, order = list(b), list(rows), []  # pyright: ignore
     for k in range(m):
-        for i in range(k + 1, m) if k else ():  # at first all are equal
+        for i in range(k + 1, m) if k and not ordered else ():  # at first all are equal
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
+            order.append(larger)
             for each in (*matrix[k:], matrix, size, b, rows):
-                first, second = each[k], each[i]
-                each[k] = jtu.tree_map(ft.partial(jnp.where, larger), second, first)
-                each[i] = jtu.tree_map(ft.partial(jnp.where, larger), first, second)
+                _exchange(each, k, i, larger)
         pivot = jnp.where(jnp.abs(matrix[k][k]) > least * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
@@ -190,7 +204,30 @@ def eliminated(
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         b[k] = b[k] / pivot
-    return jnp.stack(b), jnp.stack(rows)
+    return jnp.stack(b), jnp.stack(rows), tuple(order)
+
+
+def order_of(gram: Float[Array, "m m"]) -> Order:
+    """The order in which `eliminated` takes the constraints."""
+    return eliminated(gram, gram[0], gram)[2]
+
+
+def in_order(order: Order, each: Array) -> Array:
+    """One element or row for each constraint, in this order."""
+    if not order:
+        return each
+    x, m = list(each), len(each)
+    places = [(k, i) for k in range(1, m) for i in range(k + 1, m)]
+    for (k, i), exchanged in zip(places, order, strict=True):
+        _exchange(x, k, i, exchanged)
+    return jnp.stack(x)
+
+
+def _exchange(x: list[Any], k: int, i: int, exchanged: Bool[Array, ""]) -> None:
+    """Exchanges two elements of a list, which may be lists, if the flag is set."""
+    first, second = x[k], x[i]
+    x[k] = jtu.tree_map(ft.partial(jnp.where, exchanged), second, first)
+    x[i] = jtu.tree_map(ft.partial(jnp.where, exchanged), first, second)
 
 
 def scaled_rows(rows: Any) -> tuple[Float[Array, " m"], Any]:
