@@ -26,7 +26,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
 from ._step.iterate import any_lane, damped
-from ._step.metric import length
 from ._tree import ravel, tree_stop_gradient, tree_sub
 
 
@@ -107,15 +106,15 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         first = lambda: self.inner.evaluate(self.t0)  # noqa: E731
         step = target.step(self.t0, self.t1, first, self.error)
         problem = target.problem(t, candidate, step)
-        units = problem.equations.units
-        away = length(ravel(tree_sub(candidate, first())), units)
+        metric = problem.equations.factor
+        away = metric.length(ravel(tree_sub(candidate, first())))
         limit = lax.stop_gradient(jnp.maximum(self.limit, away))
 
         vector = ravel(candidate)
 
         def near(y: Array, ok: Array) -> Array:
             """Whether a projection succeeded without leading too far away."""
-            return ok & (length(y - vector, units) <= limit)
+            return ok & (metric.length(y - vector) <= limit)
 
         y, info = target.projection.solve(problem, vector)
         ok = near(y, info.ok)

@@ -23,6 +23,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._step.implicit import root
+from .._step.metric import Diagonal
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, divided
@@ -460,9 +461,10 @@ class _Return(AbstractProjection):
         structure = _structure(self.dae, problem.t, state, problem.args)
         if structure.index != 1:
             given = problem.equations
-            sizes = given.units if isinstance(given.units, Array) else jnp.ones_like(candidate)
-            units = structure.units(sizes)
-            freely = dataclasses.replace(problem, equations=dataclasses.replace(given, units=units))
+            metric, one = given.factor, jnp.ones_like(candidate)
+            sizes = metric.diagonal if isinstance(metric, Diagonal) else one
+            free = dataclasses.replace(given, factor=Diagonal(structure.units(sizes)))
+            freely = dataclasses.replace(problem, equations=free)
             y, info = SimplifiedNewton().solve(freely, candidate)
             return y, problem.report(candidate, y, info.num_steps, ok=info.ok)
         y = _solved_for(self.dae, problem.t, state, problem.args)

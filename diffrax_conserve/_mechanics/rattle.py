@@ -34,7 +34,7 @@ from .._step.equations import Equations, Jacobian, equations_of, shown_terms
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done
 from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
-from .._step.metric import length, spread
+from .._step.metric import Diagonal, spread
 from .._tree import ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -217,9 +217,9 @@ class RATTLE(dfx.AbstractSolver[Any]):
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
-        squares = jax.tree.map(jnp.square, equations.in_units(at.jacobian))
+        squares = jax.tree.map(jnp.square, equations.factor.of_rows(at.jacobian))
         lengths = jnp.sqrt(times(squares, jnp.ones_like(ravel(v))))
-        limit = lengths * length(drift(ravel(v)), equations.units) + jnp.abs(rate)
+        limit = lengths * equations.factor.length(drift(ravel(v))) + jnp.abs(rate)
         moves = rate + times(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | violated(equations, self.constraint, ravel(q))
@@ -288,8 +288,8 @@ class RATTLE(dfx.AbstractSolver[Any]):
     ) -> Equations:
         values, t = jnp.zeros_like(hidden), t * direction
         equations = equations_of(self.constraint, values, t, q, args, hidden)
-        units = lax.rsqrt(spread("masses", self.masses, q))
-        return dataclasses.replace(equations, units=units)
+        metric = Diagonal(lax.rsqrt(spread("masses", self.masses, q)))
+        return dataclasses.replace(equations, factor=metric)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
         """The function from velocities `v`, or momenta, to `q'`, both as vectors."""
@@ -300,7 +300,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
-        forces = equations.in_units(equations.in_units(jacobian))
+        forces = equations.factor.of_rows(equations.factor.of_rows(jacobian))
         if isinstance(jacobian, SparseRows):
             speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
             return jacobian.gram(forces.times_columns(speeds))
@@ -349,7 +349,7 @@ _once = lax.optimization_barrier
 
 def _impulse(equations: Equations, multiplier: Array, rows: Any) -> Float[Array, " n"]:
     """`M⁻¹ Gᵀ λ`."""
-    return equations.in_units(equations.in_units(combined(multiplier, rows)))
+    return equations.factor.of_rows(equations.factor.of_rows(combined(multiplier, rows)))
 
 
 def _shaken(

@@ -26,7 +26,6 @@ from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations
 from .._step.implicit import root
 from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
 from .._step.linear import combined, gram_matrix, saddle, scaled_rows, solve, times
-from .._step.metric import length
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -219,7 +218,7 @@ and backwards. `TypeError` or `ValueError` if another argument does not fit.
 def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(equations.residual, y)
-    return equations.change(equations.in_units(vjp(multiplier)[0]))
+    return equations.factor.of_change(equations.factor.of_rows(vjp(multiplier)[0]))
 
 
 def _solved(
@@ -232,24 +231,24 @@ def _solved(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = scaled_rows(start.in_units(start.linearise(y0)[1]))
+    sizes, first = scaled_rows(start.factor.of_rows(start.linearise(y0)[1]))
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 
     def stepped(multiplier: Array, rows: Array | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to
         compute that end, so they are those of the last unknowns, or at the candidate."""
-        candidate, result = inner(y0 + start.change(combined(multiplier * sizes, first)))
-        rows = end.in_units(end.linearise(candidate)[1]) if rows is None else rows
-        y = candidate + end.change(combined(multiplier, rows))
+        candidate, result = inner(y0 + start.factor.of_change(combined(multiplier * sizes, first)))
+        rows = end.factor.of_rows(end.linearise(candidate)[1]) if rows is None else rows
+        y = candidate + end.factor.of_change(combined(multiplier, rows))
         return _Unknowns(y, multiplier, candidate, result)
 
     def advance(now: _Unknowns, counter: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
-        rows = end.in_units(jacobian)
+        rows = end.factor.of_rows(jacobian)
         level, wrong = end.level(g, end.scale(jacobian, now.y))
         # What the gradients at the end itself change in the equation for the state.
-        defect = now.candidate + end.change(combined(now.multiplier, rows)) - now.y
-        off = length(defect, end.units) / (eps * length(jnp.abs(y0) + jnp.abs(now.y), end.units))
+        defect = now.candidate + end.factor.of_change(combined(now.multiplier, rows)) - now.y
+        off = end.factor.length(defect) / (eps * end.factor.length(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)
         solved = jnp.where(off <= NOISE, SETTLED, jnp.where(off <= ROUNDOFF, ON, OFF))
         solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._constants import MAX_STEPS
 from .._step.implicit import Along, solution
+from .._step.metric import Diagonal
 from .base import AbstractProjection, Problem, ProjectionInfo
 from .options import check_options, option
 
@@ -92,14 +93,17 @@ class AlongLine(AbstractProjection):
                 f"`AlongLine` has one unknown, but `manifold` has {size} scalar constraints. Keep "
                 "one integral, or pass `projection=SimplifiedNewton()`."
             )
-        # The iteration moves along `s Uᵀ λ`, for units `s` and a row `U` that are given. With
-        # `s = |w|` and the row `w / s` this is `w λ`, and the units of the user cancel. Where a
-        # component of `w` is zero, its unit must not be, because its derivative is not, but so
-        # small that the component counts for nothing.
+        # The iteration moves along `S Uᵀ λ`, for a factor `S` and a row `U` that are given. With
+        # `S = diag(s)`, `s = |w|` and the row `w / s` this is `w λ`, and the units of the user
+        # cancel. Where a component of `w` is zero, `s` must not be, because the derivative of the
+        # component is not, but so small that the component counts for nothing.
         line = self._line(problem, candidate)
         least = float(jnp.finfo(line.dtype).tiny) ** 0.5
-        units = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
-        equations, row = dataclasses.replace(problem.equations, units=units), (line / units)[None]
+        s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
+        equations, row = (
+            dataclasses.replace(problem.equations, factor=Diagonal(s)),
+            (line / s)[None],
+        )
         y, ok, count, _ = solution(Along(equations, candidate, row, max_steps=self.max_steps))
         if self.direction == "step":
             ok = ok & _is_no_return(problem, candidate, y)

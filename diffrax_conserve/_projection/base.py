@@ -20,7 +20,7 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._manifold import evaluate, is_entry, named_entries
 from .._printing import is_traced, names_at, printed
 from .._step.equations import ON, Equations, equations_of, relative
-from .._step.metric import MatrixUnits, PreferredUnits, Units, length, units_of
+from .._step.metric import AbstractFactor, Identity, Preferring, factor_of
 from .._tree import key_of, ravel, tree_all_finite, tree_stop_gradient, unflatten, unravel
 
 
@@ -167,7 +167,7 @@ class Problem(eqx.Module):
             num_steps=jnp.asarray(num_steps),
             residual_before=before,
             residual_after=after,
-            correction=length(y - candidate, equations.units),
+            correction=equations.factor.length(y - candidate),
             roundoff=jnp.max(relative(equations.hidden, scale)),
             # An iteration that diverged makes every residual large. So we look for the entry whose
             # residual is large both before and after: of both the smaller one counts.
@@ -208,9 +208,7 @@ def adapted(
     one; otherwise they keep theirs."""
     changed = {name: getattr(projection, name, None) for name in ("rtol", "atol")}
     if projection.metric is not None:
-        changed["units"] = units_of(projection.metric, t, y, args)
-    if isinstance(changed.get("units"), MatrixUnits):
-        changed["pattern"] = None  # products with a matrix are dense
+        changed["factor"] = factor_of(projection.metric, t, y, args)
     return dataclasses.replace(equations, **changed)
 
 
@@ -229,14 +227,14 @@ class Target(eqx.Module):
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
     - `moved`: how far each component moves in the step; `None` outside a solve.
-    - `units`: those of the components where the projection has no metric of its own; `None` if they
-      are one, with noise and outside a solve.
+    - `factor`: that of the metric where the projection has none of its own: of the motion, or of
+      the numbers of the state, with noise and outside a solve.
     - `direction`: -1 if the solver's time is the negative of the manifold's, as in a solve
       backwards in time, otherwise 1.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
       second what rounding has added to them; `None` if no entry has a rate.
     - `preferred`: changes of the state in this step and the last one, if corrections are to stay
-      in their span; see `PreferredUnits`.
+      in their span; see `Preferring`.
     """
 
     projection: AbstractProjection
@@ -246,7 +244,7 @@ class Target(eqx.Module):
     args: Args
     direction: Real[Array, ""]
     moved: Float[Array, " n"] | None = None
-    units: Float[Array, " n"] | None = None
+    factor: AbstractFactor = Identity()
     gained: Float[Array, "2 m"] | None = None
     preferred: Float[Array, "k n"] | None = None
 
@@ -301,17 +299,17 @@ class Target(eqx.Module):
             hidden = hidden + jnp.maximum(jnp.abs(self.values) - jnp.abs(self.value), 0)
         t = t * self.direction
         equations = equations_of(self.manifold, self.value, t, like, self.args, hidden)
-        equations = dataclasses.replace(equations, units=self.units, moved=self.moved)
+        equations = dataclasses.replace(equations, factor=self.factor, moved=self.moved)
         equations = adapted(equations, self.projection, t, y, self.args)
         if self.preferred is None:
             return equations
-        units = PreferredUnits.along(equations.units, self.preferred)
-        return dataclasses.replace(equations, units=units, pattern=None)  # their products are dense
+        factor = Preferring.along(equations.factor, self.preferred)
+        return dataclasses.replace(equations, factor=factor)
 
-    def metric(self, t: RealScalarLike, y: Y) -> Units:
-        """The units of the components in the metric of the projection, at a time of the solver."""
-        metric = self.projection.metric
-        return self.units if metric is None else units_of(metric, t * self.direction, y, self.args)
+    def metric(self, t: RealScalarLike, y: Y) -> AbstractFactor:
+        """The factor of the metric of the projection, at a time of the solver."""
+        own = self.projection.metric
+        return self.factor if own is None else factor_of(own, t * self.direction, y, self.args)
 
     def step(
         self, start: RealScalarLike, end: RealScalarLike, y0: Callable[[], Y], error: Y | None

@@ -22,7 +22,7 @@ from .._step.equations import Equations
 from .._step.implicit import Along, certain, root, solution
 from .._step.iterate import Solved, damped
 from .._step.linear import gram_matrix, least_pivot, saddle, solve, times, unit_rows
-from .._step.metric import measured
+from .._step.metric import Identity
 from .._tree import tree_stop_gradient
 from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS
@@ -122,15 +122,15 @@ class _Conditions(eqx.Module):
         # else, so that a component that is never moved has the derivative of the candidate.
         candidate, change = self.given.candidate, unknowns[: self.base.size]
         base = self.base + (candidate - lax.stop_gradient(candidate))
-        return self.given.clip(base + self.given.equations.change(change))
+        return self.given.clip(base + self.given.equations.factor.of_change(change))
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         equations, away = self.given.equations, self.base - lax.stop_gradient(self.given.candidate)
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(equations.residual, self.state(unknowns))
-        gradient = equations.in_units(vjp(multiplier / self.lengths)[0])
-        return jnp.concatenate([measured(away, equations.units) + change - gradient, g])
+        gradient = equations.factor.of_rows(vjp(multiplier / self.lengths)[0])
+        return jnp.concatenate([equations.factor.measured(away) + change - gradient, g])
 
 
 def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Equations]:
@@ -138,10 +138,10 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     equations, y = given.equations, given.clip(base)
     jacobian = equations.linearise(y)[1]
-    lengths, rows = unit_rows(equations.in_units(jacobian))
+    lengths, rows = unit_rows(equations.factor.of_rows(jacobian))
     conditions = _Conditions(given, base, lengths)
-    sizes_of = [jnp.abs(measured(x, equations.units)) for x in (base, given.candidate)]
-    change = measured(base - given.candidate, equations.units)
+    sizes_of = [jnp.abs(equations.factor.measured(x)) for x in (base, given.candidate)]
+    change = equations.factor.measured(base - given.candidate)
     fits = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
     scale = equations.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
@@ -157,7 +157,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         magnitude=jnp.concatenate([sizes_of[0] + sizes_of[1], scale]),
         hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
         moved=None,
-        units=None,
+        factor=Identity(),
         rtol=tolerance(ROUNDOFF * eps, equations.rtol),
         atol=tolerance(0.0, equations.atol),
     )
@@ -173,7 +173,7 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
         base, _, count, left = now
         _, start, tested = _conditions(still, base)
         found = damped(tested, start, max_steps=max_steps, polish=True)
-        end = base + still.equations.change(found.y[: base.size])
+        end = base + still.equations.factor.of_change(found.y[: base.size])
         left = jnp.where(found.ok, left - 1, 0)
         return jnp.where(found.ok, end, base), found.ok, count + found.num_steps, left
 

@@ -28,7 +28,7 @@ from .._manifold import (
 from .._options import check_number
 from .._step.equations import equations_of
 from .._step.linear import corrected, gram_matrix, scaled_rows, solve
-from .._step.metric import positive_weights, units_of
+from .._step.metric import factor_of, positive_weights
 from .._tree import ravel, tree_add, unflatten, unravel
 from .options import check_state
 
@@ -156,7 +156,7 @@ class TangentField(eqx.Module):
         numbers = ravel(values).astype(vector.dtype)
         equations = equations_of(self.manifold, numbers, t, y, args)
         if self.metric is not None:
-            equations = dataclasses.replace(equations, units=units_of(self.metric, t, y, args))
+            equations = dataclasses.replace(equations, factor=factor_of(self.metric, t, y, args))
         evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
@@ -168,9 +168,9 @@ class TangentField(eqx.Module):
             sizes, and so is the right side."""
             vector, wrong = given
             _, jacobian = equations.linearise(vector)
-            sizes, rows = scaled_rows(equations.in_units(jacobian))
+            sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
             gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = equations.change(corrected(rows, rows, right))
+            change = equations.factor.of_change(corrected(rows, rows, right))
             return change, solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))

@@ -73,7 +73,7 @@ def project_within(
     without the clip. A component that reaches its bound costs a step, so there may be twice as many
     of them.
     """
-    rows = equations.in_units(equations.linearise(candidate)[1])
+    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
     within = bounds.compose(equations)
     return solution(Along(within, candidate, rows, iteration=bounded, max_steps=2 * max_steps))
 

@@ -21,7 +21,7 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.within_bounds import bounded_parts
 from .._step.equations import reach
 from .._step.iterate import any_lane
-from .._step.metric import length
+from .._step.metric import Diagonal, Identity
 from .._tree import ravel, tree_add, tree_sub
 from .diffrax_private import member
 from .state import (
@@ -260,14 +260,14 @@ class ManifoldProjection(ForwardingSolver):
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         # Whether it succeeded, and if not, whether a shorter step could.
-        units = start.metric(t0, y0)
+        metric = start.metric(t0, y0)
         first = jnp.all(state.motion == 0)  # it is zero only before the first step
         cannot_start = self._cannot_start(start, state, t0, y0, first, made_jump)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
-        told = info.ok, cannot_start, state.values, (y0, candidate, y1), units
+        told = info.ok, cannot_start, state.values, (y0, candidate, y1), metric
         failed = cause_of_failure(*told, self.max_correction, hopeless=first | final)
         statistics = state.statistics.add(
-            info, due, None if error is None else length(ravel(error), units)
+            info, due, None if error is None else metric.length(ravel(error))
         )
         # The last state of a solve that failed is NaN. In a batch such a lane is evaluated until
         # the last one ends, and NaN costs no iterations.
@@ -275,7 +275,7 @@ class ManifoldProjection(ForwardingSolver):
         dense_info = dict(
             inner=dense_info,
             shift=tree_sub(y1, candidate),
-            limit=reach(ravel(y0), ravel(y1), units),
+            limit=reach(ravel(y0), ravel(y1), metric),
             error=None if step is None else error,
             target=Packed(start),
             due=due,
@@ -333,7 +333,7 @@ class ManifoldProjection(ForwardingSolver):
             args,
             time_direction(terms, t),
             moved=change,
-            units=motion if is_ode(terms) else None,
+            factor=Diagonal(motion) if is_ode(terms) else Identity(),
             gained=state.gained,
             preferred=preferred,
         )

@@ -23,7 +23,7 @@ from .._options import found_in
 from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
 from .._step.equations import Equations, reach
-from .._step.metric import Units, length
+from .._step.metric import AbstractFactor, Identity
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
@@ -281,7 +281,7 @@ def cause_of_failure(
     cannot_start: Bool[Array, ""],
     values: Float[Array, " m"],
     states: tuple[Y, Y, Y],
-    units: Units = None,
+    factor: AbstractFactor = Identity(),
     max_correction: RealScalarLike | None = None,
     hopeless: BoolScalarLike = False,
 ) -> Int[Array, ""]:
@@ -293,8 +293,8 @@ def cause_of_failure(
     finite, known = jnp.abs(jnp.sum(correction)) < jnp.inf, jnp.all(jnp.isfinite(values))
     cause = jnp.where(ok, 0, jnp.where(hopeless, _NO_STATE, _NOT_REACHED))
     if max_correction is not None:
-        limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, units)
-        cause = jnp.where(ok & (length(correction, units) > limit), _TOO_FAR, cause)
+        limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, factor)
+        cause = jnp.where(ok & (factor.length(correction) > limit), _TOO_FAR, cause)
     cause = jnp.where(cannot_start, _START, cause)
     return jnp.where(known & (finite | (cause == 0)), cause, _NOT_FINITE)
 

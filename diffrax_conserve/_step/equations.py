@@ -31,7 +31,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, SparseRows, pattern_of
 from .._manifold import evaluate, is_entry
 from .._tree import ravel, unflatten, unravel
-from .metric import Units, in_state, length, times_units
+from .metric import AbstractFactor, Identity
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
@@ -48,12 +48,7 @@ class Equations(eqx.Module):
     - `parts`: the residual of each entry.
     - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
     - `hidden`: the part of it that the gradients do not show.
-    - `units`: the metric `M` in the form in which it is used, as a factor `S` of `M⁻¹ = S Sᵀ`. A
-      vector `s` is the unit in which a correction of each component is measured, `S = diag(s)`;
-      `None` means that all units are one. A component whose unit is zero is never moved. All linear
-      algebra works with the product `G S`, in whose columns the units of the user have cancelled.
-      So nothing is squared before it is scaled, which could overflow, and a change of units by
-      powers of two changes no bit of the result.
+    - `factor`: the metric, as a factor `S` of `M⁻¹ = S Sᵀ`.
     - `moved`: how far each component moves in the step of a solve; `None` outside a solve.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
@@ -64,7 +59,7 @@ class Equations(eqx.Module):
     parts: tuple[Part, ...]
     magnitude: Float[Array, " m"]
     hidden: Float[Array, " m"]
-    units: Units = None
+    factor: AbstractFactor = Identity()
     moved: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
@@ -82,7 +77,7 @@ class Equations(eqx.Module):
         the row of one would contain zeros times the gradients of the others, which are NaN where
         those gradients are infinite.
         """
-        if self.pattern is not None:
+        if self.pattern is not None and not self.factor.is_dense:
             return SparseRows.linearised(self.pattern, self.parts, y)
         values, rows = [], []
         for part in self.parts:
@@ -133,16 +128,10 @@ class Equations(eqx.Module):
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= ON
 
-    def in_units(self, rows: Any) -> Any:
-        """`G S` for the rows of a Jacobian, or for one gradient."""
-        return times_units(rows, self.units)
 
-    def change(self, u: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S u`, the change of the state that is `u` when it is measured in the units."""
-        return in_state(u, self.units)
-
-
-def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> Float[Array, ""]:
+def reach(
+    start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
+) -> Float[Array, ""]:
     """The length of a step in the metric, with which the length of a correction is compared.
 
     Each component counts as moved by at least `√ε` of itself. Where gradients are nearly parallel,
@@ -150,7 +139,7 @@ def reach(start: Float[Array, " n"], end: Float[Array, " n"], units: Units) -> F
     at rest would have no length, and every correction would be longer than it.
     """
     least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
-    return length(jnp.maximum(jnp.abs(end - start), least), units)
+    return factor.length(jnp.maximum(jnp.abs(end - start), least))
 
 
 def shown_terms(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array, " m"]:

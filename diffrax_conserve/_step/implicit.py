@@ -4,8 +4,8 @@ Whatever solves the equations `F(x, p) = 0` for the unknowns `x`, its derivative
 `p` is `ẋ = -(∂F/∂x)⁻¹ ∂F/∂p ṗ`. It holds for the unknowns that were computed, whatever the number
 of steps, and no step is unrolled. That is one rule, `solution`. A system of equations says how it
 is solved, what `F` is, and how a linear system with its derivative is solved. The parameters are
-the arrays of which it consists: the candidate, the values that are conserved, the units, parameters
-of the user's functions.
+the arrays of which it consists: the candidate, the values that are conserved, the metric, and the
+parameters of the user's functions.
 """
 
 import abc
@@ -23,7 +23,6 @@ from .._tree import tree_tangents, unflatten
 from .equations import Equations, Jacobian
 from .iterate import Solved, nearby
 from .linear import combined, corrected, gram_matrix, least_pivot, solve, times, unit_rows
-from .metric import measured
 
 
 class AbstractSystem(eqx.Module):
@@ -106,14 +105,14 @@ class Along(AbstractSystem):
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
-        return self.equations.in_units(self.equations.linearise(start)[1])
+        return self.equations.factor.of_rows(self.equations.linearise(start)[1])
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
         """Whether a state was found, and the multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, from
         which the state follows."""
         start = self._start(solved.ok)
         sizes, rows = unit_rows(self._along(start))
-        change = measured(jnp.where(solved.ok, solved.y, start) - start, self.equations.units)
+        change = self.equations.factor.measured(jnp.where(solved.ok, solved.y, start) - start)
         multiplier = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
         return solved.ok, multiplier / sizes
 
@@ -124,8 +123,8 @@ class Along(AbstractSystem):
             change = combined(multiplier, self.directions)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
             _, vjp = jax.vjp(self.equations.residual, start)
-            change = self.equations.in_units(vjp(multiplier)[0])
-        end = start + self.equations.change(change)
+            change = self.equations.factor.of_rows(vjp(multiplier)[0])
+        end = start + self.equations.factor.of_change(change)
         # The second equation at the end of the correction, so that its tangent contains the first.
         return end, self.equations.residual(end)
 
@@ -135,10 +134,10 @@ class Along(AbstractSystem):
         t_y, t_g = (-x for x in right)
         equations, start = self.equations, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = unit_rows(equations.in_units(equations.linearise(y)[1]))
+        heights, rows = unit_rows(equations.factor.of_rows(equations.linearise(y)[1]))
         along = unit_rows(self._along(start))[1]
         change = corrected(rows, along, t_g / heights, least=least_pivot(rows))
-        return t_y - equations.change(change)
+        return t_y - equations.factor.of_change(change)
 
 
 @jax.custom_jvp

@@ -179,7 +179,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     def shared(y: Any) -> Any:
         """What the steps share: the order in which they eliminate the constraints, and in this
         order the directions, or the gradients at the candidate."""
-        rows = scaled_rows(equations.in_units(equations.linearise(y)[1]))[1]
+        rows = scaled_rows(equations.factor.of_rows(equations.linearise(y)[1]))[1]
         along = rows if directions is None else directions
         order = order_of(gram_matrix(rows, along))
         return order, in_order(order, along)
@@ -190,7 +190,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
         level, wrong = equations.level(g, equations.scale(jacobian, y))
-        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
         rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
         # By the counter before the test, which goes down by one in each step. The test leaves one
@@ -205,7 +205,9 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - equations.change(corrected(rows, along, wrong, least=least, ordered=True))
+        moved = y - equations.factor.of_change(
+            corrected(rows, along, wrong, least=least, ordered=True)
+        )
         return keep_done(counter, moved, y), counter
 
     # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for
@@ -228,7 +230,7 @@ def _of_many(equations: Equations, candidate: Float[Array, " n"], max_steps: int
     candidate = lax.optimization_barrier(candidate)
     jacobian = equations.linearise(candidate)[1]
     scale = equations.scale(jacobian, candidate)
-    along = equations.in_units(jacobian)
+    along = equations.factor.of_rows(jacobian)
     sizes, rows = scaled_rows(along)
     solve = factored(gram_matrix(rows, rows))
     _, vjp = jax.vjp(equations.residual, candidate)
@@ -236,8 +238,8 @@ def _of_many(equations: Equations, candidate: Float[Array, " n"], max_steps: int
     def along_gradients(multiplier: Array) -> Array:
         """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
         if isinstance(along, SparseRows):
-            return equations.change(equations.in_units(vjp(multiplier)[0]))
-        return equations.change(combined(multiplier, along))
+            return equations.factor.of_change(equations.factor.of_rows(vjp(multiplier)[0]))
+        return equations.factor.of_change(combined(multiplier, along))
 
     def advance(y: Array, counter: Array) -> tuple[Array, Array]:
         level, wrong = equations.level(equations.residual(y), scale)
@@ -289,9 +291,9 @@ def damped(
         scale = jnp.where(first, here, now.scale)
         residuals = jnp.abs(relative(g, scale))
         better = jnp.all(residuals <= now.largest)  # false if one is NaN
-        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
         along = rows if directions is None else directions
-        further = y - equations.change(corrected(rows, along, wrong / sizes))
+        further = y - equations.factor.of_change(corrected(rows, along, wrong / sizes))
         shorter = now.best + SHORTER * (y - now.best)
         best = jnp.where(better, y, now.best)
         largest = jnp.where(better, jnp.max(residuals), now.largest)
@@ -308,7 +310,7 @@ def damped_along(
 ) -> Solved:
     """As `nearby`, by the damped iteration."""
     del directions
-    rows = equations.in_units(equations.linearise(candidate)[1])
+    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
     return damped(equations, candidate, rows, max_steps=max_steps)
 
 
@@ -330,11 +332,11 @@ def bounded(
         g, jacobian = lax.optimization_barrier(equations.linearise(z))
         level, _ = equations.level(g, equations.scale(jacobian, z))
         counter = after_test(level, counter, polish=False)
-        sizes, rows = scaled_rows(equations.in_units(jacobian))
+        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = solve(gram_matrix(rows, directions), g / sizes)
-        change = equations.change(combined(multiplier, directions))
+        change = equations.factor.of_change(combined(multiplier, directions))
         share = _share(equations, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 

@@ -190,21 +190,21 @@ def eliminated(
     least = roundoff_pivot(gram.dtype) if least is None else least
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
-    b, rows, order = list(b), list(rows), []  # pyright: ignore
+    right, sides, order = list(b), list(rows), []
     for k in range(m):
         for i in range(k + 1, m) if k and not ordered else ():  # at first all are equal
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             order.append(larger)
-            for each in (*matrix[k:], matrix, size, b, rows):
+            for each in (*matrix[k:], matrix, size, right, sides):
                 _exchange(each, k, i, larger)
         pivot = jnp.where(jnp.abs(matrix[k][k]) > least * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
-            b[i], rows[i] = b[i] - below * b[k], rows[i] - beside * rows[k]
+            right[i], sides[i] = right[i] - below * right[k], sides[i] - beside * sides[k]
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
-        b[k] = b[k] / pivot
-    return jnp.stack(b), jnp.stack(rows), tuple(order)
+        right[k] = right[k] / pivot
+    return jnp.stack(right), jnp.stack(sides), tuple(order)
 
 
 def order_of(gram: Float[Array, "m m"]) -> Order:

@@ -1,15 +1,15 @@
 """The metric `M` of a projection, in the form of a factor `S` of its inverse, `M⁻¹ = S Sᵀ`.
 
-Projections never use `M` itself. For weights, `S` is the diagonal matrix of the units `1/√M_k` of
-the components. For parts of the state that have a matrix, it is made from a Cholesky factor. And a
-metric may prefer the directions in which a step has moved, so that a correction keeps what these
-directions keep.
+Projections never use `M` itself. For weights `S` is a diagonal matrix. For parts of the state that
+have a matrix it is made from a Cholesky factor. And a metric may prefer the directions in which a
+step has moved, so that a correction keeps what these directions keep.
 """
 
+import abc
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax
@@ -28,33 +28,94 @@ from .._options import check_function, check_number
 from .._tree import ravel, real_view
 
 
-class MatrixUnits(eqx.Module):
-    """A factor `S` of `M⁻¹ = S Sᵀ`, where the metric `M` is a matrix in some parts of the state. In
-    such a part `M = L Lᵀ` is the Cholesky factorisation, and `S = L⁻ᵀ`; elsewhere `S` is diagonal.
+class AbstractFactor(eqx.Module):
+    """A factor `S` of `M⁻¹ = S Sᵀ`, as products with it and with its inverse.
 
-    - `diagonal`: the units of the components, ones in the parts with a matrix.
+    All linear algebra works with `G S`, in whose columns the units of the user have cancelled. So
+    nothing is squared before it is scaled, which could overflow, and a change of units by powers of
+    two changes no bit of the result.
+    """
+
+    # Whether the product of a sparse row with `S` is dense.
+    is_dense: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def of_rows(self, rows: Any) -> Any:
+        """`rows S`, for the rows of a Jacobian or for one gradient."""
+
+    @abc.abstractmethod
+    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """`S change`, the change of the state that is `change` when the metric measures it."""
+
+    @abc.abstractmethod
+    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """`S⁻¹ change`."""
+
+    def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
+        """The length of a change of the state in the metric."""
+        return jnp.linalg.norm(self.measured(change))
+
+
+@final
+class Identity(AbstractFactor):
+    """`S = 1`, which costs no product."""
+
+    def of_rows(self, rows: Any) -> Any:
+        return rows
+
+    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return change
+
+    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return change
+
+
+@final
+class Diagonal(AbstractFactor):
+    """`S = diag(s)`. The number `s_k = 1/√M_k` is the unit in which a correction of the component
+    is measured. A component whose unit is zero is never moved, and its `S⁻¹ change` is zero."""
+
+    diagonal: Float[Array, " n"]
+
+    def of_rows(self, rows: Any) -> Any:
+        if isinstance(rows, SparseRows):
+            return rows.times_columns(self.diagonal)
+        return rows * jnp.broadcast_to(self.diagonal, rows.shape)
+
+    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return change * self.diagonal
+
+    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        moves = self.diagonal != 0
+        return jnp.where(moves, change / jnp.where(moves, self.diagonal, 1), 0)
+
+
+@final
+class Matrices(AbstractFactor):
+    """The factor of a metric that is a matrix in some parts of the state. In such a part
+    `M = L Lᵀ` is the Cholesky factorisation, and `S = L⁻ᵀ`; elsewhere `S` is diagonal.
+
+    - `elsewhere`: the diagonal, ones in the parts with a matrix.
     - `lower`: the factor `L` of each part with a matrix.
     - `starts`: the first component of each of these parts.
     """
 
-    diagonal: Float[Array, " n"]
+    elsewhere: Diagonal
     lower: tuple[Float[Array, "k k"], ...]
     starts: tuple[int, ...] = eqx.field(static=True)
+    is_dense: ClassVar[bool] = True
 
     def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-        """`rows S`."""
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
-        return self._in_parts(solve, rows * self.diagonal)
+        return self._in_parts(solve, self.elsewhere.of_rows(rows))
 
     def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S change`."""
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
-        return self._in_parts(solve, change * self.diagonal)
+        return self._in_parts(solve, self.elsewhere.of_change(change))
 
     def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S⁻¹ change`."""
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
-        return self._in_parts(product, measured(change, self.diagonal))
+        return self._in_parts(product, self.elsewhere.measured(change))
 
     def _in_parts(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
         """`x` with `fn(L, part)` in the place of each part with a matrix."""
@@ -64,9 +125,10 @@ class MatrixUnits(eqx.Module):
         return x
 
 
-class PreferredUnits(eqx.Module):
+@final
+class Preferring(AbstractFactor):
     """The factor `S (P + δ (1 - P))`, where `S` is the factor of another metric, the `own` one, and
-    `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, in the units of `S`.
+    `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, as measured by `S`.
 
     In this metric a correction leaves the span only where nothing within it reaches the manifold,
     because outside of the span it is longer by `1/δ`. The square of `δ`, its share in `M⁻¹`, is
@@ -74,16 +136,17 @@ class PreferredUnits(eqx.Module):
     can be solved that the span alone leaves singular.
     """
 
-    own: "Float[Array, ' n'] | MatrixUnits | None"
+    own: AbstractFactor
     basis: Float[Array, "k n"]
+    is_dense: ClassVar[bool] = True
 
     @classmethod
-    def along(cls, own: Any, changes: Float[Array, "k n"]) -> "PreferredUnits":
+    def along(cls, own: AbstractFactor, changes: Float[Array, "k n"]) -> "Preferring":
         """With the span of given changes of the state, by the Gram-Schmidt process. Each change is
         made orthogonal to the others twice, because once would leave roundoff in the ratio of its
-        length before and after. If its new part is less than `δ` of it, it is left out: it has too
-        few digits to keep what the others keep."""
-        changes = jax.vmap(lambda x: measured(x, own))(changes)
+        length before and after. If no more than a share `δ` of it is new, it is left out: the new
+        part has too few digits to keep what the others keep."""
+        changes = jax.vmap(own.measured)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
         least = _outside(changes.dtype) ** 2
@@ -100,16 +163,17 @@ class PreferredUnits(eqx.Module):
         return cls(own, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
     def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-        """`rows S (P + δ (1 - P))`."""
-        return self._shared(times_units(rows, self.own), _outside(rows.dtype))
+        return self._shared(self.own.of_rows(rows), _outside(rows.dtype))
 
     def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S (P + δ (1 - P)) change`."""
-        return in_state(self._shared(change, _outside(change.dtype)), self.own)
+        return self.own.of_change(self._shared(change, _outside(change.dtype)))
 
     def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`(P + (1 - P) / δ) S⁻¹ change`."""
-        return self._shared(measured(change, self.own), 1 / _outside(change.dtype))
+        return self._shared(self.own.measured(change), 1 / _outside(change.dtype))
+
+    def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
+        """In the own metric: a preference says where a correction leads, and not how long it is."""
+        return self.own.length(change)
 
     def _shared(self, x: Float[Array, "*m n"], outside: float) -> Float[Array, "*m n"]:
         """`x (P + outside (1 - P))`."""
@@ -119,49 +183,8 @@ class PreferredUnits(eqx.Module):
 
 
 def _outside(dtype: Any) -> float:
-    """`δ` of `PreferredUnits`."""
+    """`δ` of `Preferring`."""
     return float(jnp.finfo(dtype).eps) ** (ADDED_POWER / 2)
-
-
-# The metric as it is used: a unit for each component, or a factor that is no diagonal matrix, or
-# `None` if all units are one.
-Units = Float[Array, " n"] | MatrixUnits | PreferredUnits | None
-
-
-def times_units(rows: Any, units: Units) -> Any:
-    """`rows S`, for the rows of a Jacobian or for one gradient."""
-    if units is None:
-        return rows
-    if isinstance(units, MatrixUnits | PreferredUnits):
-        return units.of_rows(rows)
-    if isinstance(rows, SparseRows):
-        return rows.times_columns(units)
-    return rows * jnp.broadcast_to(units, rows.shape)
-
-
-def in_state(u: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
-    """`S u`, the change of the state that is `u` when it is measured in the units."""
-    if isinstance(units, MatrixUnits | PreferredUnits):
-        return units.of_change(u)
-    return u if units is None else u * units
-
-
-def measured(change: Float[Array, " n"], units: Units) -> Float[Array, " n"]:
-    """`S⁻¹ change`, each component measured in its unit. It is zero where the unit is zero, because
-    such a component is never moved."""
-    if units is None:
-        return change
-    if isinstance(units, MatrixUnits | PreferredUnits):
-        return units.measured(change)
-    moves = units != 0
-    return jnp.where(moves, change / jnp.where(moves, units, 1), 0)
-
-
-def length(change: Float[Array, " n"], units: Units) -> Float[Array, ""]:
-    """The length of a change of the state in the metric. A preference says where a correction
-    leads, and not how long it is."""
-    units = units.own if isinstance(units, PreferredUnits) else units
-    return jnp.linalg.norm(measured(change, units))
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:
@@ -198,9 +221,9 @@ def _is_positive_definite(matrix: np.ndarray) -> bool:
     return bool(symmetric and np.all(np.linalg.eigvalsh((matrix + matrix.T) / 2) > 0))
 
 
-def units_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> Units:
-    """The units `M^(-1/2)` of a metric at a state. The unit of an infinite weight is zero, so that
-    its component is never moved."""
+def factor_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> AbstractFactor:
+    """The factor of a metric at a state. The unit of an infinite weight is zero, so that its
+    component is never moved."""
     values = jtu.tree_map(lambda x: x(t, y, args) if callable(x) else x, metric, is_leaf=callable)
     like, matrices, start = jax.eval_shape(lambda: y), {}, 0
 
@@ -215,11 +238,11 @@ def units_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> Units:
         return given
 
     _check_prefix("metric", values, like)
-    diagonal = 1 / jnp.sqrt(spread("metric", jtu.tree_map(weights, values, like), like))
+    units = 1 / jnp.sqrt(spread("metric", jtu.tree_map(weights, values, like), like))
     if not matrices:
-        return diagonal
-    factors = (jnp.linalg.cholesky(jnp.asarray(x, diagonal.dtype)) for x in matrices.values())
-    return MatrixUnits(diagonal, tuple(factors), tuple(matrices))
+        return Diagonal(units)
+    lower = (jnp.linalg.cholesky(jnp.asarray(x, units.dtype)) for x in matrices.values())
+    return Matrices(Diagonal(units), tuple(lower), tuple(matrices))
 
 
 def spread(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:

@@ -18,6 +18,7 @@ from diffrax_conserve._large import sparse
 from diffrax_conserve._step.equations import Equations, equations_of
 from diffrax_conserve._step.linear import combined, gram_matrix, times
 from diffrax_conserve._step.linear import solve as gram_solve
+from diffrax_conserve._step.metric import Diagonal
 
 from ..problems import difference, largest, solve
 from ..thinned import some_of
@@ -68,12 +69,14 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     beside = y + 0.01 * jr.normal(key[1], y.shape, dtype)
     values = jnp.zeros(jax.eval_shape(entry.fn, 0.0, y, None).size + 4, dtype)
     equations = equations_of(manifold, values, 0.0, y, None)
-    equations = dataclasses.replace(equations, units=jnp.exp(jr.normal(key[2], (y.size,), dtype)))
+    equations = dataclasses.replace(
+        equations, factor=Diagonal(jnp.exp(jr.normal(key[2], (y.size,), dtype)))
+    )
     assert equations.pattern is not None
     x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
 
     def rows(equations: Equations, y: Array) -> Any:
-        return equations.in_units(equations.linearise(y.reshape(-1))[1])
+        return equations.factor.of_rows(equations.linearise(y.reshape(-1))[1])
 
     @jax.jit
     def found() -> Any:
