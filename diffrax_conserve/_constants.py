@@ -7,8 +7,8 @@
 # compared with this many units of it.
 ROUNDOFF = 16
 # A residual of this many units is noise: rounding the state and evaluating the residual contribute
-# about one unit each. An iteration can reduce it by chance only, so it is not corrected. With other
-# tolerances the share of the tolerance is the same.
+# about one unit each. An iteration can reduce it by chance only, so it is not corrected. Where the
+# user sets a tolerance, noise is the same share of it, an eighth.
 NOISE = 2
 # An iteration has at most this many steps, unless the user says otherwise. In a solve two are
 # usual. The rest is for steps of the solver that are much too long.
@@ -35,7 +35,7 @@ WRITTEN_OUT = 4
 ADDED_POWER = 3 / 4
 # So many solves, all but the first for what is left of the right side, remove from a solution what
 # the addition has changed in it.
-REFINEMENTS = 3
+SOLVES = 3
 # Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 AT_BOUND = 1e-10

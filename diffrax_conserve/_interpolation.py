@@ -63,7 +63,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     - `t0`, `t1`: the ends of the step, as times of the solver.
     - `inner`: the interpolant `u` of the wrapped solver.
     - `shift`: the correction of the step, `y₁ - ŷ₁`.
-    - `limit`: the length of the step in the metric, which no correction may exceed.
+    - `limit`: the length of the step in the metric, which a correction may exceed only if the time
+      is farther than that from the start of the step.
     - `error`: the error estimate of the step, if the projection uses it.
     - `target`: what the projection of the step aimed at, without the balances of the step itself.
     - `due`: whether the step is projected; `None` if every step is.
@@ -103,11 +104,11 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
         candidate = self.moved(t, left)
         target = self.target.unpack().advanced(self.t0, t, self.inner.evaluate)
-        first = lambda: self.inner.evaluate(self.t0)  # noqa: E731
+        first = self.inner.evaluate(self.t0)
         step = target.step(self.t0, self.t1, first, self.error)
         problem = target.problem(t, candidate, step)
         metric = problem.equations.factor
-        away = metric.length(ravel(tree_sub(candidate, first())))
+        away = metric.length(ravel(tree_sub(candidate, first)))
         limit = lax.stop_gradient(jnp.maximum(self.limit, away))
 
         vector = ravel(candidate)

@@ -24,8 +24,7 @@ class AlongLine(AbstractProjection):
     solver conserves, as every Runge-Kutta method does, are constant along $w$ and thus conserved
     too, without a metric and without being listed in the manifold. At saved times inside a step and
     in dense output $\hat y$ is the dense output. Derivatives follow from the implicit function
-    theorem for $\lambda$; where the sine of the angle between $w$ and the manifold is below the
-    root of roundoff, they are those of the candidate.
+    theorem for $\lambda$.
 
     **Along the error estimate**, `direction="error"`: $w$ is the error estimate of the step, in a
     Runge-Kutta method the difference from the embedded solution. Where $w$ is nearly tangent to the

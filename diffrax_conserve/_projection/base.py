@@ -56,7 +56,8 @@ class ProjectionInfo(eqx.Module):
 
     **Attributes:**
 
-    - `ok`: whether every residual is within its tolerance at the state that is returned.
+    - `ok`: whether the projection succeeded: every residual is within its tolerance at the state
+        that is returned, and what else the projection asks of it holds.
     - `result`: an `optimistix.RESULTS`, successful if and only if `ok`; `nonfinite` if the
         candidate has no finite residual, divergence if only the result has none.
     - `num_steps`: the number of iterations.
@@ -67,8 +68,8 @@ class ProjectionInfo(eqx.Module):
         projection.
     - `roundoff`: the largest share of a scale that the gradient does not show: near one where `fn`
         is less accurate than its gradient tells, as `1 - cos(q)` near zero.
-    - `worst`: the position in `names` of the entry with the largest relative residual (before or
-        after, the smaller), which tells the cause of a failure. `print` shows the name.
+    - `worst`: the position in `names` of the entry whose relative residual is large both before and
+        after, which tells the cause of a failure. `print` shows the name.
     - `names`: the names of the entries of the manifold, such as `manifold['energy']`.
     """
 
@@ -221,8 +222,8 @@ def check_projection(projection: Any) -> None:
 
 
 class Target(eqx.Module):
-    """Everything that a projection needs except the time and the candidate. It does not change
-    within a step, so that dense output can project by it too.
+    """Everything that a projection needs except the time and the candidate. Within a step only
+    `gained` changes, by `advanced`, so that dense output can project by the target too.
 
     - `values`: the conserved values at the start of the solve.
     - `hidden`: the part of the scales that the gradients do not show.
@@ -312,13 +313,13 @@ class Target(eqx.Module):
         return self.factor if own is None else factor_of(own, t * self.direction, y, self.args)
 
     def step(
-        self, start: RealScalarLike, end: RealScalarLike, y0: Callable[[], Y], error: Y | None
+        self, start: RealScalarLike, end: RealScalarLike, y0: Y, error: Y | None
     ) -> Step | None:
         """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
         if not self.projection.sees_step:
             return None
         error = None if error is None else ravel(error)
-        return Step(start * self.direction, end * self.direction, ravel(y0()), error)
+        return Step(start * self.direction, end * self.direction, ravel(y0), error)
 
     def problem(self, t: RealScalarLike, candidate: Y, step: Step | None = None) -> Problem:
         """The problem at a time of the solver."""

@@ -101,7 +101,8 @@ class _Given(eqx.Module):
 
 
 def _some_point(equations: Equations, given: _Given, max_steps: int) -> Solved:
-    """First phase: some point of the manifold, within bounds before the clip."""
+    """First phase: some point of the manifold, within bounds before the clip. Nobody uses its
+    derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
     if given.bounds is not None:
         return project_within(given.bounds, equations, given.candidate, max_steps=max_steps)
     return solution(Along(equations, given.candidate, iteration=damped, max_steps=max_steps))
@@ -165,8 +166,9 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
 
 
 def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:
-    """Second phase: the nearest point, and the number of steps. If there is none, the derivative is
-    NaN. The result of a failed projection is discarded, and its derivative must stay finite."""
+    """Second phase: the nearest point, and the number of steps. If the first phase has reached the
+    manifold, but no nearest point was found, the derivative is NaN. If it has not, the result is
+    discarded, and its derivative stays finite."""
     still = tree_stop_gradient(given)
 
     def approach(now: Any) -> Any:

@@ -1,5 +1,5 @@
-"""The simplified Newton iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as
-close to the manifold as the local error of a step. It moves along the gradients at the candidate.
+"""The iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as close to the
+manifold as the local error of a step. It moves along the gradients at the candidate.
 The iteration itself is `iterate.nearby`, that within bounds is in `within_bounds`, the derivative
 in `implicit`."""
 
@@ -15,7 +15,7 @@ from .within_bounds import AbstractNewton, project_within
 
 @final
 class SimplifiedNewton(AbstractNewton):
-    r"""Projects along the gradients at the candidate, with the constraint Jacobian frozen there.
+    r"""Projects along the gradients at the candidate, which is for candidates near the manifold.
 
     For the candidate $\hat y$, with $G = \partial g/\partial y\,(\hat y)$ and the metric $M$,
     solves $g(y) = 0$, $y = \hat y + M^{-1} G^\top \lambda$, for the multipliers
@@ -23,16 +23,19 @@ class SimplifiedNewton(AbstractNewton):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    Two iterations are enough for nearly every step of an integrator. If up to four constraints are
-    not met after six, the plane of the corrections may miss the manifold, as on a circular orbit:
-    from then on the corrections are along the gradients at each state. With more than four the
-    matrix is that at the candidate, factored once, so that after a long step it takes more
-    iterations, and fails sooner. For candidates far away use [`diffrax_conserve.Newton`][].
+    Two iterations are enough for nearly every step of an integrator. Up to four constraints have
+    the matrix of each state, as it is written here, so this is Newton's method. If they are not met
+    after six iterations, the plane of the corrections may miss the manifold, as on a circular
+    orbit: from then on the corrections are along the gradients at each state. With more than four
+    the matrix is that at the candidate, factored once, as in the simplified Newton iteration. So
+    after a long step it takes more iterations, and fails sooner. For candidates far away use
+    [`diffrax_conserve.Newton`][].
 
     The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state
-    up to six iterations; after more it is that along the gradients at the candidate. A constraint
-    whose gradient is parallel to others, so nearly that half of the digits would be lost, takes no
-    part in it: see [Derivatives near a circular orbit][derivatives-near-a-circular-orbit].
+    while the corrections are along the gradients at the candidate; otherwise it is that along them
+    all the same. A constraint whose gradient has an angle to the span of the others with a sine of
+    at most $\varepsilon^{1/4}$, which is 1e-4 in float64, takes no part in it, or little if there
+    are more than four: see [Derivatives near a circular orbit][derivatives-near-a-circular-orbit].
 
     !!! example
 

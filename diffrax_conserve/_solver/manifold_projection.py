@@ -94,21 +94,21 @@ class ManifoldProjection(ForwardingSolver):
     **The metric of motion.** A candidate is moved to the manifold along the gradients of the
     functions, and the metric shares out the correction among the components. By default it is
     $M = \mathrm{diag}(1/s^2)$ with a unit $s$ for each quantity of the state, the largest geometric
-    mean so far of its size and of its change in a step,
+    mean so far of its size and of its change $\Delta = |\hat y - y_n|$ in a step,
 
-    $$s = \max \sqrt{|\hat y|\, |\hat y - y_n|}.$$
+    $$s = \max \sqrt{\max(|\hat y|, \Delta)\, \Delta}.$$
 
     If the state has several leaves, each vector along the last axis of a leaf is one quantity, such
     as the place of a body, and $|\cdot|$ is its largest component: put quantities with unlike units
     into leaves of their own. If the state is one array, each component is a quantity. So the result
     does not depend on the units of the leaves, or of the components of a single array. A quantity
     that never moves, such as a parameter, counts as changing by $\varepsilon$ of itself, so that it
-    is hardly corrected if another can be. For a field in a single array, all of whose components
-    have one unit, pass `projection=SimplifiedNewton(metric=1.0)`, which is the Euclidean metric: a
-    travelling wave with all of its integrals kept needs it.
-    Stochastic equations have the Euclidean metric in the numbers of the state, because there the
-    metric decides which equation is solved: for mixed units pass
-    `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`.
+    is hardly corrected if another can be; one that rests at zero is not corrected at all. For a
+    field in a single array, all of whose components have one unit, pass
+    `projection=SimplifiedNewton(metric=1.0)`, which is the Euclidean metric: a travelling wave with
+    all of its integrals kept needs it. Stochastic equations have the Euclidean metric in the
+    numbers of the state, because there the metric decides which equation is solved: for mixed units
+    pass `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`.
 
     Conserving one integral is not always better than none: see "Choosing a projection". The
     projected method has the order of the wrapped one. A stage that the wrapped solver keeps for
@@ -237,16 +237,16 @@ class ManifoldProjection(ForwardingSolver):
         # next step, which starts at the projected state. Told of a jump, it evaluates the slope
         # there anew. It is told so in every step, because while one lane of a batch is in its first
         # step, diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend
-        # on the others. There are two exceptions. In an implicit method the kept slope fits the
-        # last stage, which its root finder has solved; a slope at the projected state would amplify
-        # the error of the root finder. `QUICSORT` keeps none, and refuses to be told.
-        keeps = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
+        # on the others. Two kinds of solvers are told what diffrax says. In an implicit method the
+        # kept slope fits the last stage, which its root finder has solved; a slope at the projected
+        # state would amplify the error of the root finder. `QUICSORT` refuses to be told of a jump.
+        as_it_is = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
         state = self._checked(solver_state)
         candidate, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, state.inner, made_jump if keeps else True
+            terms, t0, t1, y0, args, state.inner, made_jump if as_it_is else True
         )
-        # The projection. `start` is its target with the balances at the start of the step, from
-        # which dense output integrates them to any time in the step; `target` is that at the end.
+        # The projection. The target `before` has the balances at the start of the step, from which
+        # dense output integrates them to any time in the step; `target` has those at the end.
         change = distances(y0, candidate)
         motion = state.motion_after(change, candidate)
         # The dense output of the step is rarely needed, so it is made when it is called.
@@ -254,15 +254,16 @@ class ManifoldProjection(ForwardingSolver):
         preferred = state.preferred
         if preferred is not None:
             preferred = jnp.concatenate([changes_along(path(), t0, t1, y0), preferred[:_CHANGES]])
-        start = self._target(terms, t1, state, change, motion, preferred, args).following(t0, y0)
-        target = start.advanced(t0, t1, lambda t: path().evaluate(t))
-        step = target.step(t0, t1, lambda: y0, error)
+        before = self._target(terms, t1, state, change, motion, preferred, args).following(t0, y0)
+        target = before.advanced(t0, t1, lambda t: path().evaluate(t))
+        step = target.step(t0, t1, y0, error)
         due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
         y1, info = target.project_if(due, t1, candidate, step)
         # Whether it succeeded, and if not, whether a shorter step could.
-        metric = start.metric(t0, y0)
-        first = jnp.all(state.motion == 0)  # it is zero only before the first step
-        cannot_start = self._cannot_start(start, state, t0, y0, first, made_jump)
+        metric = before.metric(t0, y0)
+        # It is zero until a step has been accepted in which anything moved or was not zero.
+        first = jnp.all(state.motion == 0)
+        cannot_start = self._cannot_start(before, state, t0, y0, first, made_jump)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
         told = info.ok, cannot_start, state.values, (y0, candidate, y1), metric
         failed = cause_of_failure(*told, self.max_correction, hopeless=first | final)
@@ -277,7 +278,7 @@ class ManifoldProjection(ForwardingSolver):
             shift=tree_sub(y1, candidate),
             limit=reach(ravel(y0), ravel(y1), metric),
             error=None if step is None else error,
-            target=Packed(start),
+            target=Packed(before),
             due=due,
         )
         # diffrax looks at the result of a step only if the step is accepted. So a failed step
@@ -371,8 +372,9 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     `()` if only the bounds of the projection are kept.
 - `projection`: a `SimplifiedNewton`, `Newton`, `AlongLine`, `ClosedForm`, `Staged`, or your own.
 - `max_correction`: a projection fails if its correction is longer than this share of its step, both
-    in the metric of the projection. A component that hardly moves counts as moving by
-    $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
+    in the metric of the projection at the start of the step, which is that of motion for
+    projections without a metric, such as `Staged`. A component that hardly moves counts as moving
+    by $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
     manifold; whether a quantity is conserved at all is told by
     [`diffrax_conserve.check_invariance`][]. Default: no limit.
 - `keep_linear`: whether linear functions of the state that the wrapped solver keeps, such as the
@@ -382,8 +384,9 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     the state in the dense output of this step and the one before only where nothing within reaches
     the manifold. Linear entries of `manifold` are kept as without it. These are up to eight
     directions, for a few constraints: more than eight are refused. It costs eight vectors of the
-    size of the state in memory, in dense output for each step, and their products in time; a
-    sparse Jacobian is treated as dense. Active bounds, `AlongLine` and a `ClosedForm` ignore it.
+    size of the state in memory, in dense output for each step, and their products in time; a sparse
+    Jacobian is treated as dense. Active bounds, `AlongLine`, a `ClosedForm` and the stages of
+    `Staged` that have a metric of their own ignore it.
 - `every`: project only every `every`-th step. In the other steps neither the state nor dense output
     is projected, so the final state may be off the manifold.
 

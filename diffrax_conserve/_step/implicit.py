@@ -68,16 +68,18 @@ class Along(AbstractSystem):
     """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
-    The unknowns are `y` and `λ`, and the equations `ŷ + S Uᵀ λ - y = 0` and `g(y) = 0`.
+    The equations are `y = ŷ + S Uᵀ λ` and `g(y) = 0`. The first gives the state, so that the only
+    unknowns are the multipliers `λ`. But what is wanted is the derivative of the state. So `defect`
+    returns both sides that depend on the parameters, `ŷ + S Uᵀ λ` and `g` there.
 
     Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
     derivative would divide the error of the candidate's derivative by the sine of their angle. In
     the step of a solve it is of no use there: the candidate moves nearly along the manifold by
-    itself. So a constraint whose gradient is in the span of others, up to half of the digits of its
-    square, takes no part in the derivative, or little if there are more than four; see `linear`.
-    The derivative then has the accuracy of the wrapped solver in that direction. After more than
-    `FROZEN_STEPS` steps the directions were those at several states; the derivative is by those at
-    the candidate all the same, which differ by the size of the correction.
+    itself. So a constraint whose gradient has an angle to the span of the others with a squared
+    sine of at most `√ε` takes no part in the derivative, or little if there are more than four; see
+    `linear`. The derivative then has the accuracy of the wrapped solver in that direction. After
+    more than `FROZEN_STEPS` steps the directions were those at several states; the derivative is by
+    those at the candidate all the same, which differ by the size of the correction.
 
     The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
     times a tangent that is not finite would be NaN. So where nothing was found we differentiate at
@@ -108,8 +110,8 @@ class Along(AbstractSystem):
         return self.equations.factor.of_rows(self.equations.linearise(start)[1])
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
-        """Whether a state was found, and the multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, from
-        which the state follows."""
+        """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
+        where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
         sizes, rows = unit_rows(self._along(start))
         change = self.equations.factor.measured(jnp.where(solved.ok, solved.y, start) - start)

@@ -1,8 +1,8 @@
 """The iterations that lead to the manifold: one loop, and what a step of it may do.
 
-All are Newton's method for equations with more unknowns than constraints. They differ in what a
-step does, so a step is a function of the unknowns and of a counter, and the loop around it is
-written once, in `iterate`.
+All are Newton's method, for equations that have at least as many unknowns as there are equations.
+They differ in what a step does, so a step is a function of the unknowns and of a counter, and the
+loop around it is written once, in `iterate`.
 
 - `nearby` is for candidates as near as the local error of a solver's step (Hairer, Lubich and
   Wanner, IV.4, equations (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
@@ -11,6 +11,7 @@ written once, in `iterate`.
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration
   is Newton's method. With many constraints it is that at the candidate.
+- `bounded` is `nearby` within bounds.
 - `damped` is for starts far away. Each step is the shortest, in the metric, that solves the
   equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
   Springer 2004, Section 4.4). A step that increases the largest residual, or leaves the domain of a
@@ -108,10 +109,10 @@ def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
     """The counter after unknowns of this `level` were tested.
 
     Unknowns that are settled are done. Of those that are merely within the tolerance, one more step
-    brings the residual to roundoff, where `polish` asks for it; should that step have left the
-    tolerance, another returns to it. A residual that is not finite cannot recover, but one more
-    step takes the NaN to the unknowns, where everybody sees it. If no test is left and the unknowns
-    do not solve the equations, the iteration has failed.
+    brings the residual to roundoff, where `polish` asks for it; should that step leave the
+    tolerance, another tries to return to it. A residual that is not finite cannot recover, but one
+    more step takes the NaN to the unknowns, where everybody sees it. If no test is left and the
+    unknowns do not solve the equations, the iteration has failed.
     """
     then = jnp.where(level == NOT_FINITE, jnp.minimum(counter - 1, 1), counter - 1)
     then = jnp.where((level < ON) & (then == 0), -1, then)
@@ -159,9 +160,9 @@ def nearby(
     *,
     max_steps: int,
 ) -> Solved:
-    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions`, or the
-    gradients at the candidate; instead of the latter, those at each state after `FROZEN_STEPS`
-    steps."""
+    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
+    Up to four constraints may have other `directions` instead; without them the rows are the
+    gradients at each state, if those at the candidate have failed for `FROZEN_STEPS` steps."""
     if equations.magnitude.size > WRITTEN_OUT:
         return _of_many(equations, candidate, max_steps)
     return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
@@ -185,7 +186,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         return order, in_order(order, along)
 
     def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
-        order, first = known
+        order, at_candidate = known
         seen = equations.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
@@ -193,10 +194,11 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
         rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
-        # By the counter before the test, which goes down by one in each step. The test leaves one
-        # for the last step, whenever that is.
+        # In each step the counter goes down by one, but before the last step, which polishes, the
+        # test sets it to two. So we look at it before the test. Should the last step leave the
+        # tolerance, the one that tries to return is along the gradients at its state.
         frozen = counter > max_steps + 1 - FROZEN_STEPS
-        along = jnp.where(frozen, first, rows) if fresh else first
+        along = jnp.where(frozen, at_candidate, rows) if fresh else at_candidate
         counter = after_test(level, counter)
         # A step that only polishes is as long as roundoff over the sine of the angle between
         # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
@@ -210,12 +212,12 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         )
         return keep_done(counter, moved, y), counter
 
-    # The candidate is the end of a step. Without a barrier XLA would evaluate that step once for
-    # each use of the candidate.
-    loop: Any = shared, advance, candidate if lanes else lax.optimization_barrier(candidate)
     if lanes:
-        loop = written_out_loop(shared, advance, candidate, tests(max_steps))
-    start, step, y = loop
+        start, step, y = written_out_loop(shared, advance, candidate, tests(max_steps))
+    else:
+        # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
+        # that step once for each use of the candidate.
+        start, step, y = shared, advance, lax.optimization_barrier(candidate)
     found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
     return found._replace(y=joined(candidate, found.y))
 
@@ -303,15 +305,6 @@ def damped(
     begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), equations.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
     return found._replace(y=found.y.y)
-
-
-def damped_along(
-    equations: Equations, candidate: Float[Array, " n"], directions: None, *, max_steps: int
-) -> Solved:
-    """As `nearby`, by the damped iteration."""
-    del directions
-    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
-    return damped(equations, candidate, rows, max_steps=max_steps)
 
 
 # ---- Within bounds ----

@@ -2,17 +2,18 @@
 
 The matrices are singular where constraints depend on each other, as when an integral is given
 twice. Their multipliers are then not determined, but what they move is, if the constraints do not
-contradict each other. There are three ways to solve such a system, by its size.
+contradict each other. There are three ways to solve such a system.
 
 - Up to four constraints are eliminated one after the other, written out in scalars, and next always
   the one whose gradient is farthest from a combination of those before it. Once it is such a
   combination, its pivot is roundoff. We give it the multiplier zero: if the others hold, it holds
   too. Gradients that are only nearly parallel are all kept, because a correction needs the
   direction in which they differ. A derivative does not, and would lose its digits in that
-  direction; see `implicit`. Nor does a step that only polishes; see `iterate`.
+  direction; see `implicit`. Nor, below double precision, does a step that only polishes; see
+  `iterate`.
 - More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a
   derivative the share is the least pivot that counts: what is smaller has nearly no effect.
-- A sparse matrix is factored in blocks, in the same way; see `sparse`.
+- A sparse matrix is factored in blocks, with the same share in a derivative too; see `sparse`.
 """
 
 import functools as ft
@@ -27,7 +28,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import ADDED_POWER, REFINEMENTS, ROUNDOFF, WRITTEN_OUT
+from .._constants import ADDED_POWER, ROUNDOFF, SOLVES, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -160,7 +161,7 @@ def refined(
     """The solution of `product(x) = b` by iterative refinement, from a `solve` that is inaccurate,
     because something was added to the matrix."""
     x = solve(b)
-    for _ in range(REFINEMENTS - 1):
+    for _ in range(SOLVES - 1):
         x = x + solve(b - product(x))
     return x
 
@@ -262,6 +263,6 @@ def roundoff_pivot(dtype: Any) -> float:
 
 
 def least_pivot(rows: Any) -> float:
-    """The least pivot of unit rows that counts in a derivative. It has an error of one unit of
-    roundoff, so that half of the digits of what is divided by it are right."""
+    """The least pivot of unit rows that counts in a derivative, `√ε`. As a pivot has an error of
+    about `ε`, half of the digits of what is divided by it are right."""
     return float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(rows))).eps) ** 0.5

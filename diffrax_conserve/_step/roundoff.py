@@ -58,9 +58,9 @@ def hidden_scale(
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
     gradients do not show.
 
-    Where the value and the gradient show more than that part, it counts as zero. It is measured
-    once, at the start of a solve, and is added to the scale everywhere. So it must not contain what
-    the gradient shows here but not elsewhere.
+    That part is measured once, at the start of a solve, and added to the scale at every state.
+    Where value and gradient show more at the start, the part is zero: otherwise it would contain
+    what the gradient shows there, and add it again, or add it where there is nothing.
     """
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)
@@ -91,7 +91,7 @@ def hidden_scale(
 
 
 def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
-    """The value and the Jacobian of `fn` at `y`, and its roundoff there in units of roundoff.
+    """The value and the Jacobian of `fn` at `y`, and its error there by roundoff, divided by `ε`.
 
     The function is evaluated with two more arguments, both zero, which change nothing. The rule of
     `_rounded` gives them cotangents: the sum over all rounded values of size times adjoint, and the

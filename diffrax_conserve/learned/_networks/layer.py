@@ -13,7 +13,7 @@ from ..._manifold import check_manifold, conserved_values
 from ..._options import check_counts
 from ..._step.equations import Equations, equations_of
 from ..._step.implicit import Along, solution
-from ..._step.iterate import damped_along
+from ..._step.iterate import Solved, damped
 from ..._tree import ravel, unravel
 from .iterations import iterated
 from .trainable import LayerSchedule
@@ -79,7 +79,7 @@ class ConservativeLayer(eqx.Module):
         if self.steps is None:
             # The start is on the manifold, so the functions are finite there.
             known = ravel(start[1]).astype(vector.dtype)
-            options: Any = dict(iteration=damped_along, max_steps=MAX_STEPS)
+            options: Any = dict(iteration=_damped_along, max_steps=MAX_STEPS)
             projected = solution(Along(equations, vector, fallback=known, **options))
             y = jnp.where(projected.ok, projected.y, vector)
         else:
@@ -104,6 +104,15 @@ class ConservativeLayer(eqx.Module):
         values = ravel(self.values(*start)).astype(vector.dtype)
         equations = equations_of(self.manifold, values, t, candidate, self.args)
         return equations.dense(), vector
+
+
+def _damped_along(
+    equations: Equations, candidate: Float[Array, " n"], directions: None, *, max_steps: int
+) -> Solved:
+    """The damped iteration along the gradients at the candidate."""
+    del directions
+    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
+    return damped(equations, candidate, rows, max_steps=max_steps)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
