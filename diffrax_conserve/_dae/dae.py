@@ -23,10 +23,11 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._step.implicit import root
+from .._step.iterate import Solved
 from .._step.metric import Diagonal
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
-from .newton import MOST, algebraic_newton, divided
+from .newton import MOST, algebraic_newton, at_rest_near, divided
 from .radau import Radau
 from .reduction import (
     Implicit,
@@ -467,9 +468,8 @@ class _Return(AbstractProjection):
             freely = dataclasses.replace(problem, equations=free)
             y, info = SimplifiedNewton().solve(freely, candidate)
             return y, problem.report(candidate, y, info.num_steps, ok=info.ok)
-        y = _solved_for(self.dae, problem.t, state, problem.args)
-        # Newton's method knows the roundoff of the equations, and is NaN if it misses the root.
-        return y, problem.report(candidate, y, ok=jnp.all(jnp.isfinite(y)))
+        y = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
+        return y, problem.report(candidate, y)
 
 
 @eqx.filter_jit
@@ -481,7 +481,7 @@ def _consistent(
     if structure.index == 0:
         return y, tree_all_finite(_Slopes(dae)(t, y, args))
     if moves is None and structure.index == 1:
-        found = unravel(_solved_for(dae, t, y, args), y)
+        found = unravel(_solved_for(dae, t, y, args, algebraic_newton), y)
         return found, tree_all_finite(found)
     sizes = jnp.abs(lax.stop_gradient(ravel(y)))
     units = structure.units(jnp.where(sizes == 0, 1, sizes))
@@ -507,9 +507,11 @@ def _consistent(
 
 
 @eqx.filter_jit
-def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Array, " n"]:
-    """The state of equations of index 1, moved without what they differentiate; NaN if there is
-    none."""
+def _solved_for(
+    dae: DAE, t: RealScalarLike, state: Y, args: Args, newton: Callable[..., Solved]
+) -> Float[Array, " n"]:
+    """The state of equations of index 1, moved without what they differentiate; NaN if Newton's
+    method finds none."""
     structure, equations, t, y = _at(dae, t, state, args)
     along, free = structure.freely_moved(equations, t, y)
     fits = structure.fits(equations, t, y)
@@ -520,7 +522,7 @@ def _solved_for(dae: DAE, t: RealScalarLike, state: Y, args: Args) -> Float[Arra
     def residual(z: Array) -> Array:
         return jnp.where(fits, structure.constraints(equations, 1)(t, moved(z))[0], jnp.nan)
 
-    return moved(root(residual, ft.partial(algebraic_newton, residual), y[free], divided).y)
+    return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
 
 
 @final

@@ -1,7 +1,7 @@
 """Newton's method for algebraic unknowns, from guesses that may be poor."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
@@ -62,17 +62,38 @@ class _Factored(NamedTuple):
 
 
 def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
+    """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
+    z, at_rest, num_steps, settled = at_rest_near(residual, z)
+
+    def at_roundoff() -> Bool[Array, ""]:
+        g, jacobian, hidden = hidden_terms(residual, z)
+        limit = ROUNDOFF * float(jnp.finfo(z.dtype).eps)
+        return jnp.all(jnp.abs(g) <= limit * (shown_terms(jacobian, jnp.abs(z)) + hidden))
+
+    unsure = at_rest & ~settled
+    found = at_rest & (
+        settled | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
+    )
+    return Solved(jnp.where(found, z, jnp.nan), found, num_steps)
+
+
+def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
     Nonlinear Problems*, Springer 2004, 3.3).
 
     A correction is accepted if the one after it, computed with the same Jacobian, is shorter. So
     the test compares changes of `z`, and does not depend on the units of the equations. A
-    correction that is NaN is not accepted. The iteration ends with NaN if there is no root.
+    correction that is NaN is not accepted.
+
+    The iteration comes to rest where corrections have converged, which `more` tells, or where none
+    helps, perhaps because of roundoff: whether that is a root, the residual must tell. The result
+    is NaN if corrections become infinite, or the Jacobian is singular.
     """
     eps = float(jnp.finfo(z.dtype).eps)
 
-    def advance(now: tuple[Array, Array], counter: Array) -> tuple[tuple[Array, Array], Array]:
-        z, share = now  # the unknowns, and the share of the correction to try next
+    def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+        # The unknowns, the share of the correction to try next, and whether they have converged.
+        z, share, _ = now
         jacobian = jax.jacfwd(residual)(z)
         factored = _Factored.of(jacobian)
         step = factored.correction(residual(z))
@@ -92,24 +113,17 @@ def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) 
         better = then <= (1 - share / 2) * before
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
-        settled = better & (share == 1) & (then * then <= eps * before) & factored.regular()
+        settled = better & (share == 1) & (then * then <= eps * before)
         # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
-        # helping. Whether it is, we ask once, at the end.
+        # helping.
         stuck = ~better & (before <= eps**0.5)
         # A share of the root of roundoff still changes half of the digits of the unknown.
         going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > eps**0.5))
         z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
         share = jnp.where(better, jnp.minimum(share / SHORTER, 1), share * SHORTER)
-        return keep_done(counter, (z, share), now), after_step(settled, going, counter)
+        at_rest = (settled | (~going & (before < jnp.inf))) & factored.regular()
+        return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
 
-    start = z, jnp.ones((), z.dtype)
-    (z, _), settled, num_steps, _ = iterate(advance, start, max_steps=MOST)
-
-    def at_roundoff() -> Bool[Array, ""]:
-        """Whether the state where the iteration ended is a root as far as rounding lets us see."""
-        g, jacobian, hidden = hidden_terms(residual, z)
-        limit = ROUNDOFF * eps * (shown_terms(jacobian, jnp.abs(z)) + hidden)
-        return jnp.all(jnp.abs(g) <= limit) & _Factored.of(jacobian).regular()
-
-    found = settled | lax.cond(any_lane(~settled), at_roundoff, lambda: jnp.asarray(True))
-    return Solved(jnp.where(found, z, jnp.nan), found, num_steps)
+    start = z, jnp.ones((), z.dtype), jnp.asarray(False)
+    (z, _, settled), at_rest, num_steps, _ = iterate(advance, start, max_steps=MOST)
+    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, num_steps, settled)
