@@ -179,7 +179,7 @@ def decide_success_by_the_scale_at_the_candidate(package):
 
 
 def polish_along_nearly_parallel_gradients(package):
-    package.around("corrected")(lambda given, *x, least=None: given(*x))
+    package.around("corrected")(lambda given, *x, least=None, **y: given(*x, **y))
 
 
 def divide_by_every_pivot_in_derivatives(package):
@@ -213,6 +213,10 @@ def leave_what_was_added_to_the_diagonal(package):
 
 def divide_by_the_roundoff_of_a_pivot(package):
     package.in_module_of("eliminated", "ROUNDOFF", 0)
+
+
+def eliminate_in_the_given_order(package):
+    package.replace("in_order", lambda order, each: each)
 
 
 def cross_kinks_in_full_steps(package):
