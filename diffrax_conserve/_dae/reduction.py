@@ -140,9 +140,10 @@ class Structure:
         free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
         matrix = self.mass if self.mass is not None else self._by_slopes(equations, t, y)
         solve = np.linalg.solve if self.mass is not None else jnp.linalg.solve
-        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(jnp.eye(free.size))
+        one = jnp.eye(free.size, dtype=y.dtype)
+        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(one)
         inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
-        return along.at[columns].set(-solve(inner, outer)), free
+        return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
 
     def _by_slopes(self, equations: Implicit, t: Array, y: Array) -> Float[Array, "n n"]:
         return jax.jacfwd(equations, 2)(t, y, self.slopes(equations, 0, t, y))

@@ -107,7 +107,8 @@ class ComparisonRow:
     - `linear`: the largest change in each lane of linear invariants that nobody declared.
     - `steps`: the number of steps in each lane; `seconds`: the time of one solve.
     - `worsened`: the component that is least accurate beside the solve without projection, and by
-        which factor.
+        which factor. What is smaller than roundoff, 1e-11 of the largest component of its leaf, or
+        than the doubt about the reference, counts as that large.
     """
 
     name: str

@@ -89,7 +89,8 @@ class ManifoldProjection(ForwardingSolver):
     for the first integrals $I$ and the constraints $g$ of `manifold`. Dense output, saved times and
     events are projected too. The conserved values are computed once, at the start of the solve, and
     carried in the solver state: the drift does not grow with the number of steps, and a solve that
-    continues from a `solver_state` keeps the original values.
+    continues from a `solver_state` keeps the original values. If you have changed the state, as by
+    an impact, leave the `solver_state` out: it would bring the old values back.
 
     **The metric of motion.** A candidate is moved to the manifold along the gradients of the
     functions, and the metric shares out the correction among the components. By default it is
