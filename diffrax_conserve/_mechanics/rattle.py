@@ -275,7 +275,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         v1, keeps = _on_tangent(equations, at, rate, drift, kicked)
 
         ok = found & keeps
-        failed = cause_of_failure(ok, state.off, state.hidden, (q, q1, v1))
+        failed = cause_of_failure(ok, state.off, state.hidden, jnp.concatenate([q1, v1]))
         y1 = y1, unravel(v1, v0)
         y1 = jax.tree.map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
         result = dfx.RESULTS.where(failed == 0, dfx.RESULTS.successful, member(FIRST - 1 + failed))

@@ -182,7 +182,7 @@ class SymmetricProjection(ForwardingSolver):
         )
         info = target.problem(t1, y0).report(candidate, y1, num_steps, ok=ok)
         off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
-        failed = cause_of_failure(info.ok, off, state.values, (vector, candidate, y1))
+        failed = cause_of_failure(info.ok, off, state.values, ravel(y1) - ravel(candidate))
         inner_failed = result != dfx.RESULTS.successful
         y1 = unravel(jnp.where((failed > 0) | inner_failed, jnp.nan, y1), y0)
         result = dfx.RESULTS.where(

@@ -266,8 +266,14 @@ class ManifoldProjection(ForwardingSolver):
         first = jnp.all(state.motion == 0)
         cannot_start = self._cannot_start(before, state, t0, y0, first, made_jump)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
-        told = info.ok, cannot_start, state.values, (y0, candidate, y1), metric
-        failed = cause_of_failure(*told, self.max_correction, hopeless=first | final)
+        correction, too_far = ravel(tree_sub(y1, candidate)), jnp.asarray(False)
+        if self.max_correction is not None:
+            limit = jnp.asarray(self.max_correction, correction.dtype)
+            limit = limit * reach(ravel(y0), ravel(candidate), metric)
+            too_far = metric.length(correction) > limit
+        failed = cause_of_failure(
+            info.ok, cannot_start, state.values, correction, too_far, first | final
+        )
         statistics = state.statistics.add(
             info, due, None if error is None else metric.length(ravel(error))
         )

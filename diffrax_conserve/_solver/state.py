@@ -22,8 +22,7 @@ from .._manifold import Constraint, is_entry, named_entries
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
 from .._projection.base import ProjectionInfo
-from .._step.equations import Equations, reach
-from .._step.metric import AbstractFactor, Identity
+from .._step.equations import Equations
 from .._step.roundoff import hidden_scale
 from .._tree import ravel, real_view, unflatten
 from .diffrax_private import register
@@ -280,21 +279,16 @@ def cause_of_failure(
     ok: Bool[Array, ""],
     cannot_start: Bool[Array, ""],
     values: Float[Array, " m"],
-    states: tuple[Y, Y, Y],
-    factor: AbstractFactor = Identity(),
-    max_correction: RealScalarLike | None = None,
+    found: Float[Array, " n"],
+    too_far: BoolScalarLike = False,
     hopeless: BoolScalarLike = False,
 ) -> Int[Array, ""]:
-    """Why a step failed, 0 if it did not. The `states` are the last one, the candidate and the
-    result of its projection. A step is `hopeless` if a shorter one would hardly help."""
-    last, candidate, result = (ravel(y) for y in states)
-    correction = result - candidate
+    """Why a step failed, 0 if it did not. What it has `found` must be finite. It is `hopeless` if a
+    shorter one would hardly help."""
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
-    finite, known = jnp.abs(jnp.sum(correction)) < jnp.inf, jnp.all(jnp.isfinite(values))
+    finite, known = jnp.abs(jnp.sum(found)) < jnp.inf, jnp.all(jnp.isfinite(values))
     cause = jnp.where(ok, 0, jnp.where(hopeless, _NO_STATE, _NOT_REACHED))
-    if max_correction is not None:
-        limit = jnp.asarray(max_correction, last.dtype) * reach(last, candidate, factor)
-        cause = jnp.where(ok & (factor.length(correction) > limit), _TOO_FAR, cause)
+    cause = jnp.where(ok & too_far, _TOO_FAR, cause)
     cause = jnp.where(cannot_start, _START, cause)
     return jnp.where(known & (finite | (cause == 0)), cause, _NOT_FINITE)
 
