@@ -161,7 +161,8 @@ def _residuals(
     if sol.ts.ndim != 1:
         raise ValueError(
             f"`{user}` takes one solution, but `sol.ts` has shape {sol.ts.shape}. For a batch "
-            f"write `equinox.filter_vmap(lambda s: {user}(s, manifold, args))(sol)`."
+            f"write `equinox.filter_vmap(lambda s: {user}(s, manifold, args))(sol)`, with `args` "
+            f"of each lane `equinox.filter_vmap(lambda s, a: {user}(s, manifold, a))(sol, args)`."
         )
     for name, entry in named_entries(manifold):
         if sol.ts.size == 1 and not has_value(entry):

@@ -31,10 +31,19 @@ from .state import (
     cause_of_failure,
     distances,
     is_final,
+    must_start_on,
     started,
     violated,
 )
-from .terms import check_direction, check_nested, innermost, is_backsolve, is_ode, time_direction
+from .terms import (
+    check_direction,
+    check_nested,
+    check_projects_nothing,
+    innermost,
+    is_backsolve,
+    is_ode,
+    time_direction,
+)
 from .wrapper import ForwardingSolver
 
 # So many changes of the state are taken from the dense output of a step. They span the directions
@@ -90,7 +99,7 @@ class ManifoldProjection(ForwardingSolver):
     events are projected too. The conserved values are computed once, at the start of the solve, and
     carried in the solver state: the drift does not grow with the number of steps, and a solve that
     continues from a `solver_state` keeps the original values. If you have changed the state, as by
-    an impact, leave the `solver_state` out: it would bring the old values back.
+    an impact, leave the `solver_state` out: the old values do not fit.
 
     **The metric of motion.** A candidate is moved to the manifold along the gradients of the
     functions, and the metric shares out the correction among the components. By default it is
@@ -121,7 +130,8 @@ class ManifoldProjection(ForwardingSolver):
 
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
-    terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise after a jump
+    terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise if it
+    continues from the `solver_state` of a solve with other values, and after a jump
     that the step size controller declares, if the constraint jumps too: end the solve there,
     `project`, and go on.
 
@@ -162,6 +172,7 @@ class ManifoldProjection(ForwardingSolver):
                 f"`solver` is `{name}`, which is not a diffrax solver. Pass an instance, such as "
                 "`diffrax.Tsit5()`, or of a network its solver, such as `DeepONetSolver(network)`."
             )
+        check_projects_nothing(self.solver)
         check_nested(self.solver)
         check_projection(self.projection)
         free = isinstance(self.manifold, Constraint) and self.manifold.fn is _nothing
@@ -215,6 +226,7 @@ class ManifoldProjection(ForwardingSolver):
             hidden=hidden,
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
             motion=distances(y0, y0),
+            end=jnp.full_like(distances(y0, y0), jnp.inf),
             first_step=jnp.abs(t1 - t0),
             num_steps=None if self.every == 1 else jnp.asarray(0),
             statistics=ProjectionStatistics.zero(
@@ -303,6 +315,7 @@ class ManifoldProjection(ForwardingSolver):
             inner=inner,
             gained=target.gained,
             motion=motion,
+            end=ravel(y1),
             statistics=statistics,
             preferred=preferred,
         )
@@ -355,14 +368,17 @@ class ManifoldProjection(ForwardingSolver):
         first: Bool[Array, ""],
         made_jump: BoolScalarLike,
     ) -> Bool[Array, ""]:
-        """Whether a conserved value is not finite, or a step starts off a `Constraint` where
-        nothing has projected its state: at the first step, and after a jump of the vector field,
-        with which the constraint may jump."""
+        """Whether a conserved value is not finite, or a step starts off the manifold where nothing
+        has projected its state: where no step has ended, as at the start of a solve, and after a
+        jump of the vector field, with which a constraint may jump."""
         lost = ~jnp.all(jnp.isfinite(state.values))
-        if not any(isinstance(entry, Constraint) for _, entry in named_entries(self.manifold)):
+        if not any(must_start_on(entry) for _, entry in named_entries(self.manifold)):
             return lost
-        # If not every step is projected, a later step may well start off the constraint.
-        fresh = first if self.every > 1 else first | made_jump
+        # A state that is NaN has failed already. If not every step is projected, a later step may
+        # well start off the manifold.
+        start = ravel(y0)
+        elsewhere = jnp.any((start != state.end) & ~jnp.isnan(start))
+        fresh = first if self.every > 1 else elsewhere | made_jump
         equations = target.equations(t0, y0)
         off = lax.cond(
             any_lane(fresh),

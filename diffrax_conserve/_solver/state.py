@@ -31,11 +31,13 @@ _ENTRY = (
     "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
 )
 FIRST = register(
-    "a step cannot start: its state violates a `Constraint`. At the start of a solve, start on the "
-    "manifold: `y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a "
+    "a step cannot start: its state is off the manifold. At the start of a solve it must satisfy "
+    "each `Constraint`: `y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a "
     "`DAE` `y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps the "
-    "value that it has at the start is a `FirstIntegral`. After a jump of the vector field end the "
-    "solve there, `project`, and go on. " + _ENTRY,
+    "value that it has at the start is a `FirstIntegral`. A solve that continues from a "
+    "`solver_state` keeps the values of that one: leave it out if you have changed the state, "
+    "`args` or the manifold. After a jump of the vector field end the solve there, `project`, and "
+    "go on. " + _ENTRY,
     "the projection of a step failed: a state is not finite, or a function of the manifold there, "
     "or the iteration diverged. At the first step look for NaN in `y0` and `args`, for "
     "derivatives of roots and norms at zero, which are infinite or NaN, and for overflow, in "
@@ -188,6 +190,7 @@ class State(eqx.Module):
     - `values`, `hidden`, `gained`: as in a `Target`.
     - `motion`: the unit of each component, see `motion_after`, the largest of all steps so far;
       zero before the first step.
+    - `end`: the numbers of the state at which the last step ended; infinite before the first.
     - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `num_steps`: counted only if not every step is projected.
     - `preferred`: the changes of the state in the last two steps, if linear invariants are kept.
@@ -198,6 +201,7 @@ class State(eqx.Module):
     hidden: Float[Array, " m"]
     gained: Float[Array, "2 m"] | None
     motion: Float[Array, " n"]
+    end: Float[Array, " n"]
     first_step: RealScalarLike
     num_steps: Int[Array, ""] | None
     statistics: ProjectionStatistics
@@ -260,8 +264,9 @@ def started(
 
 
 def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a state violates a `Constraint` by more than `√ε`, relative to the sizes of its terms
-    and of their changes in a step.
+    """Whether a state is off the manifold by more than `√ε`, relative to the sizes of the terms and
+    of their changes in a step. An integral with a `value` of its own does not count: a solve may
+    start elsewhere.
 
     The tolerance is much larger than that of a projection, because initial states are often given
     with a few digits less. The changes count because all terms may be roundoff at one state, such
@@ -271,8 +276,13 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * equations.scale(jacobian, y)
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
-    must_hold = np.repeat([isinstance(entry, Constraint) for entry in entries], counts)
+    must_hold = np.repeat([must_start_on(entry) for entry in entries], counts)
     return jnp.any(must_hold & ~(jnp.abs(g) <= limit))
+
+
+def must_start_on(entry: Any) -> bool:
+    """Whether the first state of a solve must be on an entry of the manifold."""
+    return isinstance(entry, Constraint) or entry.value is None
 
 
 def cause_of_failure(

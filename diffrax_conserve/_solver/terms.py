@@ -47,6 +47,17 @@ def _nested(terms: Any) -> list[Any]:
     return found + (_nested(parts) if parts else [])
 
 
+def check_projects_nothing(solver: dfx.AbstractSolver) -> None:
+    for layer in _layers(solver):
+        if hasattr(layer, "manifold") and hasattr(layer, "projection"):
+            raise ValueError(
+                f"`solver` contains a `{type(layer).__name__}`, whose manifold an outer projection "
+                "would leave. Put all entries into one manifold, around the solver inside. With a "
+                '`DAE` it is `{"dae": dae.wrap(Radau()).manifold, "energy": energy}`, and the '
+                "solver inside `diffrax_conserve.Radau(root_finder=...)` with tolerances."
+            )
+
+
 def check_nested(solver: dfx.AbstractSolver) -> None:
     inner = innermost(solver)
     if (

@@ -106,17 +106,22 @@ def test_time_dependent_integral_in_either_direction(t1):
     np.testing.assert_allclose(sol.ys, 1 + jnp.sin(ts), rtol=0, atol=1e-15)
 
 
-def test_a_continued_solve_keeps_the_first_conserved_value():
-    shift = 1e-3  # pushed off the manifold in between
-
+def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another():
     def run(y0, t0, t1, state=None):
         saveat = dfx.SaveAt(t1=True, solver_state=True)
-        options = dict(t0=t0, t1=t1, solver_state=state, saveat=saveat)
+        options = dict(t0=t0, t1=t1, solver_state=state, saveat=saveat, throw=False)
         return solve(oscillator, dfc.ManifoldProjection(dfx.Heun(), CIRCLE), y0, **options)
 
     first = run(jnp.array([1.0, 0.0]), 0.0, 1.0)
-    second = run(first.ys[-1] + shift, 1.0, 2.0, first.solver_state)
-    assert abs(float(jnp.sum(second.ys[-1] ** 2)) - 1) <= 4e-15
+    pushed, struck = (run(first.ys[-1] + x, 1.0, 2.0, first.solver_state) for x in (1e-9, 1e-3))
+    assert abs(float(jnp.sum(pushed.ys[-1] ** 2)) - 1) <= 4e-15
+    assert "a step cannot start" in dfx.RESULTS[struck.result]
+
+
+def test_a_projection_around_a_projection_is_refused():
+    inner = dfc.ManifoldProjection(dfx.Heun(), CIRCLE)
+    with pytest.raises(ValueError, match="one manifold"):
+        dfc.ManifoldProjection(dfx.HalfSolver(inner), CIRCLE)
 
 
 def test_a_step_begins_with_the_slope_at_the_projected_state():
