@@ -131,9 +131,9 @@ class ManifoldProjection(ForwardingSolver):
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
     terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise if it
-    continues from the `solver_state` of a solve with other values, and after a jump
-    that the step size controller declares, if the constraint jumps too: end the solve there,
-    `project`, and go on.
+    continues from the `solver_state` of a solve with other values, and after a jump that the step
+    size controller declares, if the constraint jumps too: end the solve there, `project`, and go
+    on.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve tries smaller steps until one moves the state by no more than roundoff, or no
@@ -274,8 +274,7 @@ class ManifoldProjection(ForwardingSolver):
         y1, info = target.project_if(due, t1, candidate, step)
         # Whether it succeeded, and if not, whether a shorter step could.
         metric = before.metric(t0, y0)
-        # It is zero until a step has been accepted in which anything moved or was not zero.
-        first = jnp.all(state.motion == 0)
+        first = jnp.all(state.end == jnp.inf)
         cannot_start = self._cannot_start(before, state, t0, y0, first, made_jump)
         final = cannot_start | is_final(state, t0, t1, change, candidate)
         correction, too_far = ravel(tree_sub(y1, candidate)), jnp.asarray(False)

@@ -266,7 +266,7 @@ def started(
 def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
     """Whether a state is off the manifold by more than `√ε`, relative to the sizes of the terms and
     of their changes in a step. An integral with a `value` of its own does not count: a solve may
-    start elsewhere.
+    start elsewhere. Nor does one whose gradient is not finite, as that of the speed is at rest.
 
     The tolerance is much larger than that of a projection, because initial states are often given
     with a few digits less. The changes count because all terms may be roundoff at one state, such
@@ -276,8 +276,9 @@ def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) ->
     limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * equations.scale(jacobian, y)
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
-    must_hold = np.repeat([must_start_on(entry) for entry in entries], counts)
-    return jnp.any(must_hold & ~(jnp.abs(g) <= limit))
+    of_entries = lambda fn: np.repeat([fn(entry) for entry in entries], counts)  # noqa: E731
+    unknown = jnp.isnan(limit) & ~of_entries(lambda entry: isinstance(entry, Constraint))
+    return jnp.any(of_entries(must_start_on) & ~unknown & ~(jnp.abs(g) <= limit))
 
 
 def must_start_on(entry: Any) -> bool:

@@ -209,7 +209,7 @@ def eliminated(
 
 
 def order_of(gram: Float[Array, "m m"]) -> Order:
-    """The order in which `eliminated` takes the constraints."""
+    """The order in which `eliminated` takes the constraints, whatever the right side is."""
     return eliminated(gram, gram[0], gram)[2]
 
 

@@ -118,6 +118,14 @@ def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another()
     assert "a step cannot start" in dfx.RESULTS[struck.result]
 
 
+def test_a_body_at_rest_may_have_a_speed_whose_gradient_is_nan_there():
+    energy = lambda t, y, args: jnp.linalg.norm(y[1]) ** 2 / 2 + y[0] @ y[0] / 2  # noqa: E731
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(energy))
+    y0 = jnp.array([[1.0, 0.0], [0.0, 0.0]])
+    sol = solve(lambda t, y, args: jnp.stack([y[1], -y[0]]), solver, y0, t1=2.0, dt0=0.01)
+    assert abs(float(energy(0, sol.ys[-1], None)) - 0.5) <= 4e-15
+
+
 def test_a_projection_around_a_projection_is_refused():
     inner = dfc.ManifoldProjection(dfx.Heun(), CIRCLE)
     with pytest.raises(ValueError, match="one manifold"):
