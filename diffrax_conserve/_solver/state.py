@@ -264,16 +264,17 @@ def started(
 
 
 def violated(equations: Equations, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a state is off the manifold by more than `√ε`, relative to the sizes of the terms and
-    of their changes in a step. An integral with a `value` of its own does not count: a solve may
-    start elsewhere. Nor does one whose gradient is not finite, as that of the speed is at rest.
-
-    The tolerance is much larger than that of a projection, because initial states are often given
-    with a few digits less. The changes count because all terms may be roundoff at one state, such
-    as those of `q · v = 0` where a component of a pendulum passes zero.
+    """Whether a state is off the manifold by more than its tolerance, and than `√ε`, relative to
+    the sizes of the terms and of their changes in a step. An integral with a `value` of its own
+    does not count: a solve may start elsewhere. Nor does one whose gradient is not finite, as that
+    of the speed is at rest. `√ε` is usually much larger than the tolerance of a projection,
+    because initial states are often given with a few digits less. The changes count because all
+    terms may be roundoff at one state, such as those of `q · v = 0` where a component of a pendulum
+    passes zero.
     """
     g, jacobian = equations.linearise(y)
-    limit = float(jnp.finfo(y.dtype).eps) ** 0.5 * equations.scale(jacobian, y)
+    scale = equations.scale(jacobian, y)
+    limit = jnp.maximum(float(jnp.finfo(y.dtype).eps) ** 0.5 * scale, equations.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = [eqx.filter_eval_shape(part, y).size for part in equations.parts]
     of_entries = lambda fn: np.repeat([fn(entry) for entry in entries], counts)  # noqa: E731
