@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ._custom_types import DenseInfo, RealScalarLike, Y
 from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
 from ._step.iterate import any_lane, damped
+from ._time import nonzero_length
 from ._tree import ravel, tree_stop_gradient, tree_sub
 
 
@@ -93,7 +94,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # A time exactly at an end is inside, so that the slope there is that of the interpolant.
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
         t = jnp.where(t < first, first, jnp.where(t > last, last, t))
-        share = (t - self.t0) / (self.t1 - self.t0)
+        share = (t - self.t0) / nonzero_length(self.t0, self.t1)
 
         def move(y: Array, shift: Array) -> Array:
             return y + share.astype(shift.real.dtype) * shift

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
+from ._hashable import Hashable
 from ._options import calling, check_function, check_numbers, dtype_of, is_real
 from ._tree import tree_shapes, tree_size
 
@@ -21,7 +22,7 @@ def _arrays(value: Values | None) -> Values | None:
 
 
 @final
-class FirstIntegral(eqx.Module):
+class FirstIntegral(Hashable):
     r"""A function $I(t, y, args)$ that is constant along the exact solution, or has a known rate.
 
     The manifold is $\{y : I(t, y, args) = \text{conserved value}\}$. The conserved value is
@@ -66,7 +67,7 @@ FirstIntegral.__init__.__doc__ = r"""**Arguments:**
 
 
 @final
-class Constraint(eqx.Module):
+class Constraint(Hashable):
     r"""A function $g(t, y, args)$ that is zero along the exact solution.
 
     !!! example

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Args, RealScalarLike, Values, Y
+from .._hashable import Hashable
 from .._manifold import Constraint, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo, Target
@@ -64,7 +65,7 @@ def _mass(mass: Any) -> Any:
 
 
 @final
-class DAE(eqx.Module):
+class DAE(Hashable):
     r"""A differential-algebraic equation, in one of three forms.
 
     - `DAE(residual=F)` is $F(t, y, y', args) = 0$.

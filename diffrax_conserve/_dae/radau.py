@@ -14,11 +14,13 @@ from jaxtyping import Array, Float, PyTree
 
 from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._hashable import Hashable
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
 from .._step.implicit import root
 from .._step.iterate import Solved, after_step, iterate, keep_done
+from .._time import nonzero_length
 from .._tree import ravel, unravel
 
 # The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
@@ -45,7 +47,7 @@ class _Last(NamedTuple):
 
 
 @final
-class Radau(dfx.AbstractImplicitSolver[_Last]):
+class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     r"""The Radau IIA method with three stages, of order five, for stiff equations.
 
     A step is the collocation polynomial $u$ of degree three with $u(t_n) = y_n$ that satisfies the
@@ -134,7 +136,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
     ) -> tuple[Y, Y, DenseInfo, _Last, dfx.RESULTS]:
         start = ravel(y0)
         nodes, inverse = jnp.asarray(_NODES, start.dtype), jnp.asarray(_INVERSE, start.dtype)
-        length = jnp.asarray(t1 - t0, start.dtype)
+        length = nonzero_length(t0, t1).astype(start.dtype)
         residual = self._residual(terms, t0, y0, args)
         at_stages = jax.vmap(residual)
         # The polynomial of the last step is continued.
@@ -252,5 +254,5 @@ class CollocationInterpolation(dfx.AbstractLocalInterpolation):
             ends = self.evaluate(t1), self.evaluate(t0)
             return jtu.tree_map(lambda a, b: a - b, *ends)
         dtype = self.coefficients.dtype
-        share = jnp.asarray((t0 - self.t0) / (self.t1 - self.t0), dtype)
+        share = jnp.asarray((t0 - self.t0) / nonzero_length(self.t0, self.t1), dtype)
         return unravel(ravel(self.y0) + share ** jnp.arange(1, 4) @ self.coefficients, self.y0)

@@ -9,13 +9,14 @@ import optimistix as optx
 
 from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from .._hashable import Hashable
 from .._options import check_counts
 from .._projection.options import option
 from .._tree import tree_stop_gradient
 
 
 @final
-class ImplicitMidpoint(dfx.AbstractSolver[None]):
+class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
     r"""The implicit midpoint rule, for fixed steps.
 
     $$y_{n+1} = y_n + h f(t_n + \tfrac{h}{2}, \tfrac{1}{2} (y_n + y_{n+1}))$$

@@ -22,6 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._constants import MAX_STEPS, WRITTEN_OUT
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
+from .._hashable import Hashable
 from .._interpolation import Packed
 from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
@@ -35,6 +36,7 @@ from .._step.implicit import root
 from .._step.iterate import Solved, after_test, iterate, keep_done
 from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
 from .._step.metric import Diagonal, spread
+from .._time import nonzero_length
 from .._tree import ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -74,7 +76,7 @@ class _State(eqx.Module):
 
 
 @final
-class RATTLE(dfx.AbstractSolver[Any]):
+class RATTLE(Hashable, dfx.AbstractSolver[Any]):
     r"""Velocity Verlet with constraints on the positions: symplectic, symmetric, of second order.
 
     For $q' = v$, $m v' = F + G^\top \lambda$, $g(t, q) = 0$ with $G = \partial g/\partial q$:
@@ -241,7 +243,7 @@ class RATTLE(dfx.AbstractSolver[Any]):
         q, v, at = ravel(q0), ravel(v0), state.at
         direction = time_direction(terms, t0)
         h = (t1 - t0) * direction
-        per_step = jnp.where(h == 0, 0, 1 / jnp.where(h == 0, 1, h))
+        per_step = direction / nonzero_length(t0, t1)
         middle = t0 + (t1 - t0) / 2
         drift = self._drift(terms, middle, v0, args)
         slope = lax.cond(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Real
 from .._balance import integrated_rates
 from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
+from .._hashable import Hashable
 from .._manifold import evaluate, is_entry, named_entries
 from .._printing import is_traced, names_at, printed
 from .._step.equations import ON, Equations, equations_of, relative
@@ -177,7 +178,7 @@ class Problem(eqx.Module):
         )
 
 
-class AbstractProjection(eqx.Module):
+class AbstractProjection(Hashable):
     """A map from a candidate to a state on the manifold.
 
     Write your own as a subclass with a field `metric` and the method `solve`; see [Your own

@@ -6,6 +6,7 @@ import diffrax as dfx
 from jaxtyping import PyTree
 
 from .._custom_types import VF, Args, RealScalarLike, Y
+from .._hashable import Hashable
 from .terms import innermost
 
 
@@ -14,7 +15,7 @@ def _of_innermost(name: str) -> Any:
     return property(lambda self: getattr(innermost(self.solver), name))
 
 
-class ForwardingSolver(dfx.AbstractWrappedSolver[Any]):
+class ForwardingSolver(Hashable, dfx.AbstractWrappedSolver[Any]):
     """The base of our wrappers. For diffrax a wrapper is an instance of the classes of the solver
     inside, such as of an implicit solver. It then reads the attributes of such a solver from the
     wrapper, which therefore must have them all."""

@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 from numpy.polynomial import chebyshev
 
 from ..._custom_types import RealScalarLike, Y
+from ..._time import nonzero_length
 from ..._tree import tree_sub
 
 
@@ -34,10 +35,7 @@ class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        length = self.t1 - self.t0
-        # A step of length zero, as in the padding of a solution, has one state.
-        nonzero = length != 0
-        x = jnp.where(nonzero, 2 * (t0 - self.t0) / jnp.where(nonzero, length, 1) - 1, -1)
+        x = 2 * (t0 - self.t0) / nonzero_length(self.t0, self.t1) - 1
         return jtu.tree_map(lambda c: _clenshaw(c, x.astype(c.dtype)), self.coefficients)
 
 

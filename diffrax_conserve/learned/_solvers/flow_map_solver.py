@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._hashable import Hashable
 from ..._projection.options import option
 from .._networks.flat import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
@@ -27,7 +28,7 @@ class _State(NamedTuple):
 
 
 @final
-class DeepONetSolver(dfx.AbstractSolver[_State]):
+class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
     r"""Steps a learned flow map: $y_{n+1} = \Phi(y_n, h)$.
 
     Steps may have any length up to `flow_map.max_step`. A longer one is rejected by an adaptive

@@ -9,6 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._hashable import Hashable
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import time_direction
 from ..._tree import tree_sub
@@ -30,7 +31,7 @@ _NODES = 12
 
 
 @final
-class PINNSolver(dfx.AbstractSolver[Refused]):
+class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
     The vector field is not evaluated. Steps may have any length; they determine where states are

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
+from ..._hashable import Hashable
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import is_ode
@@ -37,7 +38,7 @@ _UNSOLVED = register(
 
 
 @final
-class RandomFeatureSolver(dfx.AbstractSolver[None]):
+class RandomFeatureSolver(Hashable, dfx.AbstractSolver[None]):
     r"""Fits a network with random hidden neurons to the equations of each step.
 
     This is a physics-informed network that is trained to roundoff inside the solve. In the step
