@@ -1,16 +1,21 @@
-"""A lane of a batch is that lane alone, in value and derivative, however many steps it takes.
+"""A lane of a batch is that lane alone, in value and derivative, for every solver and all saving.
 
 While the longest lane of a batch goes on, diffrax evaluates steps of no length in the lanes that
 have arrived, and discards the results. In reverse mode their cotangents are zero, and zero times a
-derivative that is infinite is NaN.
+derivative that is infinite is NaN. So the lanes here take unlike numbers of steps, and one fails.
 """
 
 import diffrax as dfx
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
 
 import diffrax_conserve as dfc
 
-from ..learned import Rotation
+from ..learned import EAST, RADIUS, Rotation, turning
 
 ENERGY = dfc.FirstIntegral(lambda t, y, p: y[1] ** 2 / 2 - p * jnp.cos(y[0]))
 LOSSES = dfc.FirstIntegral(ENERGY.fn, rate=lambda t, y, p: -0.1 * y[1] ** 2)
@@ -29,42 +34,43 @@ BEAD = dfc.DAE(
     algebraic=lambda t, x, z, p: x[0] ** 2 + x[1] ** 2 - 1,
 )
 INDEX_1 = dfc.DAE(lambda t, x, z, p: -p * z, algebraic=lambda t, x, z, p: z + z**3 - x)
-ROTATION = Rotation(max_step=1.0, args_domain=None)
+SPRING = dfx.ODETerm(lambda t, y, p: jnp.stack([y[1], -y[0]]))
 
+ON_CIRCLE = dfc.ClosedForm(lambda t, y, args, values: y / jnp.sqrt(jnp.sum(y**2)))
+STAGED = dfc.Staged(("energy", dfc.Newton()))
+POSITIVE = dfc.SimplifiedNewton(lower=0.0)
+ROOT = optx.Newton(rtol=1e-10, atol=1e-10)
 BEGIN = jnp.array([1.0, 0.5])
-EAST = jnp.array([1.0, 0.0])
 BEAD0 = jnp.array([1.0, 0.0, 0.0, 0.2]), jnp.array(-0.04)
 wrap = dfc.ManifoldProjection
+
+
+def bottom(t, y, args, **kwargs):
+    """Zero before the end, in each lane."""
+    return y[0] - 0.9
 
 
 def nearby(**options):
     return wrap(dfx.Tsit5(), ENERGY, **options)
 
 
-# Terms, solver, initial state.
+# Terms, solver, initial state, and what else `diffeqsolve` is given.
 CASES = {
-    "Dopri5 of diffrax": (PENDULUM, dfx.Dopri5(), BEGIN),
-    "projected Dopri5": (PENDULUM, wrap(dfx.Dopri5(), ENERGY), BEGIN),
-    "projected Kvaerno5": (PENDULUM, wrap(dfx.Kvaerno5(), ENERGY), BEGIN),
+    "plain": (PENDULUM, dfx.Dopri5(), BEGIN),
+    "Dopri5": (PENDULUM, wrap(dfx.Dopri5(), ENERGY), BEGIN),
     "constraint": (TURN, wrap(dfx.Bosh3(), CIRCLE), EAST),
     "many constraints": (TURNS, wrap(dfx.Heun(), ROTORS), jnp.tile(EAST, (5, 1))),
     "Newton": (PENDULUM, nearby(projection=dfc.Newton()), BEGIN),
-    "along error": (PENDULUM, nearby(projection=dfc.AlongLine(direction="error")), BEGIN),
-    "along step": (PENDULUM, nearby(projection=dfc.AlongLine(direction="step")), BEGIN),
-    "staged": (
-        PENDULUM,
-        wrap(dfx.Tsit5(), {"energy": ENERGY}, projection=dfc.Staged(("energy", dfc.Newton()))),
-        BEGIN,
-    ),
-    "bounds": (
-        DECAY,
-        wrap(dfx.Heun(), SHARES, projection=dfc.SimplifiedNewton(lower=0.0)),
-        jnp.array([1.0, 0.0, 0.0]),
-    ),
+    "along the error": (PENDULUM, nearby(projection=dfc.AlongLine(direction="error")), BEGIN),
+    "along the step": (PENDULUM, nearby(projection=dfc.AlongLine(direction="step")), BEGIN),
+    "closed form": (TURN, wrap(dfx.Heun(), CIRCLE, projection=ON_CIRCLE), EAST),
+    "staged": (PENDULUM, wrap(dfx.Heun(), {"energy": ENERGY}, projection=STAGED), BEGIN),
+    "bounds": (DECAY, wrap(dfx.Heun(), SHARES, projection=POSITIVE), jnp.array([1.0, 0.0, 0.0])),
     "balance": (DAMPED, wrap(dfx.Tsit5(), LOSSES), BEGIN),
-    "keep linear": (PENDULUM, nearby(keep_linear=True), BEGIN),
+    "linear invariants": (PENDULUM, nearby(keep_linear=True), BEGIN),
     "longest correction": (PENDULUM, nearby(max_correction=0.5), BEGIN),
-    "metric": (PENDULUM, nearby(projection=dfc.SimplifiedNewton(metric=1.0)), BEGIN),
+    "given metric": (PENDULUM, nearby(projection=dfc.SimplifiedNewton(metric=1.0)), BEGIN),
+    "event": (PENDULUM, nearby(), BEGIN, dict(event=dfx.Event(bottom, ROOT))),
     "RK4": (PENDULUM, wrap(dfc.RK4(), ENERGY), BEGIN),
     "ImplicitMidpoint": (PENDULUM, dfc.ImplicitMidpoint(), BEGIN),
     "SymmetricProjection": (
@@ -78,4 +84,95 @@ CASES = {
     "DAE of index 1": (INDEX_1.term, INDEX_1.wrap(dfc.Radau()), (jnp.array(2.0), jnp.array(1.0))),
     "DAE of index 3": (BEAD.term, BEAD.wrap(dfc.Radau()), BEAD0),
     "DAE by Tsit5": (BEAD.term, BEAD.wrap(dfx.Tsit5()), BEAD0),
+    "PINN": (SPRING, wrap(dfc.PINNSolver(turning()), RADIUS), EAST),
+    "DeepONet": (SPRING, dfc.DeepONetSolver(Rotation()), EAST),
+    "projected DeepONet": (SPRING, wrap(dfc.DeepONetSolver(Rotation(off=0.1)), RADIUS), EAST),
 }
+ADAPTIVE_ONLY = {"Radau", "projected Radau", "DAE of index 1", "DAE of index 3"}
+FIXED_ONLY = {"ImplicitMidpoint", "SymmetricProjection", "RATTLE", "RK4", "PINN"}
+REVERSE, FORWARD, DIRECT = (
+    dfx.RecursiveCheckpointAdjoint(),
+    dfx.ForwardMode(),
+    dfx.DirectAdjoint(),
+)
+# The tolerances, or steps, of the lanes. The last lane fails.
+LANES = {"adaptive": (1e-2, 1e-4, 1e-6, 1e-6), "fixed": (1 / 2, 1 / 4, 1 / 8, 1 / 8)}
+OFF = jnp.array([0.0, 0.0, 0.0, jnp.nan])
+
+
+def observed(case, steps, adjoint, p, size, off):
+    """Everything that can be saved, as a PyTree, and whether the solve succeeded."""
+    terms, solver, y0, *options = CASES[case]
+    saveat = dfx.SaveAt(
+        subs=[dfx.SubSaveAt(t0=True, ts=jnp.array([0.33, 0.7, 1.0])), dfx.SubSaveAt(steps=True)],
+        dense=True,
+    )
+    adaptive = steps == "adaptive"
+    controller = dfx.PIDController(rtol=size, atol=size) if adaptive else dfx.ConstantStepSize()
+    sol = dfx.diffeqsolve(
+        terms,
+        solver,
+        0.0,
+        1.0,
+        1 / 16 if adaptive else size,
+        jax.tree.map(lambda y: p[1] * y + off, y0),
+        p[0],
+        saveat=saveat,
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=32,
+        throw=False,
+        **(options[0] if options else {}),
+    )
+    between = jax.vmap(sol.evaluate)(jnp.array([0.2, 0.45]))
+    # What follows an event, or the last step, is infinite.
+    saved = jax.tree.map(lambda y: jnp.where(jnp.isinf(y), 0, y), (sol.ys, between))
+    return saved, (sol.result == dfx.RESULTS.successful, sol.stats["num_steps"])
+
+
+def derivatives(case, steps, adjoint, size, off):
+    """The values, their derivatives in the modes that the adjoint has, and whether all is well."""
+    run = lambda p: observed(case, steps, adjoint, p, size, off)  # noqa: E731
+    p, found = jnp.array([1.3, 1.0]), []
+    if not isinstance(adjoint, dfx.RecursiveCheckpointAdjoint):
+        saved, tangent, okay = jax.jvp(run, (p,), (jnp.array([1.0, 0.5]),), has_aux=True)
+        found.append(tangent)
+    if not isinstance(adjoint, dfx.ForwardMode):
+        saved, vjp, okay = jax.vjp(run, p, has_aux=True)
+        # A weight of its own for each number.
+        weights = lambda x: jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape)  # noqa: E731
+        found += vjp(jax.tree.map(weights, saved))
+    return saved, found, okay
+
+
+def every_case(adjoint, always, period):
+    """The law for one adjoint; by default `always`, and some of the other cases."""
+    pairs = [(case, "adaptive") for case in CASES if case not in FIXED_ONLY]
+    pairs += [(case, "fixed") for case in CASES if case not in ADAPTIVE_ONLY]
+    by_default = {always, *pairs[len(pairs) % period :: period]}
+    params = [
+        pytest.param(*pair, id="-".join(pair), marks=() if pair in by_default else pytest.mark.slow)
+        for pair in pairs
+    ]
+
+    @pytest.mark.parametrize(("case", "steps"), params)
+    def test(case, steps):
+        lanes = eqx.filter_jit(jax.vmap(lambda *x: derivatives(case, steps, adjoint, *x)))
+        sizes = jnp.asarray(LANES[steps])
+        saved, found, (okay, count) = lanes(sizes, OFF)
+        assert okay.tolist() == [True, True, True, case == "plain" and steps == "fixed"]
+        assert len(set(count[:3].tolist())) == 3, "The lanes take unlike numbers of steps."
+        for i in range(3):
+            # The same program, in all of whose lanes is this one.
+            expected = lanes(jnp.full(4, sizes[i]), jnp.zeros(4))[:2]
+            for a, b in zip(*map(jax.tree.leaves, ((saved, found), expected)), strict=True):
+                assert np.all(np.isfinite(b[0]))
+                limit = 1e-9 * np.max(np.abs(b[0]), initial=1e-3)
+                np.testing.assert_allclose(a[i], b[0], rtol=0, atol=limit)
+
+    return test
+
+
+test_reverse = every_case(REVERSE, ("Dopri5", "fixed"), 9)
+test_forward = every_case(FORWARD, ("RATTLE", "fixed"), 17)
+test_direct = every_case(DIRECT, ("Radau", "adaptive"), 23)
