@@ -40,11 +40,11 @@ from ._manifold import FirstIntegral as FirstIntegral
 from ._mechanics.implicit_midpoint import ImplicitMidpoint as ImplicitMidpoint
 from ._mechanics.rattle import RATTLE as RATTLE
 from ._mechanics.symmetric_projection import SymmetricProjection as SymmetricProjection
+from ._numerics.problem import Problem as Problem
+from ._numerics.problem import Step as Step
 from ._projection import closed_forms as closed_forms
 from ._projection.along_line import AlongLine as AlongLine
 from ._projection.base import AbstractProjection as AbstractProjection
-from ._projection.base import Problem as Problem
-from ._projection.base import Step as Step
 from ._projection.clipped import clipped as clipped
 from ._projection.closed_form import ClosedForm as ClosedForm
 from ._projection.newton import Newton as Newton
@@ -53,7 +53,7 @@ from ._projection.simplified_newton import SimplifiedNewton as SimplifiedNewton
 from ._projection.staged import Staged as Staged
 from ._projection.tangent import tangent as tangent
 from ._solver.manifold_projection import ManifoldProjection as ManifoldProjection
-from ._solver.state import statistics as statistics
+from ._solver.statistics import statistics as statistics
 from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled
 from .learned._files import load as load

@@ -55,23 +55,17 @@ def integrated_rates(
     end: RealScalarLike,
     path: Callable[[RealScalarLike], Y],
     args: Args,
-    direction: RealScalarLike,
 ) -> Values:
-    """The integral of each rate along `path`, zero for an entry without one.
-
-    All times are those of the solver, which `diffeqsolve` negates in a solve backwards in time. The
-    times of the manifold are `direction` times these. So a rate is evaluated at `t * direction`,
-    and the integral over the time of the manifold has the factor `direction`.
-    """
+    """The integral of each rate along `path`, zero for an entry without one."""
     half = (end - start) / 2  # the nodes are in the interval from -1 to 1
 
     def at(node: RealScalarLike) -> Values:
         t = start + (1 + node) * half
-        return rates(manifold, t * direction, path(t), args)
+        return rates(manifold, t, path(t), args)
 
     def total(x: Array) -> Array:
         return jnp.sum(jax.vmap(jnp.multiply)(weights.astype(x.dtype), x), axis=0)
 
     dtype = jnp.result_type(half)
-    weights = jnp.asarray(_WEIGHTS, dtype) * half * direction
+    weights = jnp.asarray(_WEIGHTS, dtype) * half
     return jtu.tree_map(total, jax.vmap(at)(jnp.asarray(_NODES, dtype)))

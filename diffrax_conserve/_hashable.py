@@ -1,4 +1,4 @@
-"""Modules that can be keys of dictionaries and static arguments of `jax.jit`, whatever they hold."""
+"""Modules that can be keys and static arguments of `jax.jit`, whatever they hold."""
 
 from typing import Any
 

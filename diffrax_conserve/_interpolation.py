@@ -10,7 +10,6 @@ finder of an event needs the slope.
 """
 
 import dataclasses
-import functools as ft
 from collections.abc import Callable
 from typing import Any, final
 
@@ -21,13 +20,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree, Real
 
-from ._custom_types import DenseInfo, RealScalarLike, Y
-from ._projection.within_bounds import AbstractNewton, Bounds, bounded_parts
-from ._step.iterate import any_lane, damped
+from ._custom_types import DenseInfo, RealScalarLike
+from ._numerics.iterate import any_lane, damped
+from ._numerics.problem import Step
 from ._time import nonzero_length
-from ._tree import ravel, tree_stop_gradient, tree_sub
+from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
 
 
 @final
@@ -63,22 +62,22 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     - `t0`, `t1`: the ends of the step, as times of the solver.
     - `inner`: the interpolant `u` of the wrapped solver.
+    - `direction`: -1 if the solver's time is the negative of that of the vector field, otherwise 1.
     - `shift`: the correction of the step, `y₁ - ŷ₁`.
     - `limit`: the length of the step in the metric, which a correction may exceed only if the time
       is farther than that from the start of the step.
     - `error`: the error estimate of the step, if the projection uses it.
     - `target`: what the projection of the step aimed at, without the balances of the step itself.
-    - `due`: whether the step is projected; `None` if every step is.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
-    shift: Y
+    direction: Real[Array, ""]
+    shift: Float[Array, " n"]
     limit: Float[Array, ""]
-    error: Y | None
+    error: Float[Array, " n"] | None
     target: Packed
-    due: Bool[Array, ""] | None
 
     @eqx.filter_jit  # traced once for all saved times
     def evaluate(
@@ -86,61 +85,47 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        return self.projected(t0, left)
-
-    def moved(self, t: RealScalarLike, left: bool) -> Y:
-        """The interpolant of the wrapped solver, moved by `θ (y₁ - ŷ₁)` at the share `θ` of the
-        step, so that it meets the projected states at both ends."""
         # A time exactly at an end is inside, so that the slope there is that of the interpolant.
         first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
-        t = jnp.where(t < first, first, jnp.where(t > last, last, t))
+        t = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
+        u = self.inner.evaluate(t, left=left)
         share = (t - self.t0) / nonzero_length(self.t0, self.t1)
+        moved = ravel(u) + share.astype(self.shift.dtype) * self.shift
+        return unravel(self.projected(t * self.direction, moved), u)
 
-        def move(y: Array, shift: Array) -> Array:
-            return y + share.astype(shift.real.dtype) * shift
-
-        return jtu.tree_map(move, self.inner.evaluate(t, left=left), self.shift)
-
-    def projected(self, t: RealScalarLike, left: bool) -> Y:
+    def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
-        candidate = self.moved(t, left)
-        target = self.target.unpack().advanced(self.t0, t, self.inner.evaluate)
-        first = self.inner.evaluate(self.t0)
-        step = target.step(self.t0, self.t1, first, self.error)
+        start, end = self.t0 * self.direction, self.t1 * self.direction
+        path = lambda t: ravel(self.inner.evaluate(t * self.direction))  # noqa: E731
+        target, first = self.target.unpack().advanced(start, t, path), path(start)
+        step = Step(start, end, first, self.error)
         problem = target.problem(t, candidate, step)
-        metric = problem.equations.factor
-        away = metric.length(ravel(tree_sub(candidate, first)))
+        metric, projection = problem.factor, target.projection
+        away = metric.length(candidate - first)
         limit = lax.stop_gradient(jnp.maximum(self.limit, away))
-
-        vector = ravel(candidate)
 
         def near(y: Array, ok: Array) -> Array:
             """Whether a projection succeeded without leading too far away."""
-            return ok & (metric.length(y - vector) <= limit)
+            return ok & (metric.length(y - candidate) <= limit)
 
-        y, info = target.projection.solve(problem, vector)
+        y, info = projection.solve(problem, candidate)
         ok = near(y, info.ok)
-        y = jnp.where(ok, y, vector)
-        bounded = bounded_parts(target.projection)
-        for part in bounded:
-            y = Bounds.of(part.lower, part.upper, problem.like).clip(y)
-        # A second attempt by damped steps makes sense only if the projection follows gradients too.
-        # The rule of another projection, such as a line, leads elsewhere. And bounds would be lost.
-        if isinstance(target.projection, AbstractNewton) and not bounded:
-            equations, start = tree_stop_gradient((problem.equations, vector))
+        y = projection.clip(jnp.where(ok, y, candidate), problem.like)
+        # A second attempt would lose the bounds.
+        if not projection.follows_gradients or projection.has_bounds:
+            return y
+        still, start = tree_stop_gradient((problem, candidate))
 
-            def again() -> tuple[Array, Array]:
-                found = damped(equations, start, max_steps=target.projection.max_steps)
-                return found.y, near(found.y, found.ok)
+        def again() -> tuple[Array, Array]:
+            found = damped(still, start, max_steps=projection.max_steps)
+            return found.y, near(found.y, found.ok)
 
-            # A condition that is the same for all lanes of a batch remains a branch, which is
-            # skipped if no lane needs it.
-            found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
-            # Its derivative is that of the interpolant.
-            nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
-            y = lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
-        y, due = problem.state(y), self.due
-        return y if due is None else jtu.tree_map(ft.partial(jnp.where, due), y, candidate)
+        # A condition that is the same for all lanes of a batch remains a branch, which is skipped
+        # if no lane needs it.
+        found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
+        # Its derivative is that of the interpolant.
+        nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
+        return lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffrax_conserve._step.equations import relative
-from diffrax_conserve._step.metric import Identity
+from diffrax_conserve._numerics.metric import Identity
+from diffrax_conserve._numerics.problem import relative
 from diffrax_conserve._tree import ravel
 
 ROOT = Path(__file__).parents[1]
@@ -166,11 +166,11 @@ def leave_a_lane_of_a_batch_unfinished(package):
 
 def decide_success_by_the_scale_at_the_candidate(package):
     def wrong(solve, self, problem, candidate):
-        equations = problem.equations
-        scale = equations.scale(equations.linearise(candidate)[1], candidate)
+        problem = problem.problem
+        scale = problem.scale(problem.linearise(candidate)[1], candidate)
         limit = 16 * jnp.finfo(candidate.dtype).eps * scale
-        equations = dataclasses.replace(equations, rtol=0.0, atol=limit)
-        return solve(self, dataclasses.replace(problem, equations=equations), candidate)
+        problem = dataclasses.replace(problem, rtol=0.0, atol=limit)
+        return solve(self, dataclasses.replace(problem, problem=problem), candidate)
 
     for name in ("SimplifiedNewton", "Newton"):
         package.around(f"{name}.solve")(wrong)
@@ -277,9 +277,9 @@ def stop_the_newton_iteration_of_random_features_at_once(package):
     solved = package.find("Solved")
 
     @package.around("_newton")
-    def _(old, equations, start):
-        states = equations.states(start)
-        change = equations.solve_linear(equations.jacobians(states), equations.residual(start))
+    def _(old, problem, start):
+        states = problem.states(start)
+        change = problem.solve_linear(problem.jacobians(states), problem.residual(start))
         return solved(start - change, jnp.asarray(True), jnp.asarray(1))
 
 
@@ -328,13 +328,13 @@ def forget_how_the_state_changed_in_the_last_step(package):
 
 def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
     @package.around("RATTLE._linear")
-    def _(linear, self, equations, t, q, args, direction, *rest):
-        return linear(self, equations, t, q, args, jnp.ones_like(direction), *rest)
+    def _(linear, self, problem, t, q, args, direction, *rest):
+        return linear(self, problem, t, q, args, jnp.ones_like(direction), *rest)
 
 
 def differentiate_a_symmetric_step_in_the_euclidean_metric(package):
-    def along(equations, y, multiplier):
-        return jax.vjp(equations.residual, y)[1](multiplier)[0]
+    def along(problem, y, multiplier):
+        return jax.vjp(problem.residual, y)[1](multiplier)[0]
 
     package.in_module_of("SymmetricProjection", "_along", along)
 

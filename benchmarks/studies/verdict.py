@@ -29,7 +29,7 @@ from metric import unit
 from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
-from diffrax_conserve._step.metric import spread
+from diffrax_conserve._numerics.metric import spread
 from diffrax_conserve._tree import ravel, unravel
 
 RESULTS = Path(__file__).parents[1] / "results" / "verdict.json"

@@ -18,15 +18,17 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._hashable import Hashable
 from .._manifold import Constraint, slope_like
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved
+from .._numerics.metric import Diagonal
+from .._numerics.problem import Problem, problem_of
+from .._numerics.report import ProjectionInfo
+from .._numerics.roundoff import cancellation_scale
 from .._options import check_function
-from .._projection.base import AbstractProjection, Problem, ProjectionInfo, Target
+from .._projection.base import AbstractProjection, adapted
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
-from .._step.implicit import root
-from .._step.iterate import Solved
-from .._step.metric import Diagonal
-from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, at_rest_near, divided
 from .radau import Radau
@@ -462,13 +464,11 @@ class _Return(AbstractProjection):
         state = problem.state(candidate)
         structure = _structure(self.dae, problem.t, state, problem.args)
         if structure.index != 1:
-            given = problem.equations
-            metric, one = given.factor, jnp.ones_like(candidate)
+            metric, one = problem.factor, jnp.ones_like(candidate)
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
-            free = dataclasses.replace(given, factor=Diagonal(structure.units(sizes)))
-            freely = dataclasses.replace(problem, equations=free)
-            y, info = SimplifiedNewton().solve(freely, candidate)
-            return y, problem.report(candidate, y, info.num_steps, ok=info.ok)
+            free = dataclasses.replace(problem, factor=Diagonal(structure.units(sizes)))
+            y, info = SimplifiedNewton().solve(free, candidate)
+            return y, problem.report(candidate, y, info.num_iterations, ok=info.ok)
         y = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
         return y, problem.report(candidate, y)
 
@@ -493,12 +493,13 @@ def _consistent(
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, free = stage
         manifold = {"equations": Constraint(_Constraints(dae, asked))}
-        hidden = hidden_scale(manifold, t, y, args)[2]
+        cancellation = cancellation_scale(manifold, t, y, args)[2]
         metric = unravel(jnp.where(free, units, 0) ** -2, y)
         projection = SimplifiedNewton(metric=metric, max_steps=MOST)
-        target = Target(projection, manifold, none, hidden, args, jnp.asarray(1))
-        y, info = target.project(t, y)
-        return y, info.ok
+        vector = ravel(y)
+        problem = problem_of(manifold, none, t, y, args, cancellation)
+        found, info = projection.solve(adapted(problem, projection, vector), vector)
+        return unravel(found, y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.

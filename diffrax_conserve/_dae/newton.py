@@ -10,9 +10,9 @@ import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import ROUNDOFF, SHORTER
-from .._step.equations import shown_terms
-from .._step.iterate import Solved, after_step, any_lane, iterate, keep_done
-from .._step.roundoff import hidden_terms
+from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
+from .._numerics.problem import gradient_scale
+from .._numerics.roundoff import cancellation_terms
 
 # Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
@@ -63,18 +63,18 @@ class _Factored(NamedTuple):
 
 def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
     """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
-    z, at_rest, num_steps, settled = at_rest_near(residual, z)
+    z, at_rest, num_iterations, settled = at_rest_near(residual, z)
 
     def at_roundoff() -> Bool[Array, ""]:
-        g, jacobian, hidden = hidden_terms(residual, z)
+        g, jacobian, hidden = cancellation_terms(residual, z)
         limit = ROUNDOFF * float(jnp.finfo(z.dtype).eps)
-        return jnp.all(jnp.abs(g) <= limit * (shown_terms(jacobian, jnp.abs(z)) + hidden))
+        return jnp.all(jnp.abs(g) <= limit * (gradient_scale(jacobian, jnp.abs(z)) + hidden))
 
     unsure = at_rest & ~settled
     found = at_rest & (
         settled | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
     )
-    return Solved(jnp.where(found, z, jnp.nan), found, num_steps)
+    return Solved(jnp.where(found, z, jnp.nan), found, num_iterations)
 
 
 def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
@@ -125,5 +125,5 @@ def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> S
         return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(False)
-    (z, _, settled), at_rest, num_steps, _ = iterate(advance, start, max_steps=MOST)
-    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, num_steps, settled)
+    (z, _, settled), at_rest, num_iterations, _ = iterate(advance, start, max_steps=MOST)
+    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, num_iterations, settled)

@@ -15,11 +15,11 @@ from jaxtyping import Array, Float, PyTree
 from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved, after_step, iterate, keep_done
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
-from .._step.implicit import root
-from .._step.iterate import Solved, after_step, iterate, keep_done
 from .._time import nonzero_length
 from .._tree import ravel, unravel
 

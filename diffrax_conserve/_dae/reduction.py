@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER
-from .._step.implicit import root
+from .._numerics.implicit import root
 from .._tree import without_pattern
 from .newton import algebraic_newton, divided
 

@@ -30,10 +30,10 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
+from .._numerics.problem import Jacobian, gradient_scale, problem_of, relative
+from .._numerics.roundoff import cancellation_terms
 from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
-from .._step.equations import Jacobian, equations_of, relative, shown_terms
-from .._step.roundoff import hidden_terms
 from .._tree import key_of, ravel, unravel, without_pattern
 
 Entry = FirstIntegral | Constraint
@@ -234,9 +234,9 @@ def _relative_sizes(
     dtype = vector.dtype
     t = t.astype(dtype)
     values = ravel(conserved_values(entry, t, y, args, root=name)).astype(dtype)
-    equations = equations_of(entry, values, t, y, args)
+    problem = problem_of(entry, values, t, y, args)
     with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
-        residual, jacobian = equations.linearise(vector)
+        residual, jacobian = problem.linearise(vector)
     in_time = lambda t: ravel(evaluate(entry, t, y, args)).astype(dtype)  # noqa: E731
     _, partial = jax.jvp(in_time, (t,), (jnp.ones_like(t),))
     rate = ravel(rates(entry, t, y, args)).astype(dtype)
@@ -250,7 +250,7 @@ def _relative_sizes(
         """The sum of the sizes of its terms."""
         state = unravel(vector, y)
         slope = ravel(slope_of(vector_field, t, state, args))
-        return shown_terms(jacobian, jnp.abs(slope)) + jnp.abs(partial) + jnp.abs(rate)
+        return gradient_scale(jacobian, jnp.abs(slope)) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)
     # If each term of the derivative is zero, its sum tells nothing, as at an equilibrium. Only if
@@ -261,22 +261,22 @@ def _relative_sizes(
     sizes = jnp.abs(vector)
     sizes = _BESIDE * jnp.where(sizes == 0, jnp.max(sizes, initial=0), sizes)
     beside = vector + sizes * without_pattern(vector.size, dtype)
-    idle = (terms == 0) & (terms_at(beside, equations.linearise(beside)[1]) > 0)
+    idle = (terms == 0) & (terms_at(beside, problem.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field, so that its value is less accurate than its size tells. If
     # that roundoff is much larger than the terms, the defect is relative to it.
-    if equations.pattern is None:
-        _, _, hidden = hidden_terms(excess, vector)
+    if problem.pattern is None:
+        _, _, hidden = cancellation_terms(excess, vector)
         terms = jnp.where(hidden > 4 * terms, hidden, terms)
     # An integral that is not finite counts as not conserved, though its derivative may vanish.
     defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)
     violation = jnp.zeros_like(residual)
     if isinstance(entry, Constraint):
-        violation = relative(residual, equations.scale(jacobian, vector))
+        violation = relative(residual, problem.scale(jacobian, vector))
     defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
     return (
         defect,
         violation,
-        ~jnp.any(shown_terms(jacobian, jnp.ones_like(vector))) & jnp.all(partial == 0),
+        ~jnp.any(gradient_scale(jacobian, jnp.ones_like(vector))) & jnp.all(partial == 0),
         idle,
     )
 

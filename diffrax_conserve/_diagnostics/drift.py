@@ -21,9 +21,9 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
+from .._numerics.problem import gradient_scale, measure, relative
+from .._numerics.roundoff import cancellation_scale
 from .._options import check_solution
-from .._step.equations import measure, relative, shown_terms
-from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_add, tree_shapes, tree_sub
 
 
@@ -132,8 +132,8 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         # Twice the tolerance of a projection, because the roundoff of the functions is measured
         # here anew, and may be a bit smaller than where the solve measured it.
         g = ravel(residual(t, y))
-        _, jacobian, hidden = hidden_scale(manifold, t, y, args)
-        scale = numbers + shown_terms(jacobian, jnp.abs(ravel(y))) + hidden
+        _, jacobian, hidden = cancellation_scale(manifold, t, y, args)
+        scale = numbers + gradient_scale(jacobian, jnp.abs(ravel(y))) + hidden
         limit = 2 * ROUNDOFF * float(jnp.finfo(g.dtype).eps) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 
@@ -223,7 +223,10 @@ def _gained(
         # A projected solver computes its balances along the dense output of the wrapped solver, so
         # we take the same.
         local = getattr(local, "inner", local)
-        return integrated_rates(manifold, path.ts[step], end, local.evaluate, args, path.direction)
+        # Times of the solver, which are the negative of the field's in a solve backwards in time.
+        sign = path.direction
+        states = lambda t: local.evaluate(t * sign)  # noqa: E731
+        return integrated_rates(manifold, path.ts[step] * sign, end * sign, states, args)
 
     def whole(step: Array) -> Values:
         # Of a batch with unlike numbers of steps, some are padding. These are replaced by the first

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args
 from .._manifold import slope_of
-from .._step.metric import spread
+from .._numerics.metric import spread
 from .._tree import ravel, unravel
 
 # Slopes are taken at so many states for each component, and moved by this share of the size of the

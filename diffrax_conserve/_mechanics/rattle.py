@@ -26,16 +26,25 @@ from .._hashable import Hashable
 from .._interpolation import Packed
 from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved, after_test, iterate, keep_done
+from .._numerics.linear import (
+    Factors,
+    Solve,
+    combined,
+    factored,
+    gram_matrix,
+    refined,
+    solve,
+    times,
+)
+from .._numerics.metric import Diagonal, spread
+from .._numerics.problem import Jacobian, Problem, gradient_scale, problem_of
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
-from .._solver.diffrax_private import member
-from .._solver.state import FIRST, cause_of_failure, started, violated
+from .._solver.failure import end_of_step, failure_cause, is_off_manifold
+from .._solver.state import initial_values
 from .._solver.terms import is_backsolve, is_ode, time_direction
-from .._step.equations import Equations, Jacobian, equations_of, shown_terms
-from .._step.implicit import root
-from .._step.iterate import Solved, after_test, iterate, keep_done
-from .._step.linear import Factors, Solve, combined, factored, gram_matrix, refined, solve, times
-from .._step.metric import Diagonal, spread
 from .._time import nonzero_length
 from .._tree import ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -64,14 +73,14 @@ class _State(eqx.Module):
     - `at`: the constraints at its start.
     - `slope`: the force divided by the masses, at its start.
     - `multiplier`: that of the last step, the first guess for the next.
-    - `hidden`: the part of the scales that the gradients do not show.
+    - `cancellation`: the part of the scales that the gradients do not show.
     - `off`: whether the start of the solve was off the constraint, so that every step fails.
     """
 
     at: _Linear
     slope: PyTree[Array]
     multiplier: Float[Array, " m"]
-    hidden: Float[Array, " m"]
+    cancellation: Float[Array, " m"]
     off: Bool[Array, ""]
 
 
@@ -174,8 +183,8 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         q, v = (jax.tree.map(jnp.asarray, x) for x in y)
         t = jnp.asarray(t, jnp.result_type(float, t))
         values = conserved_values(self.constraint, t, q, args)
-        hidden = ravel(values).astype(ravel(q).dtype)
-        equations = self._equations(t, q, args, hidden, jnp.asarray(1, t.dtype))
+        zeros = ravel(values).astype(ravel(q).dtype)
+        problem = self._problem(t, q, args, zeros, jnp.asarray(1, t.dtype))
         drift, kick = terms[0].vf, terms[1].vf(t, q, args)
 
         def slope(t: Array, q: Y, v: Y) -> Values:
@@ -184,8 +193,8 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
         start, along = (t, q, v), (jnp.ones_like(t), drift(t, v, args), kick)
         wrong = jax.jvp(slope, start, along)[1]
-        _, jacobian = equations.linearise(ravel(q))
-        gram = self._gram(equations, jacobian, self._drift(terms, t, v, args), ravel(v))
+        _, jacobian = problem.linearise(ravel(q))
+        gram = self._gram(problem, jacobian, self._drift(terms, t, v, args), ravel(v))
         return unflatten(solve(gram, -wrong), values)
 
     def init(
@@ -211,22 +220,21 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
                 f"{tree_shapes(v)}. `RATTLE` needs a state `(q, v)` of two parts that are alike."
             )
         direction = time_direction(terms, t0)
-        values = conserved_values(self.constraint, t0 * direction, q, args)
-        values, hidden = started(values, self.constraint, t0 * direction, q, args)
-        equations = self._equations(t0, q, args, hidden, direction)
+        _, cancellation = initial_values(self.constraint, t0 * direction, q, args)
+        problem = self._problem(t0, q, args, cancellation, direction)
         drift = self._drift(terms, t0, v, args)
-        at, rate = self._linear(equations, t0, q, args, direction, drift, ravel(v))
+        at, rate = self._linear(problem, t0, q, args, direction, drift, ravel(v))
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
-        squares = jax.tree.map(jnp.square, equations.factor.of_rows(at.jacobian))
+        squares = jax.tree.map(jnp.square, problem.factor.of_rows(at.jacobian))
         lengths = jnp.sqrt(times(squares, jnp.ones_like(ravel(v))))
-        limit = lengths * equations.factor.length(drift(ravel(v))) + jnp.abs(rate)
+        limit = lengths * problem.factor.length(drift(ravel(v))) + jnp.abs(rate)
         moves = rate + times(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
-        off = off | violated(equations, self.constraint, ravel(q))
+        off = off | is_off_manifold(problem, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
-        return _State(at, slope, jnp.zeros_like(hidden), hidden, off)
+        return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off)
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
     def step(
@@ -251,20 +259,20 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         )
         state = dataclasses.replace(state, slope=slope)  # dense output needs it too
 
-        equations = self._equations(t1, q0, args, state.hidden, direction)
+        problem = self._problem(t1, q0, args, state.cancellation, direction)
         kicked = _once(v + h / 2 * ravel(slope))
 
         # The unknown is `h² λ / 2`, which a multiplier `λ` contributes to the positions. Unlike `λ`
         # itself it is well determined when the step is short.
         def halfway(displacement: Array) -> Array:
-            return kicked + per_step * _impulse(equations, displacement, at.jacobian)
+            return kicked + per_step * _impulse(problem, displacement, at.jacobian)
 
         def position(displacement: Array) -> Array:
             return q + h * drift(halfway(displacement))
 
         displacement, found, _, _ = root(
-            lambda x: equations.residual(position(x)),
-            ft.partial(_shaken, equations, position, at, q, self.max_steps),
+            lambda x: problem.residual(position(x)),
+            ft.partial(_shaken, problem, position, at, q, self.max_steps),
             state.multiplier * (h * h / 2),
             solve,
         )
@@ -273,36 +281,34 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         slope = terms[1].vf(t1, y1, args)
         kicked = _once(half + h / 2 * ravel(slope))
         drift = self._drift(terms, t1, v0, args)
-        at, rate = self._linear(equations, t1, y1, args, direction, drift, kicked)
-        v1, keeps = _on_tangent(equations, at, rate, drift, kicked)
+        at, rate = self._linear(problem, t1, y1, args, direction, drift, kicked)
+        v1, keeps = _on_tangent(problem, at, rate, drift, kicked)
 
         ok = found & keeps
-        failed = cause_of_failure(ok, state.off, state.hidden, jnp.concatenate([q1, v1]))
-        y1 = y1, unravel(v1, v0)
-        y1 = jax.tree.map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
-        result = dfx.RESULTS.where(failed == 0, dfx.RESULTS.successful, member(FIRST - 1 + failed))
+        cause = failure_cause(ok, state.off, state.cancellation, jnp.concatenate([q1, v1]))
+        (q1, v1), result = end_of_step(cause, (q1, v1), dfx.RESULTS.successful)
         dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
         multiplier = 2 * displacement * per_step**2
-        return y1, None, dense_info, _State(at, slope, multiplier, state.hidden, state.off), result
+        state = _State(at, slope, multiplier, state.cancellation, state.off)
+        return (unravel(q1, q0), unravel(v1, v0)), None, dense_info, state, result
 
-    def _equations(
-        self, t: RealScalarLike, q: Y, args: Args, hidden: Array, direction: Array
-    ) -> Equations:
-        values, t = jnp.zeros_like(hidden), t * direction
-        equations = equations_of(self.constraint, values, t, q, args, hidden)
+    def _problem(
+        self, t: RealScalarLike, q: Y, args: Args, cancellation: Array, direction: Array
+    ) -> Problem:
+        values, t = jnp.zeros_like(cancellation), t * direction
         metric = Diagonal(lax.rsqrt(spread("masses", self.masses, q)))
-        return dataclasses.replace(equations, factor=metric)
+        return problem_of(self.constraint, values, t, q, args, cancellation, factor=metric)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
         """The function from velocities `v`, or momenta, to `q'`, both as vectors."""
         return lambda p: ravel(terms[0].vf(t, unravel(p, v), args))
 
-    def _gram(self, equations: Equations, jacobian: Jacobian, drift: Any, p: Array) -> Any:
+    def _gram(self, problem: Problem, jacobian: Jacobian, drift: Any, p: Array) -> Any:
         """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear: so its derivative is
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
-        forces = equations.factor.of_rows(equations.factor.of_rows(jacobian))
+        forces = problem.factor.of_rows(problem.factor.of_rows(jacobian))
         if isinstance(jacobian, SparseRows):
             speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
             return jacobian.gram(forces.times_columns(speeds))
@@ -311,7 +317,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
     def _linear(
         self,
-        equations: Equations,
+        problem: Problem,
         t: RealScalarLike,
         q: Y,
         args: Args,
@@ -320,11 +326,11 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         p: Array,
     ) -> tuple[_Linear, Float[Array, " m"]]:
         """The constraints at a position, and their partial derivative `∂_t g`."""
-        jacobian = _once(equations.linearise(ravel(q))[1])
+        jacobian = _once(problem.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
         t = t * direction
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
-        gram = _once(lax.stop_gradient(self._gram(equations, jacobian, drift, p)))
+        gram = _once(lax.stop_gradient(self._gram(problem, jacobian, drift, p)))
         factors: Any = gram if isinstance(gram, BlockGram) else _once(factored(gram))
         return _Linear(jacobian, factors), rate
 
@@ -349,20 +355,20 @@ broadcast, the state is no pair of positions and velocities that are alike, or a
 _once = lax.optimization_barrier
 
 
-def _impulse(equations: Equations, multiplier: Array, rows: Any) -> Float[Array, " n"]:
+def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
     """`M⁻¹ Gᵀ λ`."""
-    return equations.factor.of_rows(equations.factor.of_rows(combined(multiplier, rows)))
+    return problem.factor.of_rows(problem.factor.of_rows(combined(multiplier, rows)))
 
 
 def _shaken(
-    equations: Equations, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
+    problem: Problem, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
 ) -> Solved:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
     step: a step of the iteration evaluates the constraint and nothing else."""
     # The residuals are compared with their scales at the start of the step, for coordinates as
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
-    scale, solve = equations.scale(at.jacobian, sizes), at.solve()
+    scale, solve = problem.scale(at.jacobian, sizes), at.solve()
     _, moves = jax.linearize(position, guess)
 
     def change(g: Array) -> Array:
@@ -374,8 +380,8 @@ def _shaken(
         return x if len(g) <= WRITTEN_OUT else solve(times(at.jacobian, moves(x)))
 
     def advance(x: Array, counter: Array) -> tuple[Array, Array]:
-        g = _once(equations.residual(_once(position(x))))
-        level, _ = equations.level(g, scale)
+        g = _once(problem.residual(_once(position(x))))
+        level, _ = problem.level(g, scale)
         counter = after_test(level, counter)
         return keep_done(counter, x - change(g), x), counter
 
@@ -383,7 +389,7 @@ def _shaken(
 
 
 def _on_tangent(
-    equations: Equations, at: _Linear, rate: Array, drift: Any, p: Array
+    problem: Problem, at: _Linear, rate: Array, drift: Any, p: Array
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """The velocities nearest to `p` that keep the constraint, `∂_t g + G v = 0`, and whether they
     do so to roundoff. The multipliers solve a linear system, and have its derivative."""
@@ -391,7 +397,7 @@ def _on_tangent(
 
     def product(x: Array) -> Array:
         """`G M⁻¹ Gᵀ x`, for momenta with the masses in `drift`, which is linear."""
-        change = _impulse(equations, x, at.jacobian)
+        change = _impulse(problem, x, at.jacobian)
         return times(at.jacobian, jax.jvp(drift, (p,), (change,))[1])
 
     def iterated(product: Any, b: Array) -> Array:
@@ -399,10 +405,10 @@ def _on_tangent(
 
     wrong = rate + times(at.jacobian, drift(p))
     x = lax.custom_linear_solve(product, -wrong, iterated, iterated, symmetric=True)
-    v = p + _impulse(equations, x, at.jacobian)
+    v = p + _impulse(problem, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
     # velocities is that of the terms, and not of their sum.
-    terms = _impulse(equations, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
+    terms = _impulse(problem, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
     sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
-    limit = equations.tolerance(jnp.abs(rate) + shown_terms(at.jacobian, sizes))
+    limit = problem.tolerance(jnp.abs(rate) + gradient_scale(at.jacobian, sizes))
     return v, jnp.all(jnp.abs(rate + times(at.jacobian, drift(v))) <= limit)

@@ -14,18 +14,19 @@ from .._balance import refuse_rates
 from .._constants import MAX_STEPS, NOISE, ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import Packed
-from .._manifold import check_manifold, conserved_values
-from .._projection.base import Target
+from .._manifold import check_manifold
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved, after_test, any_lane, iterate, keep_done
+from .._numerics.linear import combined, gram_matrix, saddle, scaled_rows, solve, times
+from .._numerics.problem import NOT_FINITE, OFF, ON, SETTLED, Problem, problem_of
+from .._projection.base import adapted
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
-from .._solver.diffrax_private import member
-from .._solver.state import FIRST, ProjectionStatistics, cause_of_failure, started, violated
-from .._solver.terms import check_nested, innermost, is_backsolve, time_direction
+from .._solver.failure import end_of_step, failure_cause, is_off_manifold
+from .._solver.state import initial_values
+from .._solver.statistics import ProjectionStatistics
+from .._solver.terms import check_nested, innermost, refuse_backsolve, time_direction
 from .._solver.wrapper import ForwardingSolver
-from .._step.equations import NOT_FINITE, OFF, ON, SETTLED, Equations
-from .._step.implicit import root
-from .._step.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._step.linear import combined, gram_matrix, saddle, scaled_rows, solve, times
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -36,7 +37,7 @@ class _State(eqx.Module):
 
     inner: Any
     values: Float[Array, " m"]
-    hidden: Float[Array, " m"]
+    cancellation: Float[Array, " m"]
     multiplier: Float[Array, " m"]
     statistics: ProjectionStatistics
 
@@ -131,18 +132,13 @@ class SymmetricProjection(ForwardingSolver):
         y0: Y,
         args: Args,
     ) -> _State:
-        if is_backsolve(terms):
-            raise ValueError(
-                "`SymmetricProjection` cannot solve the adjoint equations of `BacksolveAdjoint`, "
-                "whose state is not on the manifold. Use `diffrax.RecursiveCheckpointAdjoint()`."
-            )
+        refuse_backsolve(terms, "SymmetricProjection")
         check_state(y0, kind=jnp.inexact)
         t = t0 * time_direction(terms, t0)
-        values = conserved_values(self.manifold, t, y0, args)
-        values, hidden = started(values, self.manifold, t, y0, args)
+        values, cancellation = initial_values(self.manifold, t, y0, args)
         statistics = ProjectionStatistics.zero(self.manifold, values.dtype)
         inner = self.solver.init(terms, t0, t1, y0, args)
-        return _State(inner, values, hidden, jnp.zeros_like(values), statistics)
+        return _State(inner, values, cancellation, jnp.zeros_like(values), statistics)
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
     def step(
@@ -156,11 +152,8 @@ class SymmetricProjection(ForwardingSolver):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, _State, dfx.RESULTS]:
         del made_jump
-        state, vector = solver_state, ravel(y0)
-        direction = time_direction(terms, t0)
-        values, hidden = state.values, state.hidden
-        target = Target(self.projection, self.manifold, values, hidden, args, direction)
-        start, end = (target.equations(t, y0).dense() for t in (t0, t1))
+        state, vector, sign = solver_state, ravel(y0), time_direction(terms, t0)
+        start, end = (self._problem(t * sign, y0, args, state).dense() for t in (t0, t1))
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
             # A symmetric method has no memory, so we discard the state of the wrapped solver. The
@@ -174,24 +167,26 @@ class SymmetricProjection(ForwardingSolver):
             candidate, _ = inner(vector + _along(start, vector, multiplier))
             return y - candidate - _along(end, y, multiplier), end.residual(y)
 
-        (y1, multiplier), ok, num_steps, (candidate, result) = root(
+        (y1, multiplier), ok, num_iterations, (candidate, result) = root(
             residual,
             ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
             (vector, state.multiplier),
             ft.partial(saddle, vector.size),
         )
-        info = target.problem(t1, y0).report(candidate, y1, num_steps, ok=ok)
-        off = violated(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
-        failed = cause_of_failure(info.ok, off, state.values, ravel(y1) - ravel(candidate))
-        inner_failed = result != dfx.RESULTS.successful
-        y1 = unravel(jnp.where((failed > 0) | inner_failed, jnp.nan, y1), y0)
-        result = dfx.RESULTS.where(
-            (failed == 0) | (inner_failed & ~off), result, member(FIRST - 1 + failed)
-        )
+        info = end.report(candidate, y1, num_iterations, ok=ok)
+        off = is_off_manifold(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
+        cause = failure_cause(info.ok, off, state.values, y1 - candidate)
+        y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
+        y1, result = end_of_step(cause, y1, result)
         dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
-        statistics = state.statistics.add(info, None, None)
-        state = _State(state.inner, state.values, state.hidden, multiplier, statistics)
-        return y1, None, dense_info, state, result
+        statistics = state.statistics.add(info, None)
+        state = _State(state.inner, state.values, state.cancellation, multiplier, statistics)
+        return unravel(y1, y0), None, dense_info, state, result
+
+    def _problem(self, t: RealScalarLike, y0: Y, args: Args, state: _State) -> Problem:
+        """The problem at a time of the vector field, with the metric at the start of the step."""
+        problem = problem_of(self.manifold, state.values, t, y0, args, state.cancellation)
+        return adapted(problem, self.projection, ravel(y0))
 
 
 SymmetricProjection.__init__.__doc__ = r"""**Arguments:**
@@ -215,14 +210,14 @@ and backwards. `TypeError` or `ValueError` if another argument does not fit.
 """
 
 
-def _along(equations: Equations, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
+def _along(problem: Problem, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
-    _, vjp = jax.vjp(equations.residual, y)
-    return equations.factor.of_change(equations.factor.of_rows(vjp(multiplier)[0]))
+    _, vjp = jax.vjp(problem.residual, y)
+    return problem.factor.of_change(problem.factor.of_rows(vjp(multiplier)[0]))
 
 
 def _solved(
-    start: Equations, end: Equations, inner: Any, y0: Array, max_steps: int, guess: Any
+    start: Problem, end: Problem, inner: Any, y0: Array, max_steps: int, guess: Any
 ) -> Solved:
     """Simplified Newton's method for `μ`, with the matrix `G₁ M⁻¹ G₁ᵀ + G₀ M⁻¹ G₀ᵀ`, where `G₀` and
     `G₁` are the gradients at both ends of the step.
@@ -267,7 +262,7 @@ def _solved(
 
     found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
     y, multiplier, candidate, result = found.y
-    return Solved((y, multiplier), found.ok, found.num_steps + 1, (candidate, result))
+    return Solved((y, multiplier), found.ok, found.num_iterations + 1, (candidate, result))
 
 
 def _check_symmetric(solver: Any) -> None:

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._constants import MAX_STEPS
-from .._step.implicit import Along, solution
-from .._step.metric import Diagonal
-from .base import AbstractProjection, Problem, ProjectionInfo
+from .._numerics.implicit import Along, solution
+from .._numerics.metric import Diagonal
+from .._numerics.problem import Problem
+from .._numerics.report import ProjectionInfo
+from .base import AbstractProjection
 from .options import check_options, option
 
 
@@ -86,7 +88,7 @@ class AlongLine(AbstractProjection):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        size = problem.equations.magnitude.size
+        size = problem.magnitude.size
         if size != 1:
             raise ValueError(
                 f"`AlongLine` has one unknown, but `manifold` has {size} scalar constraints. Keep "
@@ -99,14 +101,16 @@ class AlongLine(AbstractProjection):
         line = self._line(problem, candidate)
         least = float(jnp.finfo(line.dtype).tiny) ** 0.5
         s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
-        equations, row = (
-            dataclasses.replace(problem.equations, factor=Diagonal(s)),
-            (line / s)[None],
-        )
-        y, ok, count, _ = solution(Along(equations, candidate, row, max_steps=self.max_steps))
+        along = dataclasses.replace(problem, factor=Diagonal(s))
+        row = (line / s)[None]
+        y, ok, count, _ = solution(Along(along, candidate, row, max_steps=self.max_steps))
         if self.direction == "step":
             ok = ok & _is_no_return(problem, candidate, y)
         return y, problem.report(candidate, y, count, ok=ok)
+
+    @property
+    def needs_signed_error(self) -> bool:
+        return self.direction == "error"
 
     def _line(self, problem: Problem, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The vector `w`."""

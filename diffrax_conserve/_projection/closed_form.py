@@ -9,10 +9,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._custom_types import RealScalarLike, Values
+from .._numerics.metric import positive_weights
+from .._numerics.problem import Problem
+from .._numerics.report import ProjectionInfo
 from .._options import check_function
-from .._step.metric import positive_weights
 from .._tree import ravel
-from .base import AbstractProjection, Problem, ProjectionInfo
+from .base import AbstractProjection
 from .options import check_options, option
 
 

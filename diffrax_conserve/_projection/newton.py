@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import NEAREST, ROUNDOFF
-from .._step.equations import Equations
-from .._step.implicit import Along, certain, root, solution
-from .._step.iterate import Solved, damped
-from .._step.linear import gram_matrix, least_pivot, saddle, solve, times, unit_rows
-from .._step.metric import Identity
+from .._numerics.implicit import Along, certain, root, solution
+from .._numerics.iterate import Solved, damped
+from .._numerics.linear import gram_matrix, least_pivot, saddle, solve, times, unit_rows
+from .._numerics.metric import Identity
+from .._numerics.problem import Problem
+from .._numerics.report import ProjectionInfo
 from .._tree import tree_stop_gradient
-from .base import Problem, ProjectionInfo
 from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, Bounds, project_within
 
@@ -72,17 +72,17 @@ class Newton(AbstractNewton):
                 f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
-        equations, bounds = problem.equations, self.bounds(problem.like)
-        given = _Given(equations.dense(), candidate, bounds)
-        if candidate.size + equations.magnitude.size > NEAREST:
-            first = _some_point(equations, given, self.max_steps)
-            y, count = given.clip(first.y), first.num_steps
+        bounds = self.bounds(problem.like)
+        given = _Given(problem.dense(), candidate, bounds)
+        if candidate.size + problem.magnitude.size > NEAREST:
+            first = _some_point(problem, given, self.max_steps)
+            y, count = given.clip(first.y), first.num_iterations
             y = certain(y, False)
         else:
-            equations, still = tree_stop_gradient((equations, given))
-            first = _some_point(equations, still, self.max_steps)
+            problem, still = tree_stop_gradient((problem, given))
+            first = _some_point(problem, still, self.max_steps)
             y, count = _nearest(given, first.y, self.max_steps)
-            count = first.num_steps + count
+            count = first.num_iterations + count
         return y, problem.report(candidate, y, count)
 
 
@@ -92,7 +92,7 @@ Newton.__init__.__doc__ = NEWTON_OPTIONS
 class _Given(eqx.Module):
     """What is given: the equations, the candidate and the bounds."""
 
-    equations: Equations
+    problem: Problem
     candidate: Float[Array, " n"]
     bounds: Bounds | None
 
@@ -100,12 +100,12 @@ class _Given(eqx.Module):
         return z if self.bounds is None else self.bounds.clip(z)
 
 
-def _some_point(equations: Equations, given: _Given, max_steps: int) -> Solved:
+def _some_point(problem: Problem, given: _Given, max_steps: int) -> Solved:
     """First phase: some point of the manifold, within bounds before the clip. Nobody uses its
     derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
     if given.bounds is not None:
-        return project_within(given.bounds, equations, given.candidate, max_steps=max_steps)
-    return solution(Along(equations, given.candidate, iteration=damped, max_steps=max_steps))
+        return project_within(given.bounds, problem, given.candidate, max_steps=max_steps)
+    return solution(Along(problem, given.candidate, iteration=damped, max_steps=max_steps))
 
 
 class _Conditions(eqx.Module):
@@ -123,28 +123,28 @@ class _Conditions(eqx.Module):
         # else, so that a component that is never moved has the derivative of the candidate.
         candidate, change = self.given.candidate, unknowns[: self.base.size]
         base = self.base + (candidate - lax.stop_gradient(candidate))
-        return self.given.clip(base + self.given.equations.factor.of_change(change))
+        return self.given.clip(base + self.given.problem.factor.of_change(change))
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
-        equations, away = self.given.equations, self.base - lax.stop_gradient(self.given.candidate)
+        problem, away = self.given.problem, self.base - lax.stop_gradient(self.given.candidate)
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
-        g, vjp = jax.vjp(equations.residual, self.state(unknowns))
-        gradient = equations.factor.of_rows(vjp(multiplier / self.lengths)[0])
-        return jnp.concatenate([equations.factor.measured(away) + change - gradient, g])
+        g, vjp = jax.vjp(problem.residual, self.state(unknowns))
+        gradient = problem.factor.of_rows(vjp(multiplier / self.lengths)[0])
+        return jnp.concatenate([problem.factor.measured(away) + change - gradient, g])
 
 
-def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Equations]:
+def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Problem]:
     """The conditions around a base; the unknowns there, with the multipliers that fit best; and the
     conditions as equations with their scales and tolerances."""
-    equations, y = given.equations, given.clip(base)
-    jacobian = equations.linearise(y)[1]
-    lengths, rows = unit_rows(equations.factor.of_rows(jacobian))
+    problem, y = given.problem, given.clip(base)
+    jacobian = problem.linearise(y)[1]
+    lengths, rows = unit_rows(problem.factor.of_rows(jacobian))
     conditions = _Conditions(given, base, lengths)
-    sizes_of = [jnp.abs(equations.factor.measured(x)) for x in (base, given.candidate)]
-    change = equations.factor.measured(base - given.candidate)
+    sizes_of = [jnp.abs(problem.factor.measured(x)) for x in (base, given.candidate)]
+    change = problem.factor.measured(base - given.candidate)
     fits = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
-    scale = equations.scale(jacobian, y)
+    scale = problem.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 
     def tolerance(mine: float, of_user: Any) -> Array:
@@ -153,14 +153,14 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         return jnp.concatenate([jnp.full_like(y, mine), of_user.astype(y.dtype)])
 
     tested = dataclasses.replace(
-        equations,
-        parts=(conditions,),
+        problem,
+        functions=(conditions,),
         magnitude=jnp.concatenate([sizes_of[0] + sizes_of[1], scale]),
-        hidden=jnp.concatenate([jnp.zeros_like(y), equations.hidden]),
-        moved=None,
+        cancellation=jnp.concatenate([jnp.zeros_like(y), problem.cancellation]),
+        changes=None,
         factor=Identity(),
-        rtol=tolerance(ROUNDOFF * eps, equations.rtol),
-        atol=tolerance(0.0, equations.atol),
+        rtol=tolerance(ROUNDOFF * eps, problem.rtol),
+        atol=tolerance(0.0, problem.atol),
     )
     return conditions, jnp.concatenate([jnp.zeros_like(y), fits]), tested
 
@@ -175,17 +175,17 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
         base, _, count, left = now
         _, start, tested = _conditions(still, base)
         found = damped(tested, start, max_steps=max_steps, polish=True)
-        end = base + still.equations.factor.of_change(found.y[: base.size])
+        end = base + still.problem.factor.of_change(found.y[: base.size])
         left = jnp.where(found.ok, left - 1, 0)
-        return jnp.where(found.ok, end, base), found.ok, count + found.num_steps, left
+        return jnp.where(found.ok, end, base), found.ok, count + found.num_iterations, left
 
     # The change from the first base may be so large that its roundoff is that of another state.
     # So we start once more, from the result: now the change is roundoff.
     begin = first, jnp.asarray(False), jnp.asarray(0), jnp.asarray(2)
     base, ok, count, _ = lax.while_loop(lambda now: now[-1] > 0, approach, begin)
-    ok = ok & still.equations.holds(still.clip(base))
+    ok = ok & still.problem.holds(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
     found = root(conditions, lambda x: Solved(x, ok, count), start, ft.partial(saddle, first.size))
     y = conditions.state(found.y)
-    return certain(y, ok | ~still.equations.holds(lax.stop_gradient(y))), count
+    return certain(y, ok | ~still.problem.holds(lax.stop_gradient(y))), count

@@ -1,18 +1,18 @@
 """`project`, and the checks of what is projected."""
 
-import dataclasses
-
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
-from .._step.equations import shown_terms
-from .._step.roundoff import hidden_scale
-from .._tree import ravel, tree_stop_gradient
-from .base import AbstractProjection, ProjectionInfo, Target, check_projection
+from .._numerics.problem import Problem, gradient_scale, problem_of
+from .._numerics.report import ProjectionInfo
+from .._numerics.roundoff import cancellation_scale
+from .._tree import ravel, tree_stop_gradient, unravel
+from .base import AbstractProjection, adapted, check_projection
 from .newton import Newton
 from .options import check_state
 
@@ -68,28 +68,38 @@ def project(
     check_state(y, kind=jnp.inexact)
     y = jtu.tree_map(jnp.asarray, y)
     values = ravel(given_values(manifold, value, t, y, args)).astype(ravel(y).dtype)
-    hidden, direction = jnp.zeros_like(values), jnp.asarray(1)
-    target = Target(projection, manifold, values, hidden, args, direction)
-    return _projected(target, t, y)
+    return _projected(manifold, projection, values, t, y, args)
 
 
 @eqx.filter_jit
-def _projected(target: Target, t: RealScalarLike, candidate: Y) -> tuple[Y, ProjectionInfo]:
+def _projected(
+    manifold: Manifold,
+    projection: AbstractProjection,
+    values: Float[Array, " m"],
+    t: RealScalarLike,
+    candidate: Y,
+    args: Args,
+) -> tuple[Y, ProjectionInfo]:
     """The tolerance follows the roundoff of the functions, which is measured at the candidate. At a
     result far away it may be different, so the result is judged by what is measured there."""
-    _, _, hidden = hidden_scale(target.manifold, t, candidate, target.args)
-    target = dataclasses.replace(target, hidden=hidden)
-    y, info = target.project(t, candidate)
+    vector = ravel(candidate)
+
+    def problem(cancellation: Float[Array, " m"]) -> Problem:
+        asked = problem_of(manifold, values, t, candidate, args, cancellation)
+        return adapted(asked, projection, vector)
+
+    _, _, at_candidate = cancellation_scale(manifold, t, candidate, args)
+    y, info = projection.solve(problem(at_candidate), vector)
     # If the projection failed, its result may be NaN, where nothing can be measured.
-    usable = jtu.tree_map(lambda x, y: jnp.where(jnp.isfinite(x), x, y), y, candidate)
-    value, jacobian, hidden = hidden_scale(target.manifold, t, usable, target.args)
-    there = dataclasses.replace(target, hidden=hidden).problem(t, candidate)
+    usable = unravel(jnp.where(jnp.isfinite(y), y, vector), candidate)
+    value, jacobian, there = cancellation_scale(manifold, t, usable, args)
     # A projection may have tolerances of its own. If it reports a success, we believe it, unless
     # there is less than half of the roundoff that it assumed.
-    shown = jnp.abs(value) + shown_terms(jacobian, jnp.abs(ravel(usable)))
-    ok = tree_stop_gradient(there.equations).holds(lax.stop_gradient(ravel(y)))
-    ok = ok | info.ok & jnp.all(target.hidden <= 2 * (shown + hidden))
-    return y, there.report(ravel(candidate), ravel(y), info.num_steps, ok=ok)
+    shown = jnp.abs(value) + gradient_scale(jacobian, jnp.abs(ravel(usable)))
+    judged = problem(there)
+    ok = tree_stop_gradient(judged).holds(lax.stop_gradient(y))
+    ok = ok | info.ok & jnp.all(at_candidate <= 2 * (shown + there))
+    return unravel(y, candidate), judged.report(vector, y, info.num_iterations, ok=ok)
 
 
 def given_values(

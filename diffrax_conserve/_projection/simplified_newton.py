@@ -7,8 +7,9 @@ from typing import final
 
 from jaxtyping import Array, Float
 
-from .._step.implicit import Along, solution
-from .base import Problem, ProjectionInfo
+from .._numerics.implicit import Along, solution
+from .._numerics.problem import Problem
+from .._numerics.report import ProjectionInfo
 from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, project_within
 
@@ -58,11 +59,11 @@ class SimplifiedNewton(AbstractNewton):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        equations, bounds = problem.equations, self.bounds(problem.like)
+        bounds = self.bounds(problem.like)
         if bounds is None:
-            y, ok, count, _ = solution(Along(equations, candidate, max_steps=self.max_steps))
+            y, ok, count, _ = solution(Along(problem, candidate, max_steps=self.max_steps))
         else:
-            z, ok, count, _ = project_within(bounds, equations, candidate, max_steps=self.max_steps)
+            z, ok, count, _ = project_within(bounds, problem, candidate, max_steps=self.max_steps)
             y = bounds.clip(z)
         return y, problem.report(candidate, y, count, ok=ok)
 

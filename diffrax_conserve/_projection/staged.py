@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._large.sparse import pattern_of
+from .._numerics.problem import Problem
+from .._numerics.report import ProjectionInfo
 from .._tree import ravel
-from .base import AbstractProjection, Problem, ProjectionInfo, adapted
+from .base import AbstractProjection, adapted
 
 
 @final
@@ -54,6 +56,15 @@ class Staged(AbstractProjection):
     metric: None = eqx.field(default=None, init=False)
     sees_step: ClassVar[bool] = False
 
+    @property
+    def has_bounds(self) -> bool:
+        return any(projection.has_bounds for projection in self.projections)
+
+    def clip(self, y: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
+        for projection in self.projections:
+            y = projection.clip(y, like)
+        return y
+
     def __init__(self, *stages: Any):
         for stage in stages:
             pair = isinstance(stage, tuple) and len(stage) == 2
@@ -78,7 +89,7 @@ class Staged(AbstractProjection):
         for number, projection in enumerate(self.projections, start=1):
             y, info = projection.solve(_restricted(problem, self.names[:number], projection, y), y)
             infos.append(info)
-        count = sum(info.num_steps for info in infos)
+        count = sum(info.num_iterations for info in infos)
         # The last stage has tested all parts, by its own tolerances.
         return y, problem.report(candidate, y, count, ok=infos[-1].ok)
 
@@ -99,19 +110,16 @@ def _restricted(
 ) -> Problem:
     """The problem restricted to the entries with these keys, in the metric and with the tolerances
     of the projection. A metric that is a function is evaluated at the candidate of the stage."""
-    y = jax.eval_shape(ravel, problem.like)
     wanted = [key in keys for key in problem.keys]
-    sizes = [eqx.filter_eval_shape(part, y).size for part in problem.equations.parts]
-    rows = np.flatnonzero(np.repeat(wanted, sizes))
-    parts = tuple(it.compress(problem.equations.parts, wanted))
-    equations = dataclasses.replace(
-        problem.equations,
-        parts=parts,
-        magnitude=problem.equations.magnitude[rows],
-        hidden=problem.equations.hidden[rows],
-        pattern=pattern_of(parts, list(it.compress(sizes, wanted)), y),
-    )
-    return dataclasses.replace(
+    rows = np.flatnonzero(problem.per_residual(wanted))
+    functions = tuple(it.compress(problem.functions, wanted))
+    y = jax.eval_shape(ravel, problem.like)
+    sizes = [eqx.filter_eval_shape(fn, y).size for fn in functions]
+    restricted = dataclasses.replace(
         problem,
-        equations=adapted(equations, projection, problem.t, problem.state(candidate), problem.args),
+        functions=functions,
+        magnitude=problem.magnitude[rows],
+        cancellation=problem.cancellation[rows],
+        pattern=pattern_of(functions, sizes, y),
     )
+    return adapted(restricted, projection, candidate)

@@ -25,10 +25,10 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
+from .._numerics.linear import corrected, gram_matrix, scaled_rows, solve
+from .._numerics.metric import factor_of, positive_weights
+from .._numerics.problem import problem_of
 from .._options import check_number
-from .._step.equations import equations_of
-from .._step.linear import corrected, gram_matrix, scaled_rows, solve
-from .._step.metric import factor_of, positive_weights
 from .._tree import ravel, tree_add, unflatten, unravel
 from .options import check_state
 
@@ -154,9 +154,9 @@ class TangentField(eqx.Module):
         slope = slope_of(self.vector_field, t, y, args)
         vector = ravel(y)
         numbers = ravel(values).astype(vector.dtype)
-        equations = equations_of(self.manifold, numbers, t, y, args)
+        problem = problem_of(self.manifold, numbers, t, y, args)
         if self.metric is not None:
-            equations = dataclasses.replace(equations, factor=factor_of(self.metric, t, y, args))
+            problem = dataclasses.replace(problem, factor=factor_of(self.metric, t, y, args))
         evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
@@ -167,10 +167,10 @@ class TangentField(eqx.Module):
             """`M⁻¹ Gᵀ λ` and `λ`, where `G M⁻¹ Gᵀ λ = wrong`. The rows of `G` are divided by their
             sizes, and so is the right side."""
             vector, wrong = given
-            _, jacobian = equations.linearise(vector)
-            sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
+            _, jacobian = problem.linearise(vector)
+            sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
             gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = equations.factor.of_change(corrected(rows, rows, right))
+            change = problem.factor.of_change(corrected(rows, rows, right))
             return change, solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))

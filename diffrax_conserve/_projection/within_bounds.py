@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._constants import AT_BOUND, MAX_STEPS
+from .._numerics.implicit import Along, solution
+from .._numerics.iterate import Solved, bounded
+from .._numerics.metric import positive_weights, spread
+from .._numerics.problem import Problem
 from .._printing import is_traced
-from .._step.equations import Equations
-from .._step.implicit import Along, solution
-from .._step.iterate import Solved, bounded
-from .._step.metric import positive_weights, spread
 from .base import AbstractProjection
 from .options import check_options, option
 
@@ -53,18 +53,18 @@ class Bounds(eqx.Module):
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
         return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
-    def compose(self, equations: Equations) -> Equations:
+    def compose(self, problem: Problem) -> Problem:
         """The equations of a manifold as functions of `z`."""
-        parts = tuple(eqx.Partial(_clipped, self, part) for part in equations.parts)
-        return dataclasses.replace(equations, parts=parts, clip=self.clip)
+        functions = tuple(eqx.Partial(_clipped, self, fn) for fn in problem.functions)
+        return dataclasses.replace(problem, functions=functions, clip=self.clip)
 
 
-def _clipped(bounds: Bounds, part: Callable[[Array], Array], z: Array) -> Array:
-    return part(bounds.clip(z))
+def _clipped(bounds: Bounds, fn: Callable[[Array], Array], z: Array) -> Array:
+    return fn(bounds.clip(z))
 
 
 def project_within(
-    bounds: Bounds, equations: Equations, candidate: Float[Array, " n"], *, max_steps: int
+    bounds: Bounds, problem: Problem, candidate: Float[Array, " n"], *, max_steps: int
 ) -> Solved:
     """The projection along the gradients at the candidate, within bounds: the vector `z`, whose
     `clip` is the state.
@@ -73,8 +73,8 @@ def project_within(
     without the clip. A component that reaches its bound costs a step, so there may be twice as many
     of them.
     """
-    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
-    within = bounds.compose(equations)
+    rows = problem.factor.of_rows(problem.linearise(candidate)[1])
+    within = bounds.compose(problem)
     return solution(Along(within, candidate, rows, iteration=bounded, max_steps=2 * max_steps))
 
 
@@ -88,6 +88,7 @@ class AbstractNewton(AbstractProjection):
     lower: PyTree[ArrayLike] | None = option(None)
     upper: PyTree[ArrayLike] | None = option(None)
     sees_step: ClassVar[bool] = False
+    follows_gradients: ClassVar[bool] = True
 
     def __check_init__(self):
         check_options(self)
@@ -95,14 +96,14 @@ class AbstractNewton(AbstractProjection):
 
     def bounds(self, like: Any) -> Bounds | None:
         """The bounds for a state of given shapes, `None` if there are none."""
-        return Bounds.of(self.lower, self.upper, like) if bounded_parts(self) else None
+        return Bounds.of(self.lower, self.upper, like) if self.has_bounds else None
 
+    @property
+    def has_bounds(self) -> bool:
+        return self.lower is not None or self.upper is not None
 
-def bounded_parts(projection: AbstractProjection) -> list[AbstractNewton]:
-    """The projection and its stages, as far as they have bounds."""
-    is_newton = lambda x: isinstance(x, AbstractNewton)  # noqa: E731
-    parts = filter(is_newton, jtu.tree_leaves(projection, is_leaf=is_newton))
-    return [x for x in parts if x.lower is not None or x.upper is not None]
+    def clip(self, y: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
+        return y if (bounds := self.bounds(like)) is None else bounds.clip(y)
 
 
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:

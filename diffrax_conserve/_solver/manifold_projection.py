@@ -1,47 +1,45 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
-import functools as ft
 from typing import Any, final
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._balance import has_rates
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import MakeManifoldInterpolation, Packed
-from .._manifold import Constraint, check_manifold, conserved_values, named_entries
-from .._options import check_counts, check_number
-from .._projection.base import AbstractProjection, Target, check_projection
+from .._manifold import Constraint, check_manifold, named_entries
+from .._numerics.iterate import any_lane
+from .._numerics.metric import Diagonal, Identity
+from .._numerics.problem import Step, component_changes, step_length
+from .._numerics.report import ProjectionInfo
+from .._options import check_number
+from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._projection.within_bounds import bounded_parts
-from .._step.equations import reach
-from .._step.iterate import any_lane
-from .._step.metric import Diagonal, Identity
-from .._tree import ravel, tree_add, tree_sub
-from .diffrax_private import member
-from .state import (
-    FIRST,
-    ProjectionStatistics,
-    State,
-    cause_of_failure,
-    distances,
+from .._tree import ravel, unravel
+from .failure import (
+    end_of_step,
+    failure_cause,
     is_final,
+    is_off_manifold,
     must_start_on,
-    started,
-    violated,
+    reported_error,
 )
+from .state import State, initial_values, units_after
+from .statistics import ProjectionStatistics
+from .target import Path, Target
 from .terms import (
     check_direction,
     check_nested,
     check_projects_nothing,
     innermost,
-    is_backsolve,
     is_ode,
+    refuse_backsolve,
     time_direction,
 )
 from .wrapper import ForwardingSolver
@@ -49,32 +47,6 @@ from .wrapper import ForwardingSolver
 # So many changes of the state are taken from the dense output of a step. They span the directions
 # in which it moves if it is a polynomial of at most this degree, as that of most solvers is.
 _CHANGES = 4
-
-
-def changes_along(
-    path: dfx.AbstractLocalInterpolation, t0: RealScalarLike, t1: RealScalarLike, y0: Y
-) -> Float[Array, "k n"]:
-    """The changes of the state from the start of a step, in the dense output of the wrapped solver,
-    after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
-    that they are orthogonal to each `c` with `c · f = 0`."""
-    shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
-    return jnp.stack([ravel(path.evaluate(t0 + share * (t1 - t0))) - ravel(y0) for share in shares])
-
-
-def first_changes(
-    terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
-) -> Float[Array, "k n"]:
-    """Two steps of Euler's method, in the place of the changes in the step before the first. A
-    method of one stage has a single slope in its first step, along which what is conserved hardly
-    changes, so that a correction would undo the step."""
-    changes = jnp.zeros((2 * _CHANGES, ravel(y0).size), ravel(y0).dtype)
-    if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):
-        return changes
-    control = terms.contr(t0, t1)
-    first = terms.vf_prod(t0, y0, args, control)
-    second = terms.vf_prod(t1, tree_add(y0, first), args, control)
-    found = jnp.stack([ravel(first), ravel(second)])
-    return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
 
 
 def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
@@ -162,7 +134,6 @@ class ManifoldProjection(ForwardingSolver):
     manifold: Manifold = eqx.field(converter=_or_nothing)
     projection: AbstractProjection = option(SimplifiedNewton())
     max_correction: RealScalarLike | None = option(None)
-    every: int = option(1, static=True)
     keep_linear: bool = option(False, static=True)
 
     def __check_init__(self):
@@ -176,15 +147,9 @@ class ManifoldProjection(ForwardingSolver):
         check_nested(self.solver)
         check_projection(self.projection)
         free = isinstance(self.manifold, Constraint) and self.manifold.fn is _nothing
-        check_manifold(() if free and not bounded_parts(self.projection) else self.manifold)
+        check_manifold(() if free and not self.projection.has_bounds else self.manifold)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
-        check_counts(every=self.every)
-        if bounded_parts(self.projection) and self.every > 1:
-            raise ValueError(
-                "`projection` has bounds, which a step that is not projected does not keep: leave "
-                "out `every`, or `lower` and `upper`."
-            )
 
     @property
     def interpolation_cls(self) -> MakeManifoldInterpolation:  # pyright: ignore
@@ -204,35 +169,35 @@ class ManifoldProjection(ForwardingSolver):
         y0: Y,
         args: Args,
     ) -> State:
-        if is_backsolve(terms):
-            raise ValueError(
-                "`ManifoldProjection` cannot solve the adjoint equations of `BacksolveAdjoint`, "
-                "whose state is not on the manifold. Name the wrapped solver for them, "
-                "`BacksolveAdjoint(solver=inner)`, or use `diffrax.RecursiveCheckpointAdjoint()`."
-            )
-        t = t0 * time_direction(terms, t0)
+        refuse_backsolve(
+            terms,
+            "ManifoldProjection",
+            "Name the wrapped solver for them, `BacksolveAdjoint(solver=inner)`, or use",
+        )
         check_state(y0, kind=jnp.inexact)
-        values = conserved_values(self.manifold, t, y0, args)
-        values, hidden = started(values, self.manifold, t, y0, args)
+        t = t0 * time_direction(terms, t0)
+        values, cancellation = initial_values(self.manifold, t, y0, args)
         if self.keep_linear and values.size > 2 * _CHANGES:
             raise ValueError(
                 f"`keep_linear` has {2 * _CHANGES} directions, but `manifold` has {values.size} "
                 "scalar constraints. Leave it out, and add the linear invariants to `manifold`: "
                 "`diffrax_conserve.compare` tells which there are."
             )
+        y = ravel(y0)
+        none = component_changes(y, y)
+        statistics = ProjectionStatistics.zero(
+            self.manifold, values.dtype, self.projection.has_bounds
+        )
         return State(
             inner=self.solver.init(terms, t0, t1, y0, args),
             values=values,
-            hidden=hidden,
+            cancellation=cancellation,
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
-            motion=distances(y0, y0),
-            end=jnp.full_like(distances(y0, y0), jnp.inf),
+            units=none,
+            end=jnp.full_like(none, jnp.inf),
             first_step=jnp.abs(t1 - t0),
-            num_steps=None if self.every == 1 else jnp.asarray(0),
-            statistics=ProjectionStatistics.zero(
-                self.manifold, values.dtype, bool(bounded_parts(self.projection))
-            ),
-            preferred=first_changes(terms, t0, t1, y0, args) if self.keep_linear else None,
+            statistics=statistics,
+            preferred=jnp.zeros((2 * _CHANGES, y.size), y.dtype) if self.keep_linear else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -246,79 +211,65 @@ class ManifoldProjection(ForwardingSolver):
         solver_state: State,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
-        # A solver with the property "first same as last" keeps the slope at the candidate for the
-        # next step, which starts at the projected state. Told of a jump, it evaluates the slope
-        # there anew. It is told so in every step, because while one lane of a batch is in its first
-        # step, diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend
-        # on the others. Two kinds of solvers are told what diffrax says. In an implicit method the
-        # kept slope fits the last stage, which its root finder has solved; a slope at the projected
-        # state would amplify the error of the root finder. `QUICSORT` refuses to be told of a jump.
-        as_it_is = isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
         state = self._checked(solver_state)
-        candidate, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, state.inner, made_jump if as_it_is else True
-        )
-        # The projection. The target `before` has the balances at the start of the step, from which
-        # dense output integrates them to any time in the step; `target` has those at the end.
-        change = distances(y0, candidate)
-        motion = state.motion_after(change, candidate)
+        jumped = made_jump if self._keeps_stage else True
+        given = terms, t0, t1, y0, args, state.inner, jumped
+        proposed, inner_error, inner_info, inner, result = self.solver.step(*given)
+
+        # From here on states are vectors, and times those of the vector field.
+        sign = time_direction(terms, t0)
+        error = None if inner_error is None else ravel(inner_error)
+        step, candidate = Step(t0 * sign, t1 * sign, ravel(y0), error), ravel(proposed)
         # The dense output of the step is rarely needed, so it is made when it is called.
-        path = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
-        preferred = state.preferred
-        if preferred is not None:
-            preferred = jnp.concatenate([changes_along(path(), t0, t1, y0), preferred[:_CHANGES]])
-        before = self._target(terms, t1, state, change, motion, preferred, args).following(t0, y0)
-        target = before.advanced(t0, t1, lambda t: path().evaluate(t))
-        step = target.step(t0, t1, y0, error)
-        due = None if state.num_steps is None else (state.num_steps + 1) % self.every == 0
-        y1, info = target.project_if(due, t1, candidate, step)
-        # Whether it succeeded, and if not, whether a shorter step could.
-        metric = before.metric(t0, y0)
-        first = jnp.all(state.end == jnp.inf)
-        cannot_start = self._cannot_start(before, state, t0, y0, first, made_jump)
-        final = cannot_start | is_final(state, t0, t1, change, candidate)
-        correction, too_far = ravel(tree_sub(y1, candidate)), jnp.asarray(False)
-        if self.max_correction is not None:
-            limit = jnp.asarray(self.max_correction, correction.dtype)
-            limit = limit * reach(ravel(y0), ravel(candidate), metric)
-            too_far = metric.length(correction) > limit
-        failed = cause_of_failure(
-            info.ok, cannot_start, state.values, correction, too_far, first | final
+        path = lambda t: ravel(  # noqa: E731
+            self.solver.interpolation_cls(t0=t0, t1=t1, **inner_info).evaluate(t * sign)
         )
-        statistics = state.statistics.add(
-            info, due, None if error is None else metric.length(ravel(error))
-        )
-        # The last state of a solve that failed is NaN. In a batch such a lane is evaluated until
-        # the last one ends, and NaN costs no iterations.
-        y1 = jtu.tree_map(lambda y: jnp.where(failed > 0, jnp.nan, y), y1)
+        before, units, preferred = self._target(terms, state, step, candidate, path, y0, args)
+        target = before.advanced(step.t0, step.t1, path)
+
+        problem = target.problem(step.t1, candidate, step)
+        y1, info = self.projection.solve(problem, candidate)
+
+        metric = before.metric(step.t0, step.y0)
+        cause, final = self._verdict(before, state, step, candidate, y1, info, made_jump)
+        y1, result = end_of_step(cause, y1, result)
+
         dense_info = dict(
-            inner=dense_info,
-            shift=tree_sub(y1, candidate),
-            limit=reach(ravel(y0), ravel(y1), metric),
-            error=None if step is None else error,
+            inner=inner_info,
+            direction=sign,
+            shift=y1 - candidate,
+            limit=step_length(step.y0, y1, metric),
+            error=error if self.projection.sees_step else None,
             target=Packed(before),
-            due=due,
         )
-        # diffrax looks at the result of a step only if the step is accepted. So a failed step
-        # reports a huge error, by which an adaptive controller rejects it and tries a shorter one.
-        # A failure that is final reports no error: the step is accepted, and its result ends the
-        # solve. The error is huge but finite, because the norm of an infinite complex number would
-        # be NaN.
-        reported = jnp.where(final, 0, float(jnp.finfo(state.values.dtype).max) ** 0.5)
-        error = jtu.tree_map(lambda e: jnp.where(failed > 0, reported.astype(e.dtype), e), error)
-        # If the wrapped solver has failed by itself, its own result is kept.
-        result = dfx.RESULTS.where(
-            (failed == 0) | (result != dfx.RESULTS.successful), result, member(FIRST - 1 + failed)
-        )
-        state = state.next(
+        length = None if error is None else metric.length(error)
+        state = State(
             inner=inner,
+            values=state.values,
+            cancellation=state.cancellation,
             gained=target.gained,
-            motion=motion,
-            end=ravel(y1),
-            statistics=statistics,
+            units=units,
+            end=y1,
+            first_step=state.first_step,
+            statistics=state.statistics.add(info, length),
             preferred=preferred,
         )
-        return y1, error, dense_info, state, result
+        error = reported_error(cause, final, inner_error)
+        return unravel(y1, y0), error, dense_info, state, result
+
+    @property
+    def _keeps_stage(self) -> bool:
+        """Whether the wrapped solver is told of jumps only where diffrax says so.
+
+        A solver with the property "first same as last" keeps the slope at the candidate for the
+        next step, which starts at the projected state. Told of a jump, it evaluates the slope there
+        anew. It is told so in every step, because while one lane of a batch is in its first step,
+        diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend on the
+        others. Two kinds of solvers are told what diffrax says. In an implicit method the kept
+        slope fits the last stage, which its root finder has solved; a slope at the projected state
+        would amplify the error of the root finder. `QUICSORT` refuses to be told of a jump.
+        """
+        return isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
 
     def _checked(self, state: Any) -> State:
         names = tuple(name for name, _ in named_entries(self.manifold))
@@ -336,36 +287,66 @@ class ManifoldProjection(ForwardingSolver):
     def _target(
         self,
         terms: PyTree[dfx.AbstractTerm],
-        t: RealScalarLike,
         state: State,
-        change: Float[Array, " n"],
-        motion: Float[Array, " n"],
-        preferred: Float[Array, "k n"] | None,
+        step: Step,
+        candidate: Float[Array, " n"],
+        path: Path,
+        like: Y,
         args: Args,
-    ) -> Target:
-        """The target of a step. Noise has no metric of motion: with noise the metric decides which
-        equation is solved, and that must not depend on the path."""
-        return Target(
+    ) -> tuple[Target, Float[Array, " n"], Float[Array, "k n"] | None]:
+        """The target at the start of a step, from which dense output integrates balances to any
+        time in the step; the units of the metric of motion; and the preferred directions.
+
+        Noise has no metric of motion: with noise the metric decides which equation is solved, and
+        that must not depend on the path.
+        """
+        changes = component_changes(step.y0, candidate)
+        units = units_after(state.units, changes, candidate, like)
+        preferred = state.preferred
+        if preferred is not None:
+            new = changes_along(path, step)
+            preferred = jnp.concatenate([new, preferred[:_CHANGES]])
+        target = Target(
             self.projection,
             self.manifold,
+            jax.eval_shape(lambda: like),
             state.values,
-            state.hidden,
+            state.cancellation,
             args,
-            time_direction(terms, t),
-            moved=change,
-            factor=Diagonal(motion) if is_ode(terms) else Identity(),
+            changes=changes,
+            factor=Diagonal(units) if is_ode(terms) else Identity(),
             gained=state.gained,
             preferred=preferred,
         )
+        return target.following(step.t0, step.y0), units, preferred
 
-    def _cannot_start(
+    def _verdict(
         self,
         target: Target,
         state: State,
-        t0: RealScalarLike,
-        y0: Y,
-        first: Bool[Array, ""],
+        step: Step,
+        candidate: Float[Array, " n"],
+        y1: Float[Array, " n"],
+        info: ProjectionInfo,
         made_jump: BoolScalarLike,
+    ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+        """Why the step failed, 0 if it did not, and whether a shorter step would not be better."""
+        first = jnp.all(state.end == jnp.inf)
+        cannot_start = self._cannot_start(target, state, step, made_jump)
+        changes, length = component_changes(step.y0, candidate), step.t1 - step.t0
+        time = jnp.maximum(jnp.abs(step.t1), state.first_step)
+        final = cannot_start | is_final(length, time, changes, candidate)
+        correction, too_far = y1 - candidate, jnp.asarray(False)
+        if self.max_correction is not None:
+            metric = target.metric(step.t0, step.y0)
+            limit = jnp.asarray(self.max_correction, correction.dtype)
+            limit = limit * step_length(step.y0, candidate, metric)
+            too_far = metric.length(correction) > limit
+        given = info.ok, cannot_start, state.values, correction, too_far
+        return failure_cause(*given, hopeless=first | final), final
+
+    def _cannot_start(
+        self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off the manifold where nothing
         has projected its state: where no step has ended, as at the start of a solve, and after a
@@ -373,18 +354,24 @@ class ManifoldProjection(ForwardingSolver):
         lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(must_start_on(entry) for _, entry in named_entries(self.manifold)):
             return lost
-        # A state that is NaN has failed already. If not every step is projected, a later step may
-        # well start off the manifold.
-        start = ravel(y0)
-        elsewhere = jnp.any((start != state.end) & ~jnp.isnan(start))
-        fresh = first if self.every > 1 else elsewhere | made_jump
-        equations = target.equations(t0, y0)
+        # A state that is NaN has failed already.
+        fresh = jnp.any((step.y0 != state.end) & ~jnp.isnan(step.y0)) | made_jump
+        problem = target.problem(step.t0, step.y0)
         off = lax.cond(
             any_lane(fresh),
-            lambda: violated(equations, self.manifold, ravel(y0)),
+            lambda: is_off_manifold(problem, self.manifold, step.y0),
             lambda: jnp.asarray(False),
         )
         return lost | (fresh & off)
+
+
+def changes_along(path: Path, step: Step) -> Float[Array, "k n"]:
+    """The changes of the state from the start of a step, in the dense output of the wrapped solver,
+    after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
+    that they are orthogonal to each `c` with `c · f = 0`."""
+    shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
+    times = (step.t0 + share * (step.t1 - step.t0) for share in shares)
+    return jnp.stack([path(t) - step.y0 for t in times])
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
@@ -409,8 +396,6 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     size of the state in memory, in dense output for each step, and their products in time; a sparse
     Jacobian is treated as dense. Active bounds, `AlongLine`, a `ClosedForm` and the stages of
     `Staged` that have a metric of their own ignore it.
-- `every`: project only every `every`-th step. In the other steps neither the state nor dense output
-    is projected, so the final state may be off the manifold.
 
 **Raises:**
 

@@ -9,7 +9,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import RealScalarLike
-from .._projection.along_line import AlongLine
 from .._projection.base import AbstractProjection
 from .diffrax_private import AdjointTerm, WrapTerm
 
@@ -24,6 +23,15 @@ def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[A
 def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
     """Whether this is the backward solve of a `diffrax.BacksolveAdjoint`."""
     return any(isinstance(x, AdjointTerm) for x in _nested(terms))
+
+
+def refuse_backsolve(terms: PyTree[dfx.AbstractTerm], solver: str, remedy: str = "Use") -> None:
+    """Raises in the backward solve of a `diffrax.BacksolveAdjoint`."""
+    if is_backsolve(terms):
+        raise ValueError(
+            f"`{solver}` cannot solve the adjoint equations of `BacksolveAdjoint`, whose state is "
+            f"not on the manifold. {remedy} `diffrax.RecursiveCheckpointAdjoint()`."
+        )
 
 
 def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
@@ -74,8 +82,7 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
 
 
 def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
-    along_error = isinstance(projection, AlongLine) and projection.direction == "error"
-    if along_error and dfx.HalfSolver in map(type, _layers(solver)):
+    if projection.needs_signed_error and dfx.HalfSolver in map(type, _layers(solver)):
         raise ValueError(
             '`AlongLine(direction="error")` moves along the error estimate, which '
             "`diffrax.HalfSolver` gives without its sign. Wrap a solver with an embedded method, "

@@ -14,11 +14,11 @@ from jaxtyping import Array, ArrayLike, Float, Real
 from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
+from .._numerics.implicit import root
+from .._numerics.iterate import after_test, iterate, keep_done
+from .._numerics.linear import solve
+from .._numerics.problem import OFF, SETTLED
 from .._projection.closed_form import ClosedForm
-from .._step.equations import OFF, SETTLED
-from .._step.implicit import root
-from .._step.iterate import after_test, iterate, keep_done
-from .._step.linear import solve
 from ._base import real
 
 State = Float[Array, " species"]

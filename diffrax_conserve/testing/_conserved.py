@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Real
 from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import check_manifold, conserved_values, evaluate, has_value, named_entries
+from .._numerics.problem import measure
 from .._options import check_solution
 from .._projection.project import given_values
-from .._step.equations import measure
 from .._tree import ravel, tree_all_finite
 
 # Twice the default tolerance of a projection, because the residual is evaluated again here.

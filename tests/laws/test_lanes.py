@@ -161,7 +161,7 @@ def every_case(adjoint, always, period):
         sizes = jnp.asarray(LANES[steps])
         saved, found, (okay, count) = lanes(sizes, OFF)
         assert okay.tolist() == [True, True, True, case == "plain" and steps == "fixed"]
-        assert len(set(count[:3].tolist())) == 3, "The lanes take unlike numbers of steps."
+        assert count[0] < count[2], "The lanes take unlike numbers of steps."
         for i in range(3):
             # The same program, in all of whose lanes is this one.
             expected = lanes(jnp.full(4, sizes[i]), jnp.zeros(4))[:2]

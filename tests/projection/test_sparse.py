@@ -15,10 +15,10 @@ from jaxtyping import Array
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve._large import sparse
-from diffrax_conserve._step.equations import Equations, equations_of
-from diffrax_conserve._step.linear import combined, gram_matrix, times
-from diffrax_conserve._step.linear import solve as gram_solve
-from diffrax_conserve._step.metric import Diagonal
+from diffrax_conserve._numerics.linear import combined, gram_matrix, times
+from diffrax_conserve._numerics.linear import solve as gram_solve
+from diffrax_conserve._numerics.metric import Diagonal
+from diffrax_conserve._numerics.problem import Problem, problem_of
 
 from ..problems import difference, largest, solve
 from ..thinned import some_of
@@ -68,23 +68,23 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     y = jr.normal(key[0], (points, 3), dtype)
     beside = y + 0.01 * jr.normal(key[1], y.shape, dtype)
     values = jnp.zeros(jax.eval_shape(entry.fn, 0.0, y, None).size + 4, dtype)
-    equations = equations_of(manifold, values, 0.0, y, None)
-    equations = dataclasses.replace(
-        equations, factor=Diagonal(jnp.exp(jr.normal(key[2], (y.size,), dtype)))
+    problem = problem_of(manifold, values, 0.0, y, None)
+    problem = dataclasses.replace(
+        problem, factor=Diagonal(jnp.exp(jr.normal(key[2], (y.size,), dtype)))
     )
-    assert equations.pattern is not None
+    assert problem.pattern is not None
     x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
 
-    def rows(equations: Equations, y: Array) -> Any:
-        return equations.factor.of_rows(equations.linearise(y.reshape(-1))[1])
+    def rows(problem: Problem, y: Array) -> Any:
+        return problem.factor.of_rows(problem.linearise(y.reshape(-1))[1])
 
     @jax.jit
     def found() -> Any:
-        a, b = rows(equations, y), rows(equations, beside)
+        a, b = rows(problem, y), rows(problem, beside)
         solved = (gram_solve(gram_matrix(a, other), multiplier) for other in (a, b))
         return times(a, x), combined(multiplier, a), *solved
 
-    dense = dataclasses.replace(equations, pattern=None)
+    dense = dataclasses.replace(problem, pattern=None)
     a, b = (np.asarray(rows(dense, state), np.float64) for state in (y, beside))
     ahead, back, same, other = (np.asarray(z, np.float64) for z in found())
     eps = float(jnp.finfo(dtype).eps)
@@ -147,13 +147,13 @@ def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
 
     for seed in range(2):
         order = np.random.default_rng(seed).permutation(NUM)
-        equations = equations_of(bonds(order), jnp.zeros(NUM), 0.0, jnp.ones(NUM), None)
-        dense = dataclasses.replace(equations, pattern=None)
+        problem = problem_of(bonds(order), jnp.zeros(NUM), 0.0, jnp.ones(NUM), None)
+        dense = dataclasses.replace(problem, pattern=None)
         x, y = np.arange(NUM) * 1.0, np.linspace(1, 2, NUM)
         found, expected = (
-            jax.jit(lambda x, y, e=e: times(e.linearise(y)[1], x))(x, y) for e in (equations, dense)
+            jax.jit(lambda x, y, e=e: times(e.linearise(y)[1], x))(x, y) for e in (problem, dense)
         )
-        assert equations.pattern is not None
+        assert problem.pattern is not None
         np.testing.assert_allclose(found, expected)
 
 

@@ -7,13 +7,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._step.equations import Equations, relative
-from ..._step.linear import combined, gram_matrix, solve
+from ..._numerics.linear import combined, gram_matrix, solve
+from ..._numerics.problem import Problem, relative
 from .trainable import LayerSchedule
 
 
 def iterated(
-    equations: Equations,
+    problem: Problem,
     candidate: Float[Array, " n"],
     radius: Float[Array, ""] | None,
     steps: int,
@@ -28,14 +28,14 @@ def iterated(
     """
     dtype = candidate.dtype
     p, s = (jnp.asarray(steps), jnp.ones(())) if schedule is None else schedule
-    before, rows = equations.linearise(candidate)
+    before, rows = problem.linearise(candidate)
 
     def improve(multipliers: Array) -> Array:
         y = candidate + combined(multipliers, rows)
-        g, jacobian = equations.linearise(y)
+        g, jacobian = problem.linearise(y)
         if radius is None:
             return multipliers - solve(gram_matrix(rows, rows), g)
-        ratio = relative(g, equations.scale(jacobian, y))
+        ratio = relative(g, problem.scale(jacobian, y))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         gram = gram_matrix(jacobian, rows)
         change = solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)

@@ -10,10 +10,10 @@ from ..._balance import refuse_rates
 from ..._constants import MAX_STEPS
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
+from ..._numerics.implicit import Along, solution
+from ..._numerics.iterate import Solved, damped
+from ..._numerics.problem import Problem, problem_of
 from ..._options import check_counts
-from ..._step.equations import Equations, equations_of
-from ..._step.implicit import Along, solution
-from ..._step.iterate import Solved, damped
 from ..._tree import ravel, unravel
 from .iterations import iterated
 from .trainable import LayerSchedule
@@ -75,16 +75,16 @@ class ConservativeLayer(eqx.Module):
     ) -> Y:
         """The state at time `t` on the manifold through the time and state of `start`. With
         `steps` the move of an iteration is at most the norm of `scale`."""
-        equations, vector = self.equations(candidate, t, start)
+        problem, vector = self.problem(candidate, t, start)
         if self.steps is None:
             # The start is on the manifold, so the functions are finite there.
             known = ravel(start[1]).astype(vector.dtype)
             options: Any = dict(iteration=_damped_along, max_steps=MAX_STEPS)
-            projected = solution(Along(equations, vector, fallback=known, **options))
+            projected = solution(Along(problem, vector, fallback=known, **options))
             y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)
-            y = iterated(equations, vector, radius, self.steps, schedule)
+            y = iterated(problem, vector, radius, self.steps, schedule)
         return unravel(y, candidate)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
@@ -96,23 +96,23 @@ class ConservativeLayer(eqx.Module):
                 error.add_note("The layer has no `args`: `ConservativeLayer(manifold, args=args)`.")
             raise
 
-    def equations(
+    def problem(
         self, candidate: Y, t: RealScalarLike, start: tuple[RealScalarLike, Y]
-    ) -> tuple[Equations, Float[Array, " n"]]:
+    ) -> tuple[Problem, Float[Array, " n"]]:
         """Those of the manifold through `start`, and the candidate as a vector."""
         vector = ravel(candidate)
         values = ravel(self.values(*start)).astype(vector.dtype)
-        equations = equations_of(self.manifold, values, t, candidate, self.args)
-        return equations.dense(), vector
+        problem = problem_of(self.manifold, values, t, candidate, self.args)
+        return problem.dense(), vector
 
 
 def _damped_along(
-    equations: Equations, candidate: Float[Array, " n"], directions: None, *, max_steps: int
+    problem: Problem, candidate: Float[Array, " n"], directions: None, *, max_steps: int
 ) -> Solved:
     """The damped iteration along the gradients at the candidate."""
     del directions
-    rows = equations.factor.of_rows(equations.linearise(candidate)[1])
-    return damped(equations, candidate, rows, max_steps=max_steps)
+    rows = problem.factor.of_rows(problem.linearise(candidate)[1])
+    return damped(problem, candidate, rows, max_steps=max_steps)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**

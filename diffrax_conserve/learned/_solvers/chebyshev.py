@@ -35,7 +35,7 @@ class ChebyshevInterpolation(dfx.AbstractLocalInterpolation):
     ) -> PyTree[Array]:
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        x = 2 * (t0 - self.t0) / nonzero_length(self.t0, self.t1) - 1
+        x = jnp.asarray(2 * (t0 - self.t0) / nonzero_length(self.t0, self.t1) - 1)
         return jtu.tree_map(lambda c: _clenshaw(c, x.astype(c.dtype)), self.coefficients)
 
 

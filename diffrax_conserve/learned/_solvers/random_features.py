@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
+from ..._numerics.implicit import root
+from ..._numerics.iterate import Solved, after_step, iterate, keep_done
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import is_ode
-from ..._step.implicit import root
-from ..._step.iterate import Solved, after_step, iterate, keep_done
 from .chebyshev import ChebyshevInterpolation, multiply
 from .feature_basis import FeatureBasis, feature_basis
 from .sweeps import increment

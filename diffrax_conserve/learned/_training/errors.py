@@ -130,7 +130,7 @@ def _off_manifold(model: AbstractTrainable, points: Points) -> Float[Array, ""]:
     starts = jtu.tree_map(lambda x: jnp.broadcast_to(x, (ts.size, *x.shape[1:])), starts)
 
     def off(y: Y, t: Array, t0: Array, y0: Y) -> Array:
-        equations, vector = model.layer.equations(y, t, (t0, y0))
+        equations, vector = model.layer.problem(y, t, (t0, y0))
         return ~equations.holds(vector)
 
     ys = model.states(points, ts, None)

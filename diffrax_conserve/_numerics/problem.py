@@ -14,8 +14,8 @@ step.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -24,50 +24,95 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import NOISE, ROUNDOFF
-from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, SparseRows, pattern_of
-from .._manifold import evaluate, is_entry
-from .._tree import ravel, unflatten, unravel
+from .._manifold import evaluate, is_entry, named_entries
+from .._tree import key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
+from .report import ProjectionInfo
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
 # level of a state is the minimum over its residuals.
 NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
-# One entry of a manifold, as a function from the state to the vector of its residuals.
-Part = Callable[[Float[Array, " n"]], Float[Array, " k"]]
+# The residuals of one entry of a manifold, as a function of the vector of the state.
+Residual = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
 
 
-class Equations(eqx.Module):
-    """The residuals of a manifold, in the order in which it is flattened.
+@final
+class Step(eqx.Module):
+    r"""The step of a solve in which a projection is called.
 
-    - `parts`: the residual of each entry.
-    - `magnitude`: the part of the scale that does not depend on the state: `|I₀| + hidden`.
-    - `hidden`: the part of it that the gradients do not show.
-    - `factor`: the metric, as a factor `S` of `M⁻¹ = S Sᵀ`.
-    - `moved`: how far each component moves in the step of a solve; `None` outside a solve.
+    Times are those of the vector field, states are real vectors. At a saved time inside the step
+    and in dense output this is the same step, and the candidate is the dense output at `Problem.t`.
+
+    **Attributes:**
+
+    - `t0`, `t1`: the ends of the step; in a solve backwards in time `t1 < t0`.
+    - `y0`: the state $y_n$ at `t0`, on the manifold.
+    - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
+    """
+
+    t0: RealScalarLike
+    t1: RealScalarLike
+    y0: Float[Array, " n"]
+    error: Float[Array, " n"] | None
+
+
+class Problem(eqx.Module):
+    """The equations `g(y) = 0` of a manifold at one time, which a projection solves. States are
+    vectors of `n` real numbers; see `state`.
+
+    **Attributes:**
+
+    - `t`, `args`: the time and the parameters.
+    - `values`: the conserved values, shaped like the manifold.
+    - `like`: the shapes and dtypes of the state, `jax.ShapeDtypeStruct`s.
+    - `names`, `keys`: for each entry of the manifold its name, `manifold['energy']`, and its first
+        key, such as a key of a dictionary.
+    - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
+        [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
+    - `functions`: the residual of each entry, as a function of the vector.
+    - `magnitude`: the part of the scale that does not depend on the state: the size of the
+        conserved value, and `cancellation`.
+    - `cancellation`: the part of the scale that the gradients do not show.
+    - `factor`: the metric, as a factor $S$ of $M^{-1} = S S^\\top$.
+    - `changes`: how far each component moves in the step of a solve; `None` outside a solve.
     - `rtol`, `atol`: a residual within `rtol * scale + atol` counts as zero.
     - `clip`: used within bounds only. Then the argument of all methods is not the state but a
-      vector `z` without bounds, and `clip` maps it to the state; see `within_bounds`.
+        vector without bounds, which `clip` maps to the state.
     - `pattern`: the places of the elements of a sparse Jacobian; `None` if it is dense.
     """
 
-    parts: tuple[Part, ...]
+    t: RealScalarLike
+    args: Args
+    values: Values
+    like: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    keys: tuple[Any, ...] = eqx.field(static=True)
+    functions: tuple[Residual, ...]
     magnitude: Float[Array, " m"]
-    hidden: Float[Array, " m"]
+    cancellation: Float[Array, " m"]
+    pattern: Pattern | None = eqx.field(static=True)
     factor: AbstractFactor = Identity()
-    moved: Float[Array, " n"] | None = None
+    changes: Float[Array, " n"] | None = None
     rtol: float | Array | None = None
     atol: float | Array | None = None
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
-    pattern: Pattern | None = eqx.field(default=None, static=True)
+    step: Step | None = None
+
+    def state(self, y: Float[Array, " n"]) -> Y:
+        """The state of the solve whose numbers are `y`."""
+        return unravel(y, self.like)
 
     def residual(self, y: Float[Array, " n"]) -> Float[Array, " m"]:
-        return jnp.concatenate([part(y) for part in self.parts])
+        """The `m` residuals at a state, in the order in which the manifold is flattened."""
+        return jnp.concatenate([part(y) for part in self.functions])
 
     @eqx.filter_jit  # traced once for all uses
     def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Jacobian]:
@@ -78,9 +123,9 @@ class Equations(eqx.Module):
         those gradients are infinite.
         """
         if self.pattern is not None and not self.factor.is_dense:
-            return SparseRows.linearised(self.pattern, self.parts, y)
+            return SparseRows.linearised(self.pattern, self.functions, y)
         values, rows = [], []
-        for part in self.parts:
+        for part in self.functions:
             value, vjp = jax.vjp(part, y)
             values.append(value)
             if value.size == 1:
@@ -89,14 +134,14 @@ class Equations(eqx.Module):
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), jnp.concatenate(rows)
 
-    def dense(self) -> "Equations":
-        """The same equations, whose Jacobian is computed as a dense matrix."""
+    def dense(self) -> "Problem":
+        """The same problem, with the Jacobian computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)
 
     def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
         size = jnp.abs(y if self.clip is None else self.clip(y))
-        size = size if self.moved is None else size + self.moved
-        return self.magnitude + shown_terms(jacobian, size)
+        size = size if self.changes is None else size + self.changes
+        return self.magnitude + gradient_scale(jacobian, size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -128,8 +173,63 @@ class Equations(eqx.Module):
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= ON
 
+    def per_residual(self, of_entries: Sequence[Any]) -> np.ndarray:
+        """One element for each residual, from one for each entry of the manifold."""
+        y = jax.eval_shape(ravel, self.like)
+        sizes = [eqx.filter_eval_shape(fn, y).size for fn in self.functions]
+        return np.repeat(np.asarray(of_entries), sizes)
 
-def reach(
+    def report(
+        self,
+        candidate: Float[Array, " n"],
+        y: Float[Array, " n"],
+        num_iterations: IntScalarLike = 1,
+        *,
+        ok: Bool[Array, ""] | None = None,
+    ) -> ProjectionInfo:
+        """The report on a projection from `candidate` to `y`, as `solve` must return it.
+
+        **Arguments:**
+
+        - `num_iterations`: the number of iterations.
+        - `ok`: whether the projection succeeded, if that is known. By default: whether every
+            residual is within its tolerance at `y`.
+        """
+        # A report has no derivative.
+        problem, candidate, y = tree_stop_gradient((self, candidate, y))
+        after, jacobian = problem.linearise(y)
+        scale = problem.scale(jacobian, y)
+        sizes = [jnp.abs(relative(g, scale)) for g in (problem.residual(candidate), after)]
+        # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
+        sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
+        success = problem.level(after, scale)[0] >= ON if ok is None else ok
+        before, after = (jnp.max(x) for x in sizes)
+        kinds = optx.RESULTS
+        missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
+        failed = kinds.where(jnp.isfinite(after), missed, diverged)
+        failed = kinds.where(jnp.isfinite(before), failed, kinds.nonfinite)
+        entry = jnp.asarray(self.per_residual(range(len(self.functions))))
+        return ProjectionInfo(
+            ok=success,
+            result=kinds.where(success, kinds.successful, failed),
+            num_iterations=jnp.asarray(num_iterations),
+            residual_before=before,
+            residual_after=after,
+            correction=problem.factor.length(y - candidate),
+            roundoff=jnp.max(relative(problem.cancellation, scale)),
+            # An iteration that diverged makes every residual large. So we look for the entry whose
+            # residual is large both before and after: of both the smaller one counts.
+            worst=entry[jnp.argmax(jnp.minimum(*sizes))],
+            names=self.names,
+        )
+
+
+def component_changes(start: Float[Array, " n"], end: Float[Array, " n"]) -> Float[Array, " n"]:
+    """How far each component moves from one state to another."""
+    return jnp.abs(end - start)
+
+
+def step_length(
     start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
 ) -> Float[Array, ""]:
     """The length of a step in the metric, with which the length of a correction is compared.
@@ -142,7 +242,7 @@ def reach(
     return factor.length(jnp.maximum(jnp.abs(end - start), least))
 
 
-def shown_terms(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array, " m"]:
+def gradient_scale(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array, " m"]:
     """`Σ_k size_k |∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
     shows, for components of this size."""
     if isinstance(jacobian, SparseRows):
@@ -161,47 +261,61 @@ def measure(
 ) -> tuple[Values, Values]:
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
     vector = ravel(y)
-    equations = equations_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
-    g, jacobian = equations.linearise(vector)
+    problem = problem_of(manifold, ravel(values).astype(vector.dtype), t, y, args)
+    g, jacobian = problem.linearise(vector)
     like = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
-    return unflatten(g, like), unflatten(equations.scale(jacobian, vector), like)
+    return unflatten(g, like), unflatten(problem.scale(jacobian, vector), like)
 
 
-def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -> list[Part]:
+def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -> list[Residual]:
     """The function of each entry, from the numbers of a state to a vector."""
 
-    def flat(entry: Any) -> Part:
+    def flat(entry: Any) -> Residual:
         return lambda y: ravel(evaluate(entry, t, unravel(y, like), args)).astype(y.dtype)
 
     return [flat(entry) for entry in jtu.tree_leaves(manifold, is_leaf=is_entry)]
 
 
-def equations_of(
+def problem_of(
     manifold: Manifold,
     values: Float[Array, " m"],
     t: RealScalarLike,
     like: Any,
     args: Args,
-    hidden: Float[Array, " m"] | None = None,
-) -> Equations:
-    """The equations of a manifold with the conserved `values`, for states like `like`."""
-    hidden = jnp.zeros_like(values) if hidden is None else hidden
+    cancellation: Float[Array, " m"] | None = None,
+    **more: Any,
+) -> Problem:
+    """The problem of a manifold with these conserved values, for states like `like`, with `more` of
+    its fields."""
+    cancellation = jnp.zeros_like(values) if cancellation is None else cancellation
     like = jax.eval_shape(lambda: like)
-    vector, parts, start = jax.eval_shape(ravel, like), [], 0
+    vector, residuals, start = jax.eval_shape(ravel, like), [], 0
     functions = functions_of(manifold, t, like, args)
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
     for fn, size in zip(functions, sizes, strict=True):
 
-        def part(y: Array, fn=fn, start=start, end=start + size) -> Array:
+        def residual(y: Array, fn=fn, start=start, end=start + size) -> Array:
             return fn(y) - values[start:end]
 
         # The user's function may close over arrays, such as the parameters of a network. Conversion
-        # makes them leaves of the equations: only so can the custom rules differentiate by them.
-        parts.append(_Converted(eqx.filter_closure_convert(part, vector)))
+        # makes them leaves of the problem: only so can the custom rules differentiate by them.
+        residuals.append(_Converted(eqx.filter_closure_convert(residual, vector)))
         start += size
-    magnitude = lax.stop_gradient(jnp.abs(values) + hidden)
-    pattern = pattern_of(functions, sizes, vector)
-    return Equations(tuple(parts), magnitude, hidden, pattern=pattern)
+    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
+    shapes = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
+    return Problem(
+        t=t,
+        args=args,
+        values=unflatten(values, shapes),
+        like=like,
+        names=tuple(name for name, _ in named_entries(manifold)),
+        keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
+        functions=tuple(residuals),
+        magnitude=lax.stop_gradient(jnp.abs(values) + cancellation),
+        cancellation=cancellation,
+        pattern=pattern_of(functions, sizes, vector),
+        **more,
+    )
 
 
 class _Known:

@@ -32,7 +32,7 @@ from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import SparseRows, pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
-from .equations import Jacobian, functions_of, shown_terms
+from .problem import Jacobian, functions_of, gradient_scale
 
 # The primitives of JAX that are sums, and sums of products.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
@@ -52,7 +52,7 @@ _CONSTANT, _STATE, _COMPUTED = range(3)
 _Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
 
 
-def hidden_scale(
+def cancellation_scale(
     manifold: Manifold, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Jacobian, Float[Array, " m"]]:
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
@@ -74,23 +74,23 @@ def hidden_scale(
         measured = []
         for (name, _), fn in entries:
             with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
-                measured.append(hidden_terms(fn, vector))
-        value, jacobian, hidden = (jnp.concatenate(x) for x in zip(*measured, strict=True))
+                measured.append(cancellation_terms(fn, vector))
+        value, jacobian, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
     else:
         # The roundoff of an entry with many elements is not measured, because that would cost a
         # reverse pass for each.
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
         few = [size < LEAST_SPARSE for size in sizes]
         measured = [
-            hidden_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
+            cancellation_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
             for fn, size, one in zip(functions, sizes, few, strict=True)
         ]
-        hidden = jnp.concatenate(measured)
-    shown = jnp.abs(value) + shown_terms(jacobian, jnp.abs(vector))
-    return value, jacobian, jnp.where(hidden <= shown, 0, hidden)
+        cancellation = jnp.concatenate(measured)
+    shown = jnp.abs(value) + gradient_scale(jacobian, jnp.abs(vector))
+    return value, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
 
 
-def hidden_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
+def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
     """The value and the Jacobian of `fn` at `y`, and its error there by roundoff, divided by `ε`.
 
     The function is evaluated with two more arguments, both zero, which change nothing. The rule of

@@ -34,7 +34,6 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import AT_BOUND, FROZEN_STEPS, ROUNDOFF, SHORTER, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
-from .equations import NOT_FINITE, OFF, ON, SETTLED, Equations, Jacobian, relative
 from .linear import (
     combined,
     corrected,
@@ -46,6 +45,7 @@ from .linear import (
     scaled_rows,
     solve,
 )
+from .problem import NOT_FINITE, OFF, ON, SETTLED, Jacobian, Problem, relative
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -56,13 +56,13 @@ class Solved(NamedTuple):
 
     - `y`: the unknowns. In a projection they are the state.
     - `ok`: whether they solve the equations.
-    - `num_steps`: the number of steps.
+    - `num_iterations`: the number of steps.
     - `more`: what else was found, without a derivative.
     """
 
     y: Any
     ok: Bool[Array, ""]
-    num_steps: Int[Array, ""]
+    num_iterations: Int[Array, ""]
     more: Any = None
 
 
@@ -75,7 +75,7 @@ class _Now(NamedTuple):
 
     y: Any
     counter: Array
-    num_steps: Array
+    num_iterations: Array
 
 
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
@@ -92,11 +92,11 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
 
     def body(now: _Now) -> _Now:
         y, counter = advance(now.y, now.counter)
-        return _Now(y, counter, now.num_steps + (counter > 0).astype(int))
+        return _Now(y, counter, now.num_iterations + (counter > 0).astype(int))
 
     start = _Now(y, tests(max_steps), jnp.asarray(0))
     end = lax.while_loop(lambda now: any_lane(now.counter > 0), body, start)
-    return Solved(end.y, end.counter == 0, end.num_steps)
+    return Solved(end.y, end.counter == 0, end.num_iterations)
 
 
 def tests(max_steps: int) -> Int[Array, ""]:
@@ -154,7 +154,7 @@ def keep_done(counter: Array, moved: Any, y: Any) -> Any:
 
 
 def nearby(
-    equations: Equations,
+    problem: Problem,
     candidate: Float[Array, " n"],
     directions: Float[Array, "m n"] | None = None,
     *,
@@ -163,35 +163,35 @@ def nearby(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     Up to four constraints may have other `directions` instead; without them the rows are the
     gradients at each state, if those at the candidate have failed for `FROZEN_STEPS` steps."""
-    if equations.magnitude.size > WRITTEN_OUT:
-        return _of_many(equations, candidate, max_steps)
+    if problem.magnitude.size > WRITTEN_OUT:
+        return _of_many(problem, candidate, max_steps)
     return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
-        (equations, candidate, directions)
+        (problem, candidate, directions)
     )
 
 
 def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
-    equations, candidate, directions = given
-    dtype = equations.magnitude.dtype
+    problem, candidate, directions = given
+    dtype = problem.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
     def shared(y: Any) -> Any:
         """What the steps share: the order in which they eliminate the constraints, and in this
         order the directions, or the gradients at the candidate."""
-        rows = scaled_rows(equations.factor.of_rows(equations.linearise(y)[1]))[1]
+        rows = scaled_rows(problem.factor.of_rows(problem.linearise(y)[1]))[1]
         along = rows if directions is None else directions
         order = order_of(gram_matrix(rows, along))
         return order, in_order(order, along)
 
     def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
         order, at_candidate = known
-        seen = equations.linearise(y)
+        seen = problem.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
-        level, wrong = equations.level(g, equations.scale(jacobian, y))
-        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
+        level, wrong = problem.level(g, problem.scale(jacobian, y))
+        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
         rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
         # In each step the counter goes down by one, but before the last step, which polishes, the
@@ -207,7 +207,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - equations.factor.of_change(
+        moved = y - problem.factor.of_change(
             corrected(rows, along, wrong, least=least, ordered=True)
         )
         return keep_done(counter, moved, y), counter
@@ -223,35 +223,35 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
 
 
 @eqx.filter_jit
-def _of_many(equations: Equations, candidate: Float[Array, " n"], max_steps: int) -> Solved:
+def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) -> Solved:
     """The matrix is that at the candidate, factored once, so that a step evaluates only residuals.
 
     They are compared with the scales at the candidate, because those at each state would need a
     Jacobian. So at the end we test the result once more, by its own scales.
     """
     candidate = lax.optimization_barrier(candidate)
-    jacobian = equations.linearise(candidate)[1]
-    scale = equations.scale(jacobian, candidate)
-    along = equations.factor.of_rows(jacobian)
+    jacobian = problem.linearise(candidate)[1]
+    scale = problem.scale(jacobian, candidate)
+    along = problem.factor.of_rows(jacobian)
     sizes, rows = scaled_rows(along)
     solve = factored(gram_matrix(rows, rows))
-    _, vjp = jax.vjp(equations.residual, candidate)
+    _, vjp = jax.vjp(problem.residual, candidate)
 
     def along_gradients(multiplier: Array) -> Array:
         """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
         if isinstance(along, SparseRows):
-            return equations.factor.of_change(equations.factor.of_rows(vjp(multiplier)[0]))
-        return equations.factor.of_change(combined(multiplier, along))
+            return problem.factor.of_change(problem.factor.of_rows(vjp(multiplier)[0]))
+        return problem.factor.of_change(combined(multiplier, along))
 
     def advance(y: Array, counter: Array) -> tuple[Array, Array]:
-        level, wrong = equations.level(equations.residual(y), scale)
+        level, wrong = problem.level(problem.residual(y), scale)
         counter = after_test(level, counter)
         move = lambda: y - along_gradients(solve(wrong / sizes) / sizes)  # noqa: E731
         moved = lax.cond(any_lane(counter > 0), move, lambda: y)
         return keep_done(counter, moved, y), counter
 
-    y, ok, num_steps, _ = iterate(advance, candidate, max_steps=max_steps)
-    return Solved(y, ok & equations.holds(y), num_steps)
+    y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
+    return Solved(y, ok & problem.holds(y), num_iterations)
 
 
 # ---- For starts far away ----
@@ -269,7 +269,7 @@ class _Descent(NamedTuple):
 
 
 def damped(
-    equations: Equations,
+    problem: Problem,
     start: Float[Array, " n"],
     directions: Jacobian | None = None,
     *,
@@ -284,25 +284,25 @@ def damped(
 
     def advance(now: _Descent, counter: Array) -> tuple[_Descent, Array]:
         y, first = now.y, now.largest == jnp.inf
-        g, jacobian = lax.optimization_barrier(equations.linearise(y))
-        here = equations.scale(jacobian, y)
-        level, wrong = equations.level(g, here)
+        g, jacobian = lax.optimization_barrier(problem.linearise(y))
+        here = problem.scale(jacobian, y)
+        level, wrong = problem.level(g, here)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
         level = jnp.where(first, level, jnp.maximum(level, OFF))
         counter = after_test(level, counter, polish=polish)
         scale = jnp.where(first, here, now.scale)
         residuals = jnp.abs(relative(g, scale))
         better = jnp.all(residuals <= now.largest)  # false if one is NaN
-        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
+        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
         along = rows if directions is None else directions
-        further = y - equations.factor.of_change(corrected(rows, along, wrong / sizes))
+        further = y - problem.factor.of_change(corrected(rows, along, wrong / sizes))
         shorter = now.best + SHORTER * (y - now.best)
         best = jnp.where(better, y, now.best)
         largest = jnp.where(better, jnp.max(residuals), now.largest)
         moved = keep_done(counter, jnp.where(better, further, shorter), y)
         return _Descent(moved, best, largest, scale), counter
 
-    begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), equations.magnitude)
+    begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), problem.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
     return found._replace(y=found.y.y)
 
@@ -311,7 +311,7 @@ def damped(
 
 
 def bounded(
-    equations: Equations, start: Float[Array, " n"], directions: Jacobian, *, max_steps: int
+    problem: Problem, start: Float[Array, " n"], directions: Jacobian, *, max_steps: int
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
 
@@ -322,28 +322,26 @@ def bounded(
     """
 
     def advance(z: Array, counter: Array) -> tuple[Array, Array]:
-        g, jacobian = lax.optimization_barrier(equations.linearise(z))
-        level, _ = equations.level(g, equations.scale(jacobian, z))
+        g, jacobian = lax.optimization_barrier(problem.linearise(z))
+        level, _ = problem.level(g, problem.scale(jacobian, z))
         counter = after_test(level, counter, polish=False)
-        sizes, rows = scaled_rows(equations.factor.of_rows(jacobian))
+        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = solve(gram_matrix(rows, directions), g / sizes)
-        change = equations.factor.of_change(combined(multiplier, directions))
-        share = _share(equations, z, multiplier, change, counter > 0)
+        change = problem.factor.of_change(combined(multiplier, directions))
+        share = _share(problem, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 
     return iterate(advance, start, max_steps=max_steps)
 
 
-def _share(
-    equations: Equations, z: Array, multiplier: Array, change: Array, goes_on: Array
-) -> Array:
+def _share(problem: Problem, z: Array, multiplier: Array, change: Array, goes_on: Array) -> Array:
     """The share of a step at which the convex function is least, by bisection of its slope along
     the step, which is the product of the residuals with the step of the multipliers."""
 
     def slope(share: Array | float) -> Array:
-        return jnp.sum(multiplier * equations.residual(z - share * change))
+        return jnp.sum(multiplier * problem.residual(z - share * change))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2

@@ -20,9 +20,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._tree import tree_tangents, unflatten
-from .equations import Equations, Jacobian
 from .iterate import Solved, nearby
 from .linear import combined, corrected, gram_matrix, least_pivot, solve, times, unit_rows
+from .problem import Jacobian, Problem
 
 
 class AbstractSystem(eqx.Module):
@@ -86,7 +86,7 @@ class Along(AbstractSystem):
     the `fallback`, by default the candidate, where the functions should be finite.
     """
 
-    equations: Equations
+    problem: Problem
     candidate: Float[Array, " n"]
     directions: Jacobian | None = None
     fallback: Float[Array, " n"] | None = eqx.field(default=None, kw_only=True)
@@ -94,7 +94,7 @@ class Along(AbstractSystem):
     max_steps: int = eqx.field(static=True, kw_only=True)
 
     def found(self) -> Solved:
-        given = self.equations, self.candidate, self.directions
+        given = self.problem, self.candidate, self.directions
         return self.iteration(*given, max_steps=self.max_steps)
 
     def _start(self, ok: Array) -> Float[Array, " n"]:
@@ -107,14 +107,14 @@ class Along(AbstractSystem):
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
-        return self.equations.factor.of_rows(self.equations.linearise(start)[1])
+        return self.problem.factor.of_rows(self.problem.linearise(start)[1])
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
         sizes, rows = unit_rows(self._along(start))
-        change = self.equations.factor.measured(jnp.where(solved.ok, solved.y, start) - start)
+        change = self.problem.factor.measured(jnp.where(solved.ok, solved.y, start) - start)
         multiplier = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
         return solved.ok, multiplier / sizes
 
@@ -124,22 +124,22 @@ class Along(AbstractSystem):
         if self.directions is not None:
             change = combined(multiplier, self.directions)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
-            _, vjp = jax.vjp(self.equations.residual, start)
-            change = self.equations.factor.of_rows(vjp(multiplier)[0])
-        end = start + self.equations.factor.of_change(change)
+            _, vjp = jax.vjp(self.problem.residual, start)
+            change = self.problem.factor.of_rows(vjp(multiplier)[0])
+        end = start + self.problem.factor.of_change(change)
         # The second equation at the end of the correction, so that its tangent contains the first.
-        return end, self.equations.residual(end)
+        return end, self.problem.residual(end)
 
     def linear_solution(self, solved: Solved, right: tuple[Array, Array]) -> Array:
         """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
         t_y, t_g = (-x for x in right)
-        equations, start = self.equations, self._start(solved.ok)
+        problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = unit_rows(equations.factor.of_rows(equations.linearise(y)[1]))
+        heights, rows = unit_rows(problem.factor.of_rows(problem.linearise(y)[1]))
         along = unit_rows(self._along(start))[1]
         change = corrected(rows, along, t_g / heights, least=least_pivot(rows))
-        return t_y - equations.factor.of_change(change)
+        return t_y - problem.factor.of_change(change)
 
 
 @jax.custom_jvp

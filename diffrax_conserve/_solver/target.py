@@ -1,0 +1,119 @@
+"""What a step of a solver aims at: the manifold, with the conserved values of the solve."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._balance import integrated_rates
+from .._constants import NOISE, ROUNDOFF
+from .._custom_types import Args, Manifold, RealScalarLike
+from .._numerics.metric import AbstractFactor, Identity, Preferring, factor_of
+from .._numerics.problem import Problem, Step, problem_of
+from .._projection.base import AbstractProjection, adapted
+from .._tree import ravel, tree_stop_gradient, unravel
+
+# The solution between two times of the vector field, as a vector.
+Path = Callable[[RealScalarLike], Float[Array, " n"]]
+
+
+class Target(eqx.Module):
+    """Everything that a projection needs except the time and the candidate. Within a step only
+    `gained` changes, by `advanced`, so that dense output can project by the target too. Times are
+    those of the vector field, and states are vectors.
+
+    - `like`: the shapes and dtypes of the state.
+    - `values`: the conserved values at the start of the solve.
+    - `cancellation`: the part of the scales that the gradients do not show.
+    - `changes`: how far each component moves in the step.
+    - `factor`: that of the metric where the projection has none of its own: of the motion, or with
+      noise of the numbers of the state.
+    - `gained`: in the first row the integrals of the rates since the start of the solve, in the
+      second what rounding has added to them; `None` if no entry has a rate.
+    - `preferred`: changes of the state in this step and the last one, if corrections are to stay
+      in their span; see `Preferring`.
+    """
+
+    projection: AbstractProjection
+    manifold: Manifold
+    like: Any
+    values: Float[Array, " m"]
+    cancellation: Float[Array, " m"]
+    args: Args
+    changes: Float[Array, " n"] | None = None
+    factor: AbstractFactor = Identity()
+    gained: Float[Array, "2 m"] | None = None
+    preferred: Float[Array, "k n"] | None = None
+
+    def advanced(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "Target":
+        """The target at a time `end` in a step, given the `path` of the solution from `start`.
+
+        The integral over the step is added to the integrals so far by compensated summation (W.
+        Kahan, "Further remarks on reducing truncation errors", *Comm. ACM* 8 (1965), 40). So their
+        roundoff does not grow with the number of steps.
+        """
+        if self.gained is None:
+            return self
+        last, excess = self.gained
+        states = lambda t: unravel(path(t), self.like)  # noqa: E731
+        more = integrated_rates(self.manifold, start, end, states, self.args)
+        more = ravel(more).astype(last.dtype) - excess
+        total = last + more
+        return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
+
+    def following(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
+        """The target with values that a state `y` on the manifold can keep.
+
+        A balance comes to rest, for example when friction has stopped a pendulum. The integral of
+        its rate then keeps a rest of roundoff, say an energy of -1e-17, which no state has: all
+        later projections would fail. So where the residual at the start of a step is within the
+        tolerance, but more than half of what counts as noise, the value follows the state until it
+        is that.
+        """
+        if self.gained is None:
+            return self
+        problem, y = tree_stop_gradient((self.problem(t, y), y))
+        off, jacobian = problem.linearise(y)
+        limit = problem.tolerance(problem.scale(jacobian, y))
+        within = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
+        noise = NOISE / ROUNDOFF * limit / 2
+        follow = jnp.where(within, off - jnp.clip(off, -noise, noise), 0)
+        # The next integral is added minus the second row, so that it is larger by `follow`.
+        return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
+
+    def problem(
+        self, t: RealScalarLike, y: Float[Array, " n"], step: Step | None = None
+    ) -> Problem:
+        """The problem at a time, with the metric at a state."""
+        values, cancellation = self.values, self.cancellation
+        if self.gained is not None:
+            # An energy that has been lost leaves a small value, which is a difference of large
+            # numbers and has their roundoff. So its scale is at least that of the start.
+            values = values + self.gained[0]
+            lost = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
+            cancellation = cancellation + lost
+        fields = dict(factor=self.factor, changes=self.changes, step=step)
+        problem = problem_of(self.manifold, values, t, self.like, self.args, cancellation, **fields)
+        problem = adapted(problem, self.projection, y)
+        if self.preferred is None:
+            return problem
+        factor = Preferring.along(problem.factor, self.preferred)
+        return dataclasses.replace(problem, factor=factor)
+
+    def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:
+        """The factor of the metric of the projection."""
+        own = self.projection.metric
+        return self.factor if own is None else factor_of(own, t, unravel(y, self.like), self.args)
+
+    def step(
+        self,
+        start: RealScalarLike,
+        end: RealScalarLike,
+        y0: Float[Array, " n"],
+        error: Float[Array, " n"] | None,
+    ) -> Step | None:
+        """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
+        return Step(start, end, y0, error) if self.projection.sees_step else None
