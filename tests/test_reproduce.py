@@ -128,10 +128,12 @@ def test_every_stiff_system(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.draws
 @pytest.mark.parametrize("name", dfc.systems.names())
-def test_every_system(name, tmp_path):
+def test_every_system(name, tmp_path, caplog):
     system = dfc.systems.get(name)
     status, metrics = reproduce(tmp_path, name, "--t1", str(3 * system.dt))
     assert status == 0
+    # matplotlib tells by its logger what it cannot draw as asked.
+    assert [x.getMessage() for x in caplog.records if x.name.startswith("matplotlib")] == []
     files = list((tmp_path / "out").iterdir())
     others = {file.name for file in files} - {*FIGURES, "metrics.json"}
     assert len(files) == 7 + len(others)
