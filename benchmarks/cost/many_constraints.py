@@ -9,9 +9,9 @@
 5. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
    of mass, angular momentum.
 
-For each size: seconds per step of RK4, or of the method in its name, plain and projected, the memory
-that the compiled step needs besides its arguments (in multiples of the state: constant if memory is
-linear), and the residuals.
+For each size: seconds per step of RK4, or of the method in its name, plain and projected, the
+memory that the compiled step needs besides its arguments (in multiples of the state: constant if
+memory is linear), and the residuals.
 """
 
 import functools as ft
