@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lowest slow coverage shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
+.PHONY: help demo test lowest newest slow coverage shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -81,6 +81,24 @@ lowest: | $(BIN)/python ## run a part of the tests with the lowest versions of j
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(LOWEST)
 	$(BIN)/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable '.[test]'
 	$(LOWEST)/bin/python -m pytest $(SHARED) -m "not slow and not examples" $(PROMISED)
+
+# The newest Python that is here; those of pyenv are no commands unless they were chosen.
+NEWEST_PYTHON ?= $(shell for minor in 16 15 14 13 12 11; do \
+  for found in python3.$$minor "$$HOME"/.pyenv/versions/3.$$minor.*/bin/python; do \
+  "$$found" -c "" 2>/dev/null && echo "$$found" && exit; done; done; echo "$(PYTHON)")
+NEWEST := $(VENV)/newest
+
+# Without the upper bounds of the extra `sparse`, of which uv can be told. A failure says that a
+# bound is needed, or that the code must change.
+newest: | $(BIN)/python ## run the tests with the newest Python, jax and asdex that can be had
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv venv --quiet --clear --python "$(NEWEST_PYTHON)" $(NEWEST)
+	printf 'jax\nasdex\n' > $(NEWEST)/overrides.txt
+	$(BIN)/uv pip install --quiet --python $(NEWEST)/bin/python --overrides $(NEWEST)/overrides.txt \
+	  --editable '.[sparse,test]'
+	@$(NEWEST)/bin/python --version
+	@$(BIN)/uv pip freeze --quiet --python $(NEWEST)/bin/python | grep -E '^(asdex|diffrax|equinox|jax)='
+	$(NEWEST)/bin/python -m pytest $(SHARED) -m "not slow and not examples"
 
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise

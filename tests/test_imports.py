@@ -56,6 +56,8 @@ CONFINED = {
 
 # Private names of other packages that have no public equivalent: `(file, name)`. The file says why.
 PRIVATE_ALLOWED = {
+    ("_large/asdex_import.py", "jax._src.core"),
+    ("_large/asdex_import.py", "jax._src.core.ClosedJaxpr"),
     ("_solver/diffrax_private.py", "diffrax._term.WrapTerm"),
     ("_solver/diffrax_private.py", "diffrax._term.AdjointTerm"),
     ("_solver/diffrax_private.py", "diffrax.RESULTS._index_to_message"),

@@ -128,10 +128,12 @@ def test_every_stiff_system(name, tmp_path):
 @pytest.mark.slow
 @pytest.mark.draws
 @pytest.mark.parametrize("name", dfc.systems.names())
-def test_every_system(name, tmp_path):
+def test_every_system(name, tmp_path, caplog):
     system = dfc.systems.get(name)
     status, metrics = reproduce(tmp_path, name, "--t1", str(3 * system.dt))
     assert status == 0
+    # matplotlib tells by its logger what it cannot draw as asked.
+    assert [x.getMessage() for x in caplog.records if x.name.startswith("matplotlib")] == []
     files = list((tmp_path / "out").iterdir())
     others = {file.name for file in files} - {*FIGURES, "metrics.json"}
     assert len(files) == 7 + len(others)
@@ -178,6 +180,27 @@ def test_what_is_refused(arguments, words, capsys, tmp_path, monkeypatch):
     message = capsys.readouterr().err
     assert [word for word in words if word not in message] == []
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.draws
+@pytest.mark.parametrize("parts", [1, 2])
+def test_a_curve_is_drawn_with_equal_scales_and_all_of_it(parts, caplog, tmp_path):
+    """A single part has common limits, those of several parts are their own."""
+    from diffrax_conserve.reproduce import _plot
+
+    angles = np.linspace(0, 6, 50)
+    curve = np.stack([3 * np.cos(angles), np.sin(angles)], axis=1)
+    curves = {str(i): (1 + i) * curve for i in range(parts)}
+    paths = {"rk4": curves, "standard": curves}
+    figure = _plot._trajectory(paths, None, ("q₁", "q₂"))
+    _plot.save(figure, tmp_path / "trajectory.png")
+    for ax, limit in zip(figure.axes, (3, 3 if parts == 1 else 6), strict=True):
+        across, up = np.diff(ax.transData.transform([(0, 0), (1, 1)]), axis=0)[0]
+        np.testing.assert_allclose(across, up)
+        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        assert left < -limit < limit < right
+        assert bottom < -limit / 3 < limit / 3 < top
+    assert [x.getMessage() for x in caplog.records if x.name.startswith("matplotlib")] == []
 
 
 @pytest.mark.draws

@@ -5,11 +5,13 @@
 2. Spins on a line that turn about their neighbours (Landau and Lifshitz): the length of each,
    and the energy.
 3. Rigid molecules of water in a periodic field: three bonds each, and the energy.
-4. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
+4. Kepler orbits that know nothing of each other, in one state: the energy of each.
+5. Gravitating bodies with the ten classical integrals: energy, momentum, the motion of the centre
    of mass, angular momentum.
 
-For each size: seconds per RK4 step, plain and projected, the memory that the compiled step needs
-besides its arguments (in multiples of the state: constant if memory is linear), and the residuals.
+For each size: seconds per step of RK4, or of the method in its name, plain and projected, the
+memory that the compiled step needs besides its arguments (in multiples of the state: constant if
+memory is linear), and the residuals.
 """
 
 import functools as ft
@@ -166,6 +168,29 @@ def molecules(count):
     return jnp.asarray(q), jnp.asarray(v)
 
 
+# ---- Orbits: q and v have shape (orbits, 2) ----
+
+
+def orbits_vector_field(t, y, args):
+    q, v = y
+    return v, -q / jnp.sum(q * q, -1, keepdims=True) ** 1.5
+
+
+def orbit_energies(t, y, args):
+    q, v = y
+    return jnp.sum(v * v, -1) / 2 - 1 / jnp.sqrt(jnp.sum(q * q, -1))
+
+
+ORBITS = {"energy": dfc.FirstIntegral(orbit_energies)}
+
+
+def orbits(count):
+    """At their pericentres, with eccentricities up to 0.6."""
+    e = np.random.default_rng(0).uniform(0, 0.6, count)
+    q = np.stack([1 - e, 0 * e], 1)
+    return jnp.asarray(q), jnp.asarray(np.stack([0 * e, np.sqrt((1 + e) / (1 - e))], 1))
+
+
 # ---- Gravitating bodies; the sums over pairs go row by row, so that memory is linear ----
 
 SOFTENING = 1e-2
@@ -240,10 +265,11 @@ def bodies(count):
 # ---- Measuring ----
 
 
-def measure(name, vector_field, manifold, y0, dt, steps, plain_steps, rounds=3):
+def measure(name, vector_field, manifold, y0, dt, steps, plain_steps, method=None, rounds=3):
     state_bytes = sum(x.nbytes for x in jax.tree.leaves(y0))
     row = {"problem": name, "unknowns": sum(x.size for x in jax.tree.leaves(y0))}
-    solvers = {"plain": dfc.RK4(), "projected": dfc.ManifoldProjection(dfc.RK4(), manifold)}
+    plain = method or dfc.RK4()
+    solvers = {"plain": plain, "projected": dfc.ManifoldProjection(plain, manifold)}
     for label, solver in solvers.items():
 
         @eqx.filter_jit
@@ -293,6 +319,8 @@ def main(argv=None):
     size = lambda y0: sum(x.size for x in jax.tree.leaves(y0))  # noqa: E731
     cases = [(*case, max(5, 100_000 // size(case[3])), 100) for case in cases]
     cases += [(f"{n} bodies", bodies_vector_field, BODIES, bodies(n), 1e-3, 2, 2) for n in many]
+    case = orbits_vector_field, ORBITS, orbits(128), 2e-2, 1_000, 1_000
+    cases += [("128 orbits", *case), ("128 orbits, Dopri8", *case, dfx.Dopri8())]
     rows = []
     for case in cases:
         if options.only in case[0]:

@@ -34,6 +34,7 @@ from jaxtyping import Array, Float
 
 from .._constants import ADDED_POWER, FEW, LEAST_SPARSE, NEAREST
 from .._fast.jaxprs import jaxprs_inside
+from .asdex_import import asdex, reason
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
@@ -168,8 +169,8 @@ def _coloured(
     for size, (rows, columns) in found:
         is_dense = dense[first : first + size]
         rows, columns = rows[~is_dense[rows]], columns[~is_dense[rows]]
-        kept = _asdex().SparsityPattern.from_coo(rows, columns, (size, shape[1]))
-        colour, number = _asdex().color_rows(kept)
+        kept = asdex().SparsityPattern.from_coo(rows, columns, (size, shape[1]))
+        colour, number = asdex().color_rows(kept)
         colour = np.where(is_dense, number + np.cumsum(is_dense) - 1, colour)
         elements.append((first + rows, columns, len(of_dense) + colour[rows]))
         of_dense += [False] * number + [True] * int(np.sum(is_dense))
@@ -187,11 +188,12 @@ def pattern_of(
     m, n = sum(sizes), y.size
     if m < LEAST_SPARSE:
         return None
-    if _asdex() is None:
+    try:
+        asdex()
+    except Exception as error:  # private names of jax that are gone raise errors of any kind
         warnings.warn(
-            f"The manifold has {m} constraints. Their Jacobian is treated as dense, because the "
-            "package that finds sparse ones is missing: `pip install '.[sparse]'` in the folder "
-            "of diffrax-conserve.",
+            f"The manifold has {m} constraints. Their Jacobian is treated as dense, because "
+            f"{reason(error)}",
             stacklevel=2,
         )
         return None
@@ -223,16 +225,6 @@ def pattern_of(
 
 # The patterns that were found, by their functions. Detection takes seconds for large systems.
 _KNOWN: dict[Any, Pattern | None] = {}
-
-
-@ft.cache
-def _asdex() -> Any:
-    """The package that finds sparsity patterns by abstract interpretation, if it is installed."""
-    try:
-        import asdex
-    except ImportError:
-        return None
-    return asdex
 
 
 def _constants(closed: Any) -> Iterator[Any]:
@@ -267,7 +259,7 @@ def _entries(closed: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
 
     like = [closed.consts[i] for i in unknown]
     others = [np.zeros(x.shape, x.dtype) for x in like]
-    found = _asdex().jacobian_sparsity(fn, np.zeros(y.shape, y.dtype), *others)
+    found = asdex().jacobian_sparsity(fn, np.zeros(y.shape, y.dtype), *others)
     return np.asarray(found.rows), np.asarray(found.cols)
 
 

@@ -181,7 +181,8 @@ def _trajectory(
         if dimension == 3:
             ax.set_box_aspect((1, 1, 0.8), zoom=0.82)  # leaves room for the labels
         elif axis_labels[0][0] + axis_labels[1][0] in ("xy", "qq", "qp"):
-            ax.set_aspect("equal", adjustable="datalim")
+            # Panels of a single part have the same limits, see below, so their boxes are adjusted.
+            ax.set_aspect("equal", adjustable="box" if len(parts) == 1 else "datalim")
         ax.locator_params(nbins=4)
         if len(shown) > 1:
             ax.set_title(title)
