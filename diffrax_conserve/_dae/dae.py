@@ -397,8 +397,8 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The searches and the structures that were found, by the functions and the shapes. Both are functions
-# of these alone, so that it does not matter which are known.
+# The searches, and the structures that were found, by the functions and the shapes. Both depend on
+# these alone, so that it does not matter which are known.
 _SEARCHES: dict[Any, Search] = {}
 _FOUND: dict[Any, Structure] = {}
 
@@ -440,8 +440,9 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
     if here.ranks != structure.ranks:
         raise ValueError(
             f"With these values the equations have {here}, but with values in general position "
-            f"{structure}. Where values decide, such as zeros in `args`, write `dae = dae.at(guess, "
-            "t=t0, args=args)`, and take `consistent`, `report`, `term` and `wrap` of that."
+            f"{structure}. Where values decide, such as zeros in `args`, write "
+            "`dae = dae.at(guess, t=t0, args=args)`, and take `consistent`, `report`, `term` and "
+            "`wrap` of that."
         )
     return structure
 

@@ -141,7 +141,8 @@ def _another(x: Array) -> Array:
 
 
 def _either(known: Iterable[Any], general: Iterable[Any]) -> Numbers:
-    return [b if a is None else jnp.asarray(a, b.dtype) for a, b in zip(known, general, strict=True)]
+    pairs = zip(known, general, strict=True)
+    return [b if a is None else jnp.asarray(a, b.dtype) for a, b in pairs]
 
 
 def tree_key(tree: Any) -> Any:
