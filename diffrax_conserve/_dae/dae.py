@@ -436,7 +436,14 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
     search = _search(dae, y, args)
     if search.is_traced:
         return structure
-    here = _found(dae, t, y, args, lambda: search.at((dae, args), *_numbers(t, y)))
+
+    def near() -> Structure:
+        try:
+            return search.at((dae, args), *_numbers(t, y), structure)
+        except FloatingPointError:  # a poor guess tells nothing
+            return structure
+
+    here = _found(dae, t, y, args, near)
     if here.ranks != structure.ranks:
         raise ValueError(
             f"With these values the equations have {here}, but with values in general position "
