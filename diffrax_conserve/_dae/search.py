@@ -66,7 +66,7 @@ class Search:
         self._given = given
 
     def at(self, tree: Any, t: Array, y: Array, known: Structure | None = None) -> Structure:
-        """The structure with these numbers, near a state; the one that is known, where that fits."""
+        """The structure with these numbers, near a state; the known one, where that fits."""
         _, kinds, time, _ = self._kinds
         leaves = _either((x for x in jtu.tree_leaves(tree) if self._is_number(x)), kinds)
         consts, t = _either(self._consts, self._kinds[0]), jnp.asarray(t, time.dtype)
