@@ -75,9 +75,10 @@ def compare(
     entry left out; each with the default metric, with `metric=1.0`, with $1/\text{size}^2$ of each
     component as its weight, and with the `metric` that you give. The error of a state is judged by
     a solve at a tight tolerance that steps exactly to the times at which states are compared. It is
-    the geometric mean over the $n$ components of their relative errors,
+    the geometric mean over the $n$ components of their largest relative errors so far,
 
-    $$e(t) = \Big(\prod_k \frac{|y_k(t) - y^*_k(t)|}{\max_t |y^*_k(t)|}\Big)^{1/n}.$$
+    $$e(t) = \Big(\prod_{k=1}^n
+    \frac{\max_{s \le t} |y_k(s) - y^*_k(s)|}{\max_s |y^*_k(s)|}\Big)^{1/n}.$$
 
     So each component counts as much as any other, and what is said depends neither on units nor on
     how the state is packed into arrays and leaves. Components of which the error without projection

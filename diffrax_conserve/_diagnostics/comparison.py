@@ -44,13 +44,13 @@ _CANCELLED = 1e-14
 
 
 def distance(ys: Any, exact: Any, judged: Any) -> Float[np.ndarray, "lanes times"]:
-    """The error of states with leading axes over lanes and times: that of each component relative
-    to its largest value, in the geometric mean over those that are `judged`. NaN where it is not
-    known."""
+    """The error of states with leading axes over lanes and times: the largest so far of each
+    component, relative to its largest value, in the geometric mean over those that are `judged`.
+    NaN where it is not known."""
     y, x = _flat(ys), _flat(exact)
     size = np.max(np.abs(x), axis=1, keepdims=True)
     with np.errstate(invalid="ignore", over="ignore"):
-        error = np.abs(y - x) / np.where(size == 0, 1, size)
+        error = _running(np.abs(y - x)) / np.where(size == 0, 1, size)
     return np.exp(np.mean(np.log(np.maximum(error[..., judged], _TINY)), axis=2))
 
 
@@ -132,7 +132,7 @@ class ComparisonRow:
     - `name`: such as `"all but energy, metric=1.0"`.
     - `kept`: the names of the entries that it keeps.
     - `solver`: itself, ready for `diffrax.diffeqsolve`.
-    - `errors`: the error of the state in each lane at each time.
+    - `errors`: the error of the state in each lane up to each time.
     - `success`, `message`: whether each lane succeeded, and why the first of the others did not.
     - `drift`: the largest drift of each entry in each lane, kept or not.
     - `linear`: the largest change in each lane of linear invariants that nobody declared.
@@ -194,16 +194,8 @@ class ComparisonReport:
     def error(self) -> Float[np.ndarray, "rows lanes"]:
         """The largest error of each row and lane up to the last time that is judged: infinite if
         the solve failed, NaN if nothing is judged."""
-        return self._at_last([_so_far(row) for row in self.rows])
-
-    @property
-    def error_at_end(self) -> Float[np.ndarray, "rows lanes"]:
-        """The error of each row and lane at the last time that is judged."""
-        return self._at_last([np.where(r.success[:, None], r.errors, np.inf) for r in self.rows])
-
-    def _at_last(self, errors: list[np.ndarray]) -> np.ndarray:
-        last = self.last
-        found = np.stack(errors)[:, np.arange(len(last)), last]
+        last, lanes = self.last, np.arange(self.doubt.shape[0])
+        found = np.stack([_so_far(row) for row in self.rows])[:, lanes, last]
         return np.where(last > 0, found, np.nan)
 
     @property
@@ -348,7 +340,7 @@ class ComparisonReport:
 
     def __str__(self) -> str:
         lanes = self.doubt.shape[0]
-        head = ["error", "at the end"] if lanes == 1 else ["error", "worst", "worse"]
+        head = ["error"] if lanes == 1 else ["error", "worst", "worse"]
         head += [f"drift of {name}" for name in self.rows[0].drift]
         head += ["linear"] * (self.num_linear > 0) + ["steps", "time"]
         width = max(len(row.name) for row in self.rows)
@@ -361,7 +353,7 @@ class ComparisonReport:
     def _cells(self, i: int) -> list[str]:
         row, error, first = self.rows[i], self.error, self.error[0]
         if error.shape[1] == 1:
-            found = [_number(error[i, 0]), _number(self.error_at_end[i, 0])]
+            found = [_number(error[i, 0])]
         else:
             judged = self.last > 0
             worse = np.mean(error[i, judged] > first[judged]) if judged.any() else np.nan

@@ -216,7 +216,8 @@ SymmetricProjection.__init__.__doc__ = r"""**Arguments:**
 
 `ValueError` if `solver` is known not to be symmetric: by its `tableau`, if it is a Runge-Kutta
 method with one, by its order, if that is odd, because it has a memory, or because it is a
-projection. Of other methods it cannot be told: try a solve forwards and backwards. `TypeError` or `ValueError` if another argument does not fit.
+projection. Of other methods it cannot be told: try a solve forwards and backwards. `TypeError` or
+`ValueError` if another argument does not fit.
 """
 
 
@@ -302,8 +303,8 @@ def _is_known_unsymmetric(solver: dfx.AbstractSolver) -> bool:
 
 
 def _is_symmetric(tableau: Any) -> bool:
-    """Whether `a_{s+1-i,s+1-j} + a_{ij} = b_j` for the stages that the step uses (Hairer, Lubich and
-    Wanner, V.2.1). No explicit method satisfies it."""
+    """Whether `a_{s+1-i,s+1-j} + a_{ij} = b_j` for the stages that the step uses (Hairer, Lubich
+    and Wanner, V.2.1). No explicit method satisfies it."""
     if not isinstance(tableau, dfx.ButcherTableau):
         return False  # those of diffrax for noise are explicit
     b = tableau.b_sol

@@ -216,18 +216,12 @@ class State(eqx.Module):
         squares are exchanged, as by the components of a vector of constant length, or between a
         place and a velocity by an energy, `|y Δy|` is the same on both sides.
 
-        In a state of several leaves each vector along the last axis of a leaf is a quantity, such
-        as the place of a body, because unlike units within a vector would turn the correction. It
-        is measured by its largest component. A single array may hold unlike quantities, so there
-        each component is one.
-
         A quantity that hardly changes counts as changing by `ε` of itself. This floor is inside the
         root, so that the derivative stays finite, and the root is that of a ratio, so that nothing
         is squared and a power of two as a unit changes no bit.
         """
-        size = jnp.maximum(jnp.abs(ravel(end)), change)
-        if len(jtu.tree_leaves(end)) > 1:
-            size, change = largest_of_vector(size, end), largest_of_vector(change, end)
+        size = largest_of_vector(jnp.maximum(jnp.abs(ravel(end)), change), end)
+        change = largest_of_vector(change, end)
         share = change / jnp.where(size > 0, size, 1)
         share = jnp.maximum(share, float(jnp.finfo(change.dtype).eps))
         return jnp.maximum(self.motion, size * jnp.sqrt(share))
@@ -239,8 +233,17 @@ class State(eqx.Module):
 
 
 def largest_of_vector(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
-    """Each component of `x` replaced by the largest of its vector, along the last axis of its leaf,
-    where `x` is the `ravel` of a state like `like`."""
+    """Each component of `x` replaced by the largest of its quantity, where `x` is the `ravel` of a
+    state like `like`.
+
+    Each component of a state is a quantity, with a unit of its own: here, and wherever this package
+    judges errors or drifts. There is one exception. A correction in unlike units would turn a
+    vector, such as the place of a body. So in a state of several leaves, in which unlike quantities
+    can be kept apart, each vector along the last axis of a leaf is corrected in one unit. A single
+    array may hold unlike quantities.
+    """
+    if len(jtu.tree_leaves(like)) == 1:
+        return x
 
     def largest(part: Array) -> Array:
         axis = -1 if part.ndim else None

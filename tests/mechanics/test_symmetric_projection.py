@@ -272,7 +272,8 @@ def test_what_is_admissible():
     for solver in (
         dfx.Tsit5(), dfx.Euler(), dfx.Kvaerno3(), dfx.SemiImplicitEuler(), dfx.LeapfrogMidpoint(),
         dfx.ReversibleHeun(), dfx.ImplicitEuler(), dfx.HalfSolver(dfx.Heun()), dfc.RK4(),
-        dfc.Unrolled(dfx.Tsit5()), dfc.Radau(), dfx.KenCarp3(), dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER),
+        dfc.Unrolled(dfx.Tsit5()), dfc.Radau(), dfx.KenCarp3(),
+        dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER),
     ):  # fmt: skip
         with pytest.raises(ValueError, match="not symmetric"):
             dfc.SymmetricProjection(solver, KEPLER)
