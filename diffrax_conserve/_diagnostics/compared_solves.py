@@ -122,13 +122,13 @@ def sizes_of(task: Task, sols: dfx.Solution) -> Any:
     start = jtu.tree_map(lambda y: y[:, None], task.y0s)
     size = jtu.tree_map(lambda y, x: np.maximum(largest(y), largest(x)), sols.ys, start)
     top = max(np.max(x, initial=0) for x in jtu.tree_leaves(size))
-    step = (float(task.t1) - float(task.t0)) / np.min(np.asarray(sols.stats["num_steps"]))
+    step = (float(task.t1) - float(task.t0)) / max(np.min(sols.stats["num_steps"]), 1)
 
     def floored(size: np.ndarray, slope: Any) -> np.ndarray:
         size = np.maximum(size, np.minimum(_CANCELLED * step * largest(slope), _SMALL * top))
         return np.where(size > 0, size, 1.0)
 
-    return jtu.tree_map(floored, size, _varied(task, sols.ts, sols.ys))
+    return jtu.tree_map(floored, size, _varied(task, jnp.asarray(sols.ts), sols.ys))
 
 
 @eqx.filter_jit

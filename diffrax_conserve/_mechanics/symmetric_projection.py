@@ -295,8 +295,9 @@ def _is_known_unsymmetric(solver: dfx.AbstractSolver) -> bool:
     it is symmetric (Hairer, Lubich and Wanner, II.3)."""
     if isinstance(solver, _NOT_SYMMETRIC):
         return True
-    if hasattr(solver, "tableau"):
-        tableaus = getattr(solver.tableau, "tableaus", (solver.tableau,))
+    tableau = getattr(solver, "tableau", None)
+    if tableau is not None:
+        tableaus = getattr(tableau, "tableaus", (tableau,))
         return not all(map(_is_symmetric, tableaus))
     order = solver.order(dfx.ODETerm(lambda t, y, args: y))
     return order is not None and order % 2 == 1
