@@ -367,6 +367,23 @@ def test_a_projection_that_spoils_a_component_is_not_for_what_it_keeps():
         assert report.verdict.endswith(", but `y[1]` is 45 times less accurate.")
 
 
+def test_what_spoils_a_component_is_taken_only_for_a_gain_as_large():
+    """Of a place beside a speed, for example. What is three times as inaccurate is told."""
+    for error, factor, choice in (
+        (5e-4, 8.0, "nothing kept"), (5e-4, 3.1, "nothing kept"), (5e-4, 2.9, "choice 1"),
+        (3e-4, 8.0, "choice 1"),
+    ):  # fmt: skip
+        report = report_of(1e-3, error)
+        rows = report.rows[0], dataclasses.replace(report.rows[1], worsened=("y[0]", factor))
+        report = dataclasses.replace(report, rows=rows)
+        assert report.choice == choice
+        assert (f"`y[0]` is {factor:.2g} times less accurate" in report.verdict) is (factor > 3)
+    # Of two that gain about alike the one that spoils nothing is taken.
+    plain, first, second = (report := report_of(1e-3, 2e-4, 2.5e-4)).rows
+    rows = plain, dataclasses.replace(first, worsened=("y[0]", 8.0)), second
+    assert dataclasses.replace(report, rows=rows).choice == "choice 2"
+
+
 def test_the_component_that_is_least_accurate_beside_plain():
     """In two lanes at three times, of which the last is not judged."""
     exact = np.ones((2, 3, 2))
