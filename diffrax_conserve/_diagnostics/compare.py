@@ -92,12 +92,13 @@ def compare(
     batch, unless one before it in the table has at most 1.5 times this error: then the first of
     these, because errors grow faster where less is kept. Only what has an error of less than 0.9
     times that without projection gains. If nothing does, the first is taken that has at most 1.1
-    times that error, and in no lane 1.5 times, and is said to be for what it keeps only; otherwise
-    no projection is. What makes a component more than 3 times less accurate is told, and is taken
-    only if the error falls to less than a third. If all entries kept spoil a component so, as those
-    of a solar system the outer planets beside Mercury, a metric by errors is tried too: the weight
-    of a component is the inverse square of its error without projection, so that what is accurate
-    already is hardly moved. Of more than eight entries none is left out.
+    times that error, also in each component, and in no lane 1.5 times, and is said to be for what
+    it keeps only; otherwise no projection is. What makes a component more than 3 times less
+    accurate is told, and is taken only if the error falls to less than a third. If all entries kept
+    spoil a component so, as those of a solar system the outer planets beside Mercury, a metric by
+    errors is tried too: the weight of a component is the inverse square of its error without
+    projection, so that what is accurate already is hardly moved. Of more than eight entries none is
+    left out.
 
     A small system takes half a minute, most of it compilation. Lists that differ in what is left
     out, and metrics of weights, share programs: so the time of a solve contains the evaluation of

@@ -22,7 +22,8 @@ _TRUSTED = 1 / 3
 _LOST = 0.3
 # A lane that can be judged for less than this share of its interval counts as not judged.
 _SHORTEST = 0.1
-# A projection whose error differs by less than this share from that without one changes it little.
+# A projection whose error differs by less than this share from that without one changes it little,
+# if that of no component is larger by more.
 _EQUAL = 0.1
 # The least error decides only if it is smaller by this factor. Otherwise the first choice is taken,
 # which keeps more: smaller differences depend on the interval and on what is measured, and errors
@@ -432,7 +433,7 @@ def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     worst = {i: np.max(error[i, common] / error[0, common]) for i in means}
     gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
     little = [i for i in near if means[i] <= (1 + _EQUAL) * means[0]]
-    equal = [i for i in little if worst[i] <= _RISK]
+    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= 1 + _EQUAL]
     return next((i for i in [*gains, *equal] if i > 0), 0)
 
 
