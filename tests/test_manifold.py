@@ -225,3 +225,17 @@ def test_the_components_of_a_vector_have_one_scale():
     saveat = dfx.SaveAt(t0=True, steps=True)
     sol = solve(field, solver, y0, t1=6000.0, dt0=20.0, saveat=saveat, max_steps=302)
     assert largest(drift_of(sol, momentum)) < 16 * np.finfo(float).eps
+
+
+def test_unlike_values_in_one_array_have_scales_of_their_own():
+    values = {
+        "energy": rotational_energy,
+        "fast": lambda t, y, args: 1e6 * rotational_energy(t, y, args) ** 3,
+    }
+    apart = {name: FirstIntegral(fn) for name, fn in values.items()}
+    array = FirstIntegral(lambda t, y, args: jnp.stack([fn(t, y, args) for fn in values.values()]))
+    saveat = dfx.SaveAt(t0=True, steps=True)
+    sol = solve(rigid_body, dfx.Heun(), OMEGA0, t1=5.0, dt0=0.1, saveat=saveat, max_steps=64)
+    expected = jnp.stack(list(drift_of(sol, apart).values()), axis=1)
+    assert largest(expected) > 1e-6
+    np.testing.assert_allclose(drift_of(sol, array), expected, rtol=1e-9, atol=1e-15)

@@ -33,6 +33,7 @@ from .comparison import (
     ComparisonRow,
     by_errors,
     distance,
+    judged,
     worsened,
 )
 from .linear_invariants import changes, linear_invariants
@@ -44,8 +45,8 @@ _LEFT_OUT = 8
 # An adaptive solve that must keep its dense output, as balances need it, takes at most so many
 # steps.
 _DENSE_STEPS = 4096
-# What is added to the name of a row with the metric by errors.
-_BY_ERRORS = ", metric by errors"
+# What is added to the name of a row with the metric by sizes, or by errors.
+_BY_SIZES, _BY_ERRORS = ", metric by sizes", ", metric by errors"
 # Linear invariants are searched for in states of at most so many components.
 _COMPONENTS = 300
 
@@ -71,11 +72,17 @@ def compare(
     r"""Prints and returns whether projecting makes a solution better, and says what to keep.
 
     The equation is solved without projection, with all entries of the manifold kept, and with each
-    entry left out; each with the default metric, with `metric=1.0`, and with the `metric` that you
-    give. The error of a state is judged by a solve at a tight tolerance that steps exactly to the
-    times at which states are compared,
+    entry left out; each with the default metric, with `metric=1.0`, with $1/\text{size}^2$ of each
+    component as its weight, and with the `metric` that you give. The error of a state is judged by
+    a solve at a tight tolerance that steps exactly to the times at which states are compared. It is
+    the geometric mean over the $n$ components of their largest relative errors so far,
 
-    $$e(t) = \max_{\text{leaves}} \frac{\max_k |y_k(t) - y^*_k(t)|}{\max_{k, t} |y^*_k(t)|}.$$
+    $$e(t) = \Big(\prod_{k=1}^n
+    \frac{\max_{s \le t} |y_k(s) - y^*_k(s)|}{\max_s |y^*_k(s)|}\Big)^{1/n}.$$
+
+    So each component counts as much as any other, and what is said depends neither on units nor on
+    how the state is packed into arrays and leaves. Components of which the error without projection
+    is roundoff are left out, such as parameters.
 
     A second solve, at a tolerance a hundred times as large, tells how far this reference can be
     trusted. From the time on at which both differ by more than a third of the smallest error, or
@@ -85,15 +92,13 @@ def compare(
     batch, unless one before it in the table has at most 1.5 times this error: then the first of
     these, because errors grow faster where less is kept. Only what has an error of less than 0.9
     times that without projection gains. If nothing does, the first is taken that has at most 1.1
-    times that error, in no lane 1.5 times, and in no component 10 times, and is said to be for what
-    it keeps only; otherwise no projection is. A component that becomes 10 times less accurate is
-    told in any case. If all entries kept do that, as those of a solar system to the outer planets
-    beside Mercury, a metric by errors is tried too: the weight of a component is the inverse square
-    of its error without projection, so that what is accurate already is hardly moved. Of more than
-    eight entries none is left out.
-
-    An error counts relative to the largest value of its leaf, so that of an angle which goes round
-    many times, or of a place far from the origin, counts little.
+    times that error, also in each component, and in no lane 1.5 times, and is said to be for what
+    it keeps only; otherwise no projection is. What makes a component more than 3 times less
+    accurate is told, and is taken only if the error falls to less than a third. If all entries kept
+    spoil a component so, as those of a solar system the outer planets beside Mercury, a metric by
+    errors is tried too: the weight of a component is the inverse square of its error without
+    projection, so that what is accurate already is hardly moved. Of more than eight entries none is
+    left out.
 
     A small system takes half a minute, most of it compilation. Lists that differ in what is left
     out, and metrics of weights, share programs: so the time of a solve contains the evaluation of
@@ -323,15 +328,15 @@ def _variants(
     return found
 
 
-def _metrics(projection: Any, metric: Any) -> dict[str, Any]:
-    """The metrics to try, by what is added to a name; none for a projection that has none."""
+def _metrics(projection: Any, metric: Any) -> dict[str, Any] | None:
+    """The metrics to try, by what is added to a name; `None` for a projection that has none."""
     if "metric" not in {x.name for x in dataclasses.fields(projection) if x.init}:
         if metric is not None:
             raise ValueError(
                 f"`projection` is a `{type(projection).__name__}`, which has no metric. Leave out "
                 "`metric`, or pass `SimplifiedNewton`."
             )
-        return {}
+        return None
     metric = projection.metric if metric is None else metric
     found = {"": None, ", metric=1.0": 1.0}
     return found if metric is None else found | {", given metric": metric}
@@ -358,7 +363,7 @@ def _report(
     task: Task,
     solver: dfx.AbstractSolver,
     variants: Callable[[dict[str, Any]], list[_Variant]],
-    metrics: dict[str, Any],
+    metrics: dict[str, Any] | None,
     entries: dict[str, Any],
     reference: dfx.AbstractSolver,
     ts: np.ndarray,
@@ -367,15 +372,18 @@ def _report(
     length = len(ts)
     known = np.asarray(plain.ts)[0, :length]
     ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
-    sizes = sizes_of(task.y0s, plain.ys)
+    sizes = sizes_of(task, plain)
     exact, rough = references(task, reference, ts, sizes)
     invariants = _invariants(task, ts, exact, sizes, entries)
     states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
 
+    counted = judged(states(plain), exact)
+
     def told(variant: _Variant, sols: dfx.Solution, seconds: float) -> tuple[ComparisonRow, Any]:
         ys, success = states(sols), np.asarray(sols.result == dfx.RESULTS.successful)
         row = ComparisonRow(
-            variant.name, variant.kept, variant.solver, distance(ys, exact), success,
+            variant.name, variant.kept, variant.solver, distance(ys, exact, counted),
+            success,
             _message(sols, success), drifts(task, sols, entries), changes(invariants, ys, sizes),
             np.asarray(sols.stats["num_steps"]), seconds,
         )  # fmt: skip
@@ -384,20 +392,21 @@ def _report(
     def tried(metrics: dict[str, Any]) -> list[tuple[ComparisonRow, Any]]:
         return [told(variant, *timed(task, variant.shared)) for variant in variants(metrics)]
 
-    def judged(found: list[tuple[ComparisonRow, Any]]) -> ComparisonReport:
+    def report_of(found: list[tuple[ComparisonRow, Any]]) -> ComparisonReport:
         rows = tuple(row for row, _ in found)
-        report = ComparisonReport(rows, ts, distance(rough, exact), len(invariants))
+        report = ComparisonReport(rows, ts, distance(rough, exact, counted), len(invariants))
         beside = ft.partial(worsened, found[0][1], exact, rough, report.last)
         rows = (dataclasses.replace(row, worsened=beside(ys)) for row, ys in found)
         return dataclasses.replace(report, rows=tuple(rows))
 
     nothing = told(_Variant(NOTHING, (), solver, solver), plain, seconds)
-    found = [nothing, *tried(metrics)]
-    report = judged(found)
+    by_sizes = {_BY_SIZES: jtu.tree_map(lambda size: size**-2, sizes)}
+    found = [nothing, *tried({} if metrics is None else metrics | by_sizes)]
+    report = report_of(found)
     # Weights by errors know the solution, so they seem better than they are elsewhere. They are
     # tried only where the projection that keeps all spoils a component.
     if metrics and report.rows[1].worsened[1] > WORSE:
-        report = judged(found + tried({_BY_ERRORS: by_errors(nothing[1], exact)}))
+        report = report_of(found + tried({_BY_ERRORS: by_errors(nothing[1], exact)}))
     return report
 
 

@@ -20,15 +20,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Args, RealScalarLike, Values
-from .._manifold import Constraint, FirstIntegral
+from .._manifold import Constraint, FirstIntegral, slope_of
+from .._tree import ravel, unravel, without_pattern
 from .drift import drift
 
 # The tolerances of the two solves that are the reference, in units of the largest values of the
 # components. Implicit methods cannot solve their equations more accurately.
 _EXPLICIT, _IMPLICIT = (1e-11, 1e-13), (1e-8, 1e-10)
-# A component that stays much smaller than others of its leaf is as accurate as if it had this share
-# of their size: what is left of it may be the roundoff of theirs.
+# A component that stays much smaller than what moves it may be the roundoff of that. So it is as
+# accurate as if it had this share of what its slope adds in a step without cancellation.
+_CANCELLED = 1e-2
+# But no component needs to be larger than this share of the largest one: of a stiff slope the terms
+# are much larger than anything in the solution.
 _SMALL = 1e-3
+# By these shares of themselves components are varied, to see the terms of a slope.
+_VARIED = 2.0**-10
 # The reference takes at most so many steps from a time to the next. An explicit method reaches them
 # where the field is stiff.
 _REFERENCE_STEPS = 20_000
@@ -105,18 +111,41 @@ def timed(task: Task, solver: dfx.AbstractSolver) -> tuple[dfx.Solution, float]:
     return sols, min(spent) / jtu.tree_leaves(task.y0s)[0].shape[0]
 
 
-def sizes_of(y0s: Any, ys: Any) -> Any:
-    """The largest value of each component as far as it is finite, and at least a share of that of
-    its leaf."""
+def sizes_of(task: Task, sols: dfx.Solution) -> Any:
+    """The largest value of each component as far as it is finite, and at least what roundoff may
+    have made of it. The leaves of a state do not matter."""
 
-    def largest(y0: Any, y: Any) -> np.ndarray:
-        size = np.abs(np.asarray(y))
-        size = np.max(size, axis=(0, 1), where=np.isfinite(size), initial=0)
-        size = np.maximum(size, np.max(np.abs(np.asarray(y0)), axis=0))
-        top = np.max(size, initial=0)
-        return np.maximum(size, _SMALL * top if top > 0 else 1.0).astype(float)
+    def largest(y: Any) -> np.ndarray:
+        size = np.abs(np.asarray(y)).astype(float)
+        return np.max(size, axis=(0, 1), where=np.isfinite(size), initial=0)
 
-    return jtu.tree_map(largest, y0s, ys)
+    start = jtu.tree_map(lambda y: y[:, None], task.y0s)
+    size = jtu.tree_map(lambda y, x: np.maximum(largest(y), largest(x)), sols.ys, start)
+    top = max(np.max(x, initial=0) for x in jtu.tree_leaves(size))
+    step = (float(task.t1) - float(task.t0)) / max(np.min(sols.stats["num_steps"]), 1)
+
+    def floored(size: np.ndarray, slope: Any) -> np.ndarray:
+        size = np.maximum(size, np.minimum(_CANCELLED * step * largest(slope), _SMALL * top))
+        return np.where(size > 0, size, 1.0)
+
+    return jtu.tree_map(floored, size, _varied(task, jnp.asarray(sols.ts), sols.ys))
+
+
+@eqx.filter_jit
+def _varied(task: Task, ts: Array, ys: Any) -> Any:
+    """By how much the slopes vary if each component varies by a share of itself, over that share.
+    This has the size of the terms of a slope before they cancel, in any units."""
+
+    def at(t: Array, y: Any) -> Any:
+        x = ravel(y)
+        share = _VARIED * without_pattern(x.size, x.dtype)
+        more, less = (
+            slope_of(task.term.vector_field, t, unravel(x * (1 + s), y), task.args)
+            for s in (share, -share)
+        )
+        return jtu.tree_map(lambda a, b: (a - b) / (2 * _VARIED), more, less)
+
+    return jax.vmap(jax.vmap(at))(ts, ys)
 
 
 @eqx.filter_jit

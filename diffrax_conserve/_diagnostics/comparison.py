@@ -1,4 +1,9 @@
-"""What `compare` returns: errors with and without projection, a sentence about them, a picture."""
+"""What `compare` returns: errors with and without projection, a sentence about them, a picture.
+
+Each component of a state is a quantity of its own here, and counts as much as any other: an error
+is a geometric mean over the components. In the ratio of two such means all units cancel, so no
+verdict depends on units, nor on how a state is packed into leaves.
+"""
 
 import dataclasses
 from typing import Any
@@ -6,7 +11,7 @@ from typing import Any
 import diffrax as dfx
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 # The name of the solve without projection.
 NOTHING = "nothing kept"
@@ -17,7 +22,8 @@ _TRUSTED = 1 / 3
 _LOST = 0.3
 # A lane that can be judged for less than this share of its interval counts as not judged.
 _SHORTEST = 0.1
-# A projection whose error differs by less than this share from that without one changes it little.
+# A projection whose error differs by less than this share from that without one changes it little,
+# if that of no component is larger by more.
 _EQUAL = 0.1
 # The least error decides only if it is smaller by this factor. Otherwise the first choice is taken,
 # which keeps more: smaller differences depend on the interval and on what is measured, and errors
@@ -26,33 +32,54 @@ _MARGIN = 1.5
 # Where a projection is about as accurate as none in the mean, it is not taken if a lane is worse by
 # this factor.
 _RISK = 1.5
-# A component that is less accurate by this factor is told, and without another gain it is a reason
-# not to project.
-WORSE = 10
+# A component that is less accurate by this factor is told, and is a reason not to project, unless
+# the error in the mean falls by the same factor.
+WORSE = 3
 # An error below this is roundoff. It stands in the place of zero, which has no logarithm.
 _TINY = 1e-18
-# A change of a conserved combination that is larger than this is more than roundoff.
+# A change of a conserved combination that is larger than this is more than roundoff; so is an error
+# that is a larger share of the largest value of its component.
 _BROKEN = 1e-11
+# So much of the largest component of all may be left in others where terms cancel.
+_CANCELLED = 1e-14
 
 
-def distance(ys: Any, exact: Any) -> Float[np.ndarray, "lanes times"]:
-    """The error of states with leading axes over lanes and times: in each leaf relative to its
-    largest component at any time, the largest of all leaves. NaN where it is not known."""
-    found = []
-    for y, x in zip(jtu.tree_leaves(ys), jtu.tree_leaves(exact), strict=True):
-        y, x = (np.asarray(a).reshape(*a.shape[:2], -1) for a in (y, x))
-        if x.shape[2]:
-            with np.errstate(invalid="ignore", over="ignore"):
-                size = np.max(np.abs(x), axis=(1, 2))
-                error = np.max(np.abs(y - x), axis=2)
-            found.append(error / np.where(size > 0, size, 1.0)[:, None])
-    return np.max(found, axis=0)
+def distance(ys: Any, exact: Any, judged: Any) -> Float[np.ndarray, "lanes times"]:
+    """The error of states with leading axes over lanes and times: the largest so far of each
+    component, relative to its largest value, in the geometric mean over those that are `judged`.
+    NaN where it is not known."""
+    y, x = _flat(ys), _flat(exact)
+    size = np.max(np.abs(x), axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = _running(np.abs(y - x)) / np.where(size == 0, 1, size)
+    return np.exp(np.mean(np.log(np.maximum(error[..., judged], _TINY)), axis=2))
+
+
+def judged(plain: Any, exact: Any) -> Bool[np.ndarray, " n"]:
+    """Which components are judged: those that have an error without projection, more than that of
+    roundoff. Others, such as parameters, tell only if they are worsened."""
+    x = _flat(exact)
+    error = np.max(np.abs(_flat(plain) - x), axis=1)
+    found = ~np.all(error <= _roundoff(x), axis=0)  # what is NaN is judged
+    return found if found.any() else ~found
+
+
+def _flat(ys: Any) -> Shaped[np.ndarray, "lanes times n"]:
+    """The components of states with leading axes over lanes and times."""
+    leaves = [np.asarray(y).reshape(*y.shape[:2], -1) for y in jtu.tree_leaves(ys)]
+    return np.concatenate(leaves, axis=2)
+
+
+def _roundoff(x: np.ndarray) -> Float[np.ndarray, "lanes n"]:
+    """An error that may be roundoff, for each component."""
+    size = np.max(np.abs(x), axis=1)
+    return np.maximum(_BROKEN * size, _CANCELLED * np.max(size, axis=1, keepdims=True)) + _TINY
 
 
 def by_errors(ys: Any, exact: Any) -> Any:
     """The weights of a metric, with a leaf for each leaf of a state: the inverse squares of the
-    largest errors of the components. Relative to the largest value of its leaf an error counts as
-    at least `√ε` of the largest of all.
+    largest errors of the components. Relative to the largest value of its component an error counts
+    as at least `√ε` of the largest of all.
 
     Of all states with the given values the nearest in this metric is the most likely one, if errors
     are independent, with these sizes.
@@ -60,7 +87,8 @@ def by_errors(ys: Any, exact: Any) -> Any:
     sizes, errors = [], []
     for y, x in zip(jtu.tree_leaves(ys), jtu.tree_leaves(exact), strict=True):
         off, size = (np.where(np.isfinite(a), np.abs(a), 0) for a in (y - x, x))
-        sizes.append(np.max(size, initial=0) or 1.0)
+        size = np.max(size, axis=(0, 1))
+        sizes.append(np.where(size > 0, size, 1.0))
         errors.append(np.max(off, axis=(0, 1)) / sizes[-1])
     top = max(np.max(e, initial=0) for e in errors) or 1.0
     leaves, tree = jtu.tree_flatten(ys)
@@ -75,23 +103,27 @@ def worsened(
     """The component that is least accurate beside the solve without projection, and by which
     factor, in the geometric mean over the lanes. Errors are the largest up to the last time that is
     judged, and count if they are larger than roundoff and than the doubt about the reference."""
-    judged, found = last > 0, [("", 1.0)]
-    if not judged.any():
-        return found[0]
-    paths, _ = jtu.tree_flatten_with_path(ys)
-    others = (jtu.tree_leaves(x) for x in (plain, rough, exact))
-    for (path, y), before, doubt, x in zip(paths, *others, strict=True):
-        early = (np.arange(y.shape[1]) <= last[:, None]).reshape(y.shape[:2] + (1,) * (y.ndim - 2))
-        largest = lambda a, early=early: np.max(np.abs(a), 1, where=early, initial=0)[judged]  # noqa: E731
-        least = np.maximum(3 * largest(doubt - x), _BROKEN * np.max(largest(x), initial=0)) + _TINY
-        now, then = (np.maximum(largest(a - x), least) for a in (y, before))
-        # A lane that failed tells nothing here.
-        factor = np.exp(np.mean(np.nan_to_num(np.log(now / then)), axis=0))
-        if factor.size:
-            place = np.unravel_index(np.argmax(factor), factor.shape)
-            where = f"[{', '.join(map(str, place))}]" if place else ""
-            found.append((f"y{jtu.keystr(path)}{where}", float(np.max(factor))))
-    return max(found, key=lambda pair: pair[1])
+    lanes = last > 0
+    if not lanes.any():
+        return "", 1.0
+    early = (np.arange(_flat(ys).shape[1]) <= last[:, None])[..., None]
+    y, before, x, doubt = (_flat(a) for a in (ys, plain, exact, rough))
+    largest = lambda a: np.max(np.abs(a), 1, where=early, initial=0)[lanes]  # noqa: E731
+    least = np.maximum(3 * largest(doubt - x), _roundoff(np.where(early, x, 0))[lanes])
+    now, then = (np.maximum(largest(a - x), least) for a in (y, before))
+    # A lane that failed tells nothing here.
+    factor = np.exp(np.mean(np.nan_to_num(np.log(now / then)), axis=0))
+    most = int(np.argmax(factor))
+    return (_names(ys)[most], float(factor[most])) if factor[most] > 1 else ("", 1.0)
+
+
+def _names(ys: Any) -> list[str]:
+    """The names of the components of a state, such as `y['q'][1, 2]`."""
+    found = []
+    for path, y in jtu.tree_flatten_with_path(ys)[0]:
+        places = (", ".join(map(str, place)) for place in np.ndindex(y.shape[2:]))
+        found += [f"y{jtu.keystr(path)}" + (f"[{place}]" if place else "") for place in places]
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,14 +133,15 @@ class ComparisonRow:
     - `name`: such as `"all but energy, metric=1.0"`.
     - `kept`: the names of the entries that it keeps.
     - `solver`: itself, ready for `diffrax.diffeqsolve`.
-    - `errors`: the error of the state in each lane at each time.
+    - `errors`: the error of the state in each lane up to each time.
     - `success`, `message`: whether each lane succeeded, and why the first of the others did not.
     - `drift`: the largest drift of each entry in each lane, kept or not.
     - `linear`: the largest change in each lane of linear invariants that nobody declared.
     - `steps`: the number of steps in each lane; `seconds`: the time of one solve.
     - `worsened`: the component that is least accurate beside the solve without projection, and by
-        which factor. What is smaller than roundoff, 1e-11 of the largest component of its leaf, or
-        than the doubt about the reference, counts as that large.
+        which factor. What is smaller than roundoff, 1e-11 of the largest value of the component and
+        1e-14 of that of all components, or than the doubt about the reference, counts as that
+        large.
     """
 
     name: str
@@ -162,16 +195,8 @@ class ComparisonReport:
     def error(self) -> Float[np.ndarray, "rows lanes"]:
         """The largest error of each row and lane up to the last time that is judged: infinite if
         the solve failed, NaN if nothing is judged."""
-        return self._at_last([_so_far(row) for row in self.rows])
-
-    @property
-    def error_at_end(self) -> Float[np.ndarray, "rows lanes"]:
-        """The error of each row and lane at the last time that is judged."""
-        return self._at_last([np.where(r.success[:, None], r.errors, np.inf) for r in self.rows])
-
-    def _at_last(self, errors: list[np.ndarray]) -> np.ndarray:
-        last = self.last
-        found = np.stack(errors)[:, np.arange(len(last)), last]
+        last, lanes = self.last, np.arange(self.doubt.shape[0])
+        found = np.stack([_so_far(row) for row in self.rows])[:, lanes, last]
         return np.where(last > 0, found, np.nan)
 
     @property
@@ -304,9 +329,11 @@ class ComparisonReport:
         ]
 
     def _units(self) -> list[str]:
+        handed = "is `report.solver.projection.metric`"
         about = {
             "metric=1.0": "depends on the units of the state",
-            "metric by errors": "is `report.solver.projection.metric`",
+            "metric by sizes": handed,
+            "metric by errors": handed,
         }
         return [
             f"`{name}` {words}." for name, words in about.items() if name in (self.choice or "")
@@ -314,7 +341,7 @@ class ComparisonReport:
 
     def __str__(self) -> str:
         lanes = self.doubt.shape[0]
-        head = ["error", "at the end"] if lanes == 1 else ["error", "worst", "worse"]
+        head = ["error"] if lanes == 1 else ["error", "worst", "worse"]
         head += [f"drift of {name}" for name in self.rows[0].drift]
         head += ["linear"] * (self.num_linear > 0) + ["steps", "time"]
         width = max(len(row.name) for row in self.rows)
@@ -327,7 +354,7 @@ class ComparisonReport:
     def _cells(self, i: int) -> list[str]:
         row, error, first = self.rows[i], self.error, self.error[0]
         if error.shape[1] == 1:
-            found = [_number(error[i, 0]), _number(self.error_at_end[i, 0])]
+            found = [_number(error[i, 0])]
         else:
             judged = self.last > 0
             worse = np.mean(error[i, judged] > first[judged]) if judged.any() else np.nan
@@ -388,7 +415,7 @@ def _mean(errors: np.ndarray) -> float:
 def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     """Of the rows that fail in the fewest lanes, the first with a projection of which the geometric
     mean of the errors is about the least; if none gains, the first that changes little, in every
-    component."""
+    component. What spoils a component must gain as much in the mean, and comes last."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
     failures = np.sum(np.isinf(error), axis=1)
     able = np.flatnonzero(failures == failures.min())
@@ -396,13 +423,17 @@ def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     if not common.any():
         return None
     means = {int(i): _mean(error[i, common]) for i in able}
+    spoils = lambda i: worsened[i] > WORSE  # noqa: E731
+    if 0 in means:
+        means = {i: x for i, x in means.items() if not spoils(i) or WORSE * x < means[0]}
     near = [i for i, mean in means.items() if mean <= _MARGIN * min(means.values())]
+    near.sort(key=spoils)
     if 0 not in means:
         return near[0]
     worst = {i: np.max(error[i, common] / error[0, common]) for i in means}
     gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
     little = [i for i in near if means[i] <= (1 + _EQUAL) * means[0]]
-    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= WORSE]
+    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= 1 + _EQUAL]
     return next((i for i in [*gains, *equal] if i > 0), 0)
 
 

@@ -36,9 +36,12 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
 
     where $(t_0, y_0)$ is the first saved state and $I_0 = I(t_0, y_0)$, or the integral's `value`;
     for a `Constraint` it is $g(t_k, y_k)$ over the same scale with $I_0 = 0$, to which roundoff is
-    proportional. All components of a vector have the largest scale among them, because a component
-    may be zero at the start, as those of an angular momentum in a plane. Where all these terms are
-    zero, as of the momentum of bodies at rest, the drift is absolute, in the units of the function.
+    proportional. Each component of a value has a scale of its own, so that it does not matter
+    whether a function returns several values as one array or in a dictionary. Only a component with
+    less than $\sqrt\varepsilon$ of the largest scale in its array has that one: it may be zero at
+    the start but for roundoff, as those of an angular momentum in a plane. Where all these terms
+    are zero, as of the momentum of bodies at rest, the drift is absolute, in the units of the
+    function.
     From the numerator the integral of a `rate` from $t_0$ to $t_k$ is subtracted, computed along
     the dense output, which the solution must then have.
 
@@ -82,7 +85,12 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
     """
     ts, ys, values, residual = _residuals(sol, manifold, args, "drift")
     _, scale = measure(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
-    scale = jtu.tree_map(lambda s: jnp.max(s, initial=0), scale)
+
+    def own(scale: Array) -> Array:
+        most = jnp.max(scale, initial=0)
+        return jnp.where(scale < jnp.finfo(scale.dtype).eps ** 0.5 * most, most, scale)
+
+    scale = jtu.tree_map(own, scale)
     return jax.vmap(lambda t, y: relative(residual(t, y), scale))(ts, ys)
 
 

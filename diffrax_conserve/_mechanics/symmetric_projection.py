@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._balance import refuse_rates
@@ -29,6 +30,10 @@ from .._solver.terms import check_nested, innermost, refuse_backsolve, time_dire
 from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
+
+# Methods of even order without coefficients to judge by: two that undo their steps only with their
+# memory, which a projection at both ends discards, and those for Langevin's equation.
+_NOT_SYMMETRIC = dfx.LeapfrogMidpoint, dfx.ReversibleHeun, dfx.AbstractFosterLangevinSRK
 
 
 class _State(eqx.Module):
@@ -204,9 +209,10 @@ SymmetricProjection.__init__.__doc__ = r"""**Arguments:**
 
 **Raises:**
 
-`ValueError` if `solver` is known not to be symmetric: a solver of diffrax, a Runge-Kutta method
-whose coefficients tell, or a projection. Of other methods it cannot be told: try a solve forwards
-and backwards. `TypeError` or `ValueError` if another argument does not fit.
+`ValueError` if `solver` is known not to be symmetric: by its `tableau`, if it is a Runge-Kutta
+method with one, by its order, if that is odd, because it has a memory, or because it is a
+projection. Of other methods it cannot be told: try a solve forwards and backwards. `TypeError` or
+`ValueError` if another argument does not fit.
 """
 
 
@@ -271,11 +277,38 @@ def _check_symmetric(solver: Any) -> None:
     remedy = "Pass a symmetric one-step method, such as `diffrax_conserve.ImplicitMidpoint()`"
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"`solver` is `{name}`, which is not a diffrax solver. {remedy}.")
-    inner = innermost(solver)
     projects = issubclass(type(solver), ForwardingSolver)  # which `isinstance` would not tell
-    explicit = type(inner).__module__.startswith(("diffrax.", "diffrax_conserve._solver."))
-    if projects or explicit:
+    if projects or _is_known_unsymmetric(innermost(solver)):
         raise ValueError(
             f"`solver` is {name}, which is not symmetric: a step backwards does not undo a step, "
             f"and no projection changes that. {remedy}, or use `ManifoldProjection`."
         )
+
+
+def _is_known_unsymmetric(solver: dfx.AbstractSolver) -> bool:
+    """By the coefficients of a Runge-Kutta method, and of any method by its order, which is even if
+    it is symmetric (Hairer, Lubich and Wanner, II.3)."""
+    if isinstance(solver, _NOT_SYMMETRIC):
+        return True
+    tableau = getattr(solver, "tableau", None)
+    if tableau is not None:
+        tableaus = getattr(tableau, "tableaus", (tableau,))
+        return not all(map(_is_symmetric, tableaus))
+    order = solver.order(dfx.ODETerm(lambda t, y, args: y))
+    return order is not None and order % 2 == 1
+
+
+def _is_symmetric(tableau: Any) -> bool:
+    """Whether `a_{s+1-i,s+1-j} + a_{ij} = b_j` for the stages that the step uses (Hairer, Lubich
+    and Wanner, V.2.1). No explicit method satisfies it."""
+    if not isinstance(tableau, dfx.ButcherTableau):
+        return False  # those of diffrax for noise are explicit
+    b = tableau.b_sol
+    a = np.zeros((b.size, b.size)) if tableau.a_diagonal is None else np.diag(tableau.a_diagonal)
+    for i, row in enumerate(tableau.a_lower, 1):
+        a[i, :i] = row
+    used = b != 0
+    for _ in range(b.size):
+        used = used | np.any(a[used] != 0, axis=0)
+    a, b = a[used][:, used], b[used]
+    return np.allclose(a[::-1, ::-1] + a, b, rtol=0, atol=1e-12)

@@ -214,11 +214,66 @@ class Trapezoidal(dfx.AbstractESDIRK):
         return 2
 
 
+class MyHeun(dfx.AbstractERK):
+    """A user's own explicit method, with the weights of the trapezoidal rule."""
+
+    tableau = dfx.ButcherTableau(
+        c=np.array([1.0]), b_sol=np.array([0.5, 0.5]), b_error=np.array([0.5, -0.5]),
+        a_lower=(np.array([1.0]),),
+    )  # fmt: skip
+    interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 2
+
+
+class TwoMidpoints(dfx.AbstractDIRK):
+    """Two half steps of the implicit midpoint rule, and a stage that only estimates the error."""
+
+    tableau = dfx.ButcherTableau(
+        c=np.array([0.75, 1.0]), b_sol=np.array([0.5, 0.5, 0.0]),
+        b_error=np.array([0.5, 0.0, -0.5]), a_lower=(np.array([0.5]), np.array([0.5, 0.5])),
+        a_diagonal=np.array([0.25, 0.25, 0.0]), c1=0.25,
+        a_predictor=(np.array([1.0]), np.array([0.0, 1.0])),
+    )  # fmt: skip
+    interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+    root_finder: optx.AbstractRootFinder = optx.Newton(rtol=1e-14, atol=1e-15)
+    root_find_max_steps: int = 20
+
+    def order(self, terms):
+        return 2
+
+
+ASYMMETRIC = dfx.Kvaerno3(root_finder=dfx.VeryChord(rtol=1e-13, atol=1e-14))
+
+
+@pytest.mark.parametrize(
+    "solver", [dfc.ImplicitMidpoint(), Trapezoidal(), TwoMidpoints(), MyHeun(), ASYMMETRIC]
+)
+def test_the_coefficients_say_what_a_step_back_does(solver):
+    """Symmetric is what undoes its step, whether a class is diffrax's, ours or a user's."""
+    term = dfx.ODETerm(rigid_body)
+
+    def step(t0, t1, y0):
+        state = solver.init(term, t0, t1, y0, None)
+        return solver.step(term, t0, t1, y0, None, state, made_jump=True)[0]
+
+    start, end = jnp.array(0.0), jnp.array(0.1)
+    undone = bool(difference(step(end, start, step(start, end, W0)), W0) < 1e-13)
+    if undone:
+        dfc.SymmetricProjection(solver, KEPLER)
+    else:
+        with pytest.raises(ValueError, match="not symmetric"):
+            dfc.SymmetricProjection(solver, KEPLER)
+    assert undone is not isinstance(solver, (MyHeun, dfx.Kvaerno3))
+
+
 def test_what_is_admissible():
     for solver in (
         dfx.Tsit5(), dfx.Euler(), dfx.Kvaerno3(), dfx.SemiImplicitEuler(), dfx.LeapfrogMidpoint(),
         dfx.ReversibleHeun(), dfx.ImplicitEuler(), dfx.HalfSolver(dfx.Heun()), dfc.RK4(),
-        dfc.Unrolled(dfx.Tsit5()), dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER),
+        dfc.Unrolled(dfx.Tsit5()), dfc.Radau(), dfx.KenCarp3(),
+        dfc.ManifoldProjection(dfc.ImplicitMidpoint(), KEPLER),
     ):  # fmt: skip
         with pytest.raises(ValueError, match="not symmetric"):
             dfc.SymmetricProjection(solver, KEPLER)
