@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
 from diffrax_conserve._numerics import linear, problem
 
 from ..problems import EPS
