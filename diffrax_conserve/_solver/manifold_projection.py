@@ -1,6 +1,8 @@
 """The wrapper that makes any diffrax solver keep its solution on a manifold."""
 
-from typing import Any, final
+import dataclasses
+import functools as ft
+from typing import Any, NamedTuple, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -21,7 +23,7 @@ from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._tree import ravel, unravel
+from .._tree import ravel, tree_add, unravel
 from .failure import (
     end_of_step,
     failure_cause,
@@ -197,7 +199,7 @@ class ManifoldProjection(ForwardingSolver):
             end=jnp.full_like(none, jnp.inf),
             first_step=jnp.abs(t1 - t0),
             statistics=statistics,
-            preferred=jnp.zeros((2 * _CHANGES, y.size), y.dtype) if self.keep_linear else None,
+            preferred=first_changes(terms, t0, t1, y0, args) if self.keep_linear else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -212,50 +214,56 @@ class ManifoldProjection(ForwardingSolver):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
         state = self._checked(solver_state)
-        jumped = made_jump if self._keeps_stage else True
-        given = terms, t0, t1, y0, args, state.inner, jumped
-        proposed, inner_error, inner_info, inner, result = self.solver.step(*given)
-
-        # From here on states are vectors, and times those of the vector field.
-        sign = time_direction(terms, t0)
-        error = None if inner_error is None else ravel(inner_error)
-        step, candidate = Step(t0 * sign, t1 * sign, ravel(y0), error), ravel(proposed)
-        # The dense output of the step is rarely needed, so it is made when it is called.
-        path = lambda t: ravel(  # noqa: E731
-            self.solver.interpolation_cls(t0=t0, t1=t1, **inner_info).evaluate(t * sign)
-        )
-        before, units, preferred = self._target(terms, state, step, candidate, path, y0, args)
-        target = before.advanced(step.t0, step.t1, path)
-
-        problem = target.problem(step.t1, candidate, step)
-        y1, info = self.projection.solve(problem, candidate)
-
-        metric = before.metric(step.t0, step.y0)
-        cause, final = self._verdict(before, state, step, candidate, y1, info, made_jump)
-        y1, result = end_of_step(cause, y1, result)
-
+        proposal = self._proposal(terms, t0, t1, y0, args, state.inner, made_jump)
+        step, candidate = proposal.step, proposal.candidate
+        # Dense output starts from this target, to integrate balances to any time in the step.
+        state, start = self._target(terms, state, proposal, y0, args)
+        target = start.advanced(step.t0, step.t1, proposal.path)
+        y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
+        cause, final = self._verdict(start, state, proposal, y1, info, made_jump)
+        y1, result = end_of_step(cause, y1, proposal.result)
+        metric = start.metric(step.t0, step.y0)
         dense_info = dict(
-            inner=inner_info,
-            direction=sign,
+            inner=proposal.dense_info,
+            direction=proposal.direction,
             shift=y1 - candidate,
             limit=step_length(step.y0, y1, metric),
-            error=error if self.projection.sees_step else None,
-            target=Packed(before),
+            error=step.error if self.projection.sees_step else None,
+            target=Packed(start),
         )
-        length = None if error is None else metric.length(error)
-        state = State(
-            inner=inner,
-            values=state.values,
-            cancellation=state.cancellation,
+        length = None if step.error is None else metric.length(step.error)
+        state = dataclasses.replace(
+            state,
+            inner=proposal.inner,
             gained=target.gained,
-            units=units,
             end=y1,
-            first_step=state.first_step,
             statistics=state.statistics.add(info, length),
-            preferred=preferred,
         )
-        error = reported_error(cause, final, inner_error)
+        error = reported_error(cause, final, proposal.error)
         return unravel(y1, y0), error, dense_info, state, result
+
+    def _proposal(
+        self,
+        terms: PyTree[dfx.AbstractTerm],
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        inner: Any,
+        made_jump: BoolScalarLike,
+    ) -> "_Proposal":
+        """The step of the wrapped solver. From here on states are vectors, and times those of the
+        vector field."""
+        jumped = made_jump if self._keeps_stage else True
+        y1, error, dense_info, inner, result = self.solver.step(
+            terms, t0, t1, y0, args, inner, jumped
+        )
+        sign = time_direction(terms, t0)
+        step = Step(t0 * sign, t1 * sign, ravel(y0), None if error is None else ravel(error))
+        # The dense output of the step is rarely needed, so it is made when it is called.
+        interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
+        path = lambda t: ravel(interpolation().evaluate(t * sign))  # noqa: E731
+        return _Proposal(step, ravel(y1), path, error, dense_info, inner, result, sign)
 
     @property
     def _keeps_stage(self) -> bool:
@@ -288,23 +296,20 @@ class ManifoldProjection(ForwardingSolver):
         self,
         terms: PyTree[dfx.AbstractTerm],
         state: State,
-        step: Step,
-        candidate: Float[Array, " n"],
-        path: Path,
+        proposal: "_Proposal",
         like: Y,
         args: Args,
-    ) -> tuple[Target, Float[Array, " n"], Float[Array, "k n"] | None]:
-        """The target at the start of a step, from which dense output integrates balances to any
-        time in the step; the units of the metric of motion; and the preferred directions.
+    ) -> tuple[State, Target]:
+        """The state with the units and directions of this step, and the target at its start.
 
         Noise has no metric of motion: with noise the metric decides which equation is solved, and
         that must not depend on the path.
         """
+        step, candidate, preferred = proposal.step, proposal.candidate, state.preferred
         changes = component_changes(step.y0, candidate)
         units = units_after(state.units, changes, candidate, like)
-        preferred = state.preferred
         if preferred is not None:
-            new = changes_along(path, step)
+            new = changes_along(proposal.path, step)
             preferred = jnp.concatenate([new, preferred[:_CHANGES]])
         target = Target(
             self.projection,
@@ -318,20 +323,20 @@ class ManifoldProjection(ForwardingSolver):
             gained=state.gained,
             preferred=preferred,
         )
-        return target.following(step.t0, step.y0), units, preferred
+        state = dataclasses.replace(state, units=units, preferred=preferred)
+        return state, target.following(step.t0, step.y0)
 
     def _verdict(
         self,
         target: Target,
         state: State,
-        step: Step,
-        candidate: Float[Array, " n"],
+        proposal: "_Proposal",
         y1: Float[Array, " n"],
         info: ProjectionInfo,
         made_jump: BoolScalarLike,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether a shorter step would not be better."""
-        first = jnp.all(state.end == jnp.inf)
+        step, candidate = proposal.step, proposal.candidate
         cannot_start = self._cannot_start(target, state, step, made_jump)
         changes, length = component_changes(step.y0, candidate), step.t1 - step.t0
         time = jnp.maximum(jnp.abs(step.t1), state.first_step)
@@ -342,6 +347,7 @@ class ManifoldProjection(ForwardingSolver):
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_length(step.y0, candidate, metric)
             too_far = metric.length(correction) > limit
+        first = jnp.all(state.end == jnp.inf)
         given = info.ok, cannot_start, state.values, correction, too_far
         return failure_cause(*given, hopeless=first | final), final
 
@@ -363,6 +369,44 @@ class ManifoldProjection(ForwardingSolver):
             lambda: jnp.asarray(False),
         )
         return lost | (fresh & off)
+
+
+def first_changes(
+    terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+) -> Float[Array, "k n"]:
+    """Two steps of Euler's method, in the place of the changes in the step before the first. A
+    method of one stage has a single slope in its first step, along which what is conserved hardly
+    changes, so that a correction would undo the step."""
+    y = ravel(y0)
+    changes = jnp.zeros((2 * _CHANGES, y.size), y.dtype)
+    if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):
+        return changes
+    control = terms.contr(t0, t1)
+    first = terms.vf_prod(t0, y0, args, control)
+    second = terms.vf_prod(t1, tree_add(y0, first), args, control)
+    found = jnp.stack([ravel(first), ravel(second)])
+    return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
+
+
+class _Proposal(NamedTuple):
+    """What the wrapped solver proposes.
+
+    - `step`: the step, as a projection sees it.
+    - `candidate`: the state at its end.
+    - `path`: its dense output, as a function from times to states.
+    - `error`, `dense_info`, `inner`, `result`: the error estimate, dense output, solver state and
+      result, as the wrapped solver returns them.
+    - `direction`: -1 if the solver's time is the negative of that of the vector field, otherwise 1.
+    """
+
+    step: Step
+    candidate: Float[Array, " n"]
+    path: Path
+    error: Y | None
+    dense_info: DenseInfo
+    inner: Any
+    result: dfx.RESULTS
+    direction: RealScalarLike
 
 
 def changes_along(path: Path, step: Step) -> Float[Array, "k n"]:

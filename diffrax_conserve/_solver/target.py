@@ -87,7 +87,8 @@ class Target(eqx.Module):
     def problem(
         self, t: RealScalarLike, y: Float[Array, " n"], step: Step | None = None
     ) -> Problem:
-        """The problem at a time, with the metric at a state."""
+        """The problem at a time, with the metric at a state, and the step if the projection uses
+        it."""
         values, cancellation = self.values, self.cancellation
         if self.gained is not None:
             # An energy that has been lost leaves a small value, which is a difference of large
@@ -95,6 +96,7 @@ class Target(eqx.Module):
             values = values + self.gained[0]
             lost = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
             cancellation = cancellation + lost
+        step = step if self.projection.sees_step else None
         fields = dict(factor=self.factor, changes=self.changes, step=step)
         problem = problem_of(self.manifold, values, t, self.like, self.args, cancellation, **fields)
         problem = adapted(problem, self.projection, y)
@@ -107,13 +109,3 @@ class Target(eqx.Module):
         """The factor of the metric of the projection."""
         own = self.projection.metric
         return self.factor if own is None else factor_of(own, t, unravel(y, self.like), self.args)
-
-    def step(
-        self,
-        start: RealScalarLike,
-        end: RealScalarLike,
-        y0: Float[Array, " n"],
-        error: Float[Array, " n"] | None,
-    ) -> Step | None:
-        """The `Step` for a projection whose `sees_step` is true, otherwise `None`."""
-        return Step(start, end, y0, error) if self.projection.sees_step else None
