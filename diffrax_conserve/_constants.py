@@ -22,7 +22,7 @@ FROZEN_STEPS = 6
 # A correction that does not help is shortened to this share of itself. A half needs twice as many
 # evaluations where it is far too long, and a much smaller share gives away corrections that would
 # do.
-SHORTER = 1 / 4
+BACKTRACKING_FACTOR = 1 / 4
 # Up to this many constraints the elimination is written out, element by element, so that XLA fuses
 # it with what is around it. A call of LAPACK would take most of the time of a small projection.
 WRITTEN_OUT = 4

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree, Real
 
 from ._custom_types import DenseInfo, RealScalarLike
-from ._numerics.iterate import any_lane, damped
+from ._numerics.iterate import any_lane, damped_newton
 from ._numerics.problem import Step
 from ._time import nonzero_length
 from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
@@ -117,7 +117,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         still, start = tree_stop_gradient((problem, candidate))
 
         def again() -> tuple[Array, Array]:
-            found = damped(still, start, max_steps=projection.max_steps)
+            found = damped_newton(still, start, max_steps=projection.max_steps)
             return found.y, near(found.y, found.ok)
 
         # A condition that is the same for all lanes of a batch remains a branch, which is skipped

@@ -110,7 +110,7 @@ class Constraint(Hashable):
             ```
         """
         check_vector_field(vector_field)
-        return Constraint(Along(self.fn, vector_field))
+        return Constraint(LieDerivative(self.fn, vector_field))
 
 
 Constraint.__init__.__doc__ = r"""**Arguments:**
@@ -120,7 +120,7 @@ Constraint.__init__.__doc__ = r"""**Arguments:**
 """
 
 
-class Along(eqx.Module):
+class LieDerivative(eqx.Module):
     """The derivative of a function along a vector field, `∂_t g + ∂_y g · f`, by one forward pass.
     It is a module and not a closure, so that JAX compiles it once for equal functions."""
 

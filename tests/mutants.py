@@ -109,7 +109,7 @@ def do_not_project_the_interpolant(package):
 
 
 def call_nan_a_success(package):
-    @package.around("Equations.level")
+    @package.around("Problem.level")
     def _(level, self, *values):
         return level(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
 
@@ -212,7 +212,7 @@ def leave_what_was_added_to_the_diagonal(package):
 
 
 def divide_by_the_roundoff_of_a_pivot(package):
-    package.in_module_of("eliminated", "ROUNDOFF", 0)
+    package.in_module_of("forward_elimination", "ROUNDOFF", 0)
 
 
 def eliminate_in_the_given_order(package):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import ROUNDOFF, SHORTER
+from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
 from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
 from .._numerics.problem import gradient_scale
 from .._numerics.roundoff import cancellation_terms
@@ -118,9 +118,10 @@ def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> S
         # helping.
         stuck = ~better & (before <= eps**0.5)
         # A share of the root of roundoff still changes half of the digits of the unknown.
-        going = ~stuck & (before < jnp.inf) & (better | (share * SHORTER > eps**0.5))
+        going = ~stuck & (before < jnp.inf) & (better | (share * BACKTRACKING_FACTOR > eps**0.5))
         z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
-        share = jnp.where(better, jnp.minimum(share / SHORTER, 1), share * SHORTER)
+        longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
+        share = jnp.where(better, longer, shorter)
         at_rest = (settled | (~going & (before < jnp.inf))) & factored.regular()
         return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
 

@@ -317,13 +317,13 @@ class SparseRows(eqx.Module):
         dense = self.dense / sizes[self.pattern.dense_rows, None]
         return sizes, SparseRows(self.colours / size, dense, self.pattern)
 
-    def times(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    def matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """`U x`."""
         products = self.times_columns(x)
         blocks = jnp.sum(_take(products.colours, self.pattern.elements), axis=2)
         return self.pattern.joined(blocks, jnp.sum(products.dense, axis=1))
 
-    def combined(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
+    def rmatvec(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
         """`Uᵀ λ`."""
         active = jnp.sum(_take(multiplier, self.pattern.owners) * self.colours, axis=0)
         dense = multiplier[self.pattern.dense_rows, None] * self.dense
@@ -348,8 +348,8 @@ class SparseRows(eqx.Module):
 
             following = coupling(ours, theirs)
             preceding = jnp.swapaxes(coupling(theirs, ours), 1, 2)
-        columns = jax.vmap(lambda x: self.pattern.taken_apart(self.times(x))[0], out_axes=-1)
-        rows = jax.vmap(lambda x: self.pattern.taken_apart(others.times(x))[0])
+        columns = jax.vmap(lambda x: self.pattern.taken_apart(self.matvec(x))[0], out_axes=-1)
+        rows = jax.vmap(lambda x: self.pattern.taken_apart(others.matvec(x))[0])
         return BlockGram(
             diagonal,
             following,
@@ -385,11 +385,11 @@ class BlockGram(eqx.Module):
     def __len__(self) -> int:
         return self.pattern.size
 
-    def times(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+    def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
         """`U Vᵀ x`."""
         if self.factors is not None:
             left, right = self.factors
-            return left.times(right.combined(x))
+            return left.matvec(right.rmatvec(x))
         blocks, dense = self.pattern.taken_apart(x)
         products = _times(self.diagonal, blocks) + self.columns @ dense
         if self.following is not None and self.preceding is not None:
@@ -398,7 +398,7 @@ class BlockGram(eqx.Module):
         below = jnp.einsum("dij,ij->d", self.rows, blocks) + self.corner @ dense
         return self.pattern.joined(products, below)
 
-    def factored(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
+    def factorise(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
         """The solution of the system, as a function of its right side. Dense rows are eliminated
         last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
         block = self.diagonal.shape[1]
@@ -437,7 +437,7 @@ class BlockGram(eqx.Module):
 
         def product(left: SparseRows, right: SparseRows, x: Array) -> Array:
             return self.pattern.taken_apart(
-                left.times(right.combined(self.pattern.joined(x, zero)))
+                left.matvec(right.rmatvec(self.pattern.joined(x, zero)))
             )[0]
 
         def solve(product: Callable[[Array], Array], b: Array) -> Array:

@@ -31,12 +31,12 @@ from .._numerics.iterate import Solved, after_test, iterate, keep_done
 from .._numerics.linear import (
     Factors,
     Solve,
-    combined,
-    factored,
+    factorise,
     gram_matrix,
-    refined,
+    iterative_refinement,
+    matvec,
+    rmatvec,
     solve,
-    times,
 )
 from .._numerics.metric import Diagonal, spread
 from .._numerics.problem import Jacobian, Problem, gradient_scale, problem_of
@@ -64,7 +64,7 @@ class _Linear(eqx.Module):
     def solve(self) -> Solve:
         """The solution of the system, as a function of its right side."""
         fixed = lax.stop_gradient(self.factors)
-        return fixed.factored() if isinstance(fixed, BlockGram) else fixed
+        return fixed.factorise() if isinstance(fixed, BlockGram) else fixed
 
 
 class _State(eqx.Module):
@@ -227,10 +227,10 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
-        squares = jax.tree.map(jnp.square, problem.factor.of_rows(at.jacobian))
-        lengths = jnp.sqrt(times(squares, jnp.ones_like(ravel(v))))
+        squares = jax.tree.map(jnp.square, problem.factor.scale_columns(at.jacobian))
+        lengths = jnp.sqrt(matvec(squares, jnp.ones_like(ravel(v))))
         limit = lengths * problem.factor.length(drift(ravel(v))) + jnp.abs(rate)
-        moves = rate + times(at.jacobian, drift(ravel(v)))
+        moves = rate + matvec(at.jacobian, drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | is_off_manifold(problem, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
@@ -308,7 +308,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
-        forces = problem.factor.of_rows(problem.factor.of_rows(jacobian))
+        forces = problem.factor.scale_columns(problem.factor.scale_columns(jacobian))
         if isinstance(jacobian, SparseRows):
             speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
             return jacobian.gram(forces.times_columns(speeds))
@@ -331,7 +331,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         t = t * direction
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
         gram = _once(lax.stop_gradient(self._gram(problem, jacobian, drift, p)))
-        factors: Any = gram if isinstance(gram, BlockGram) else _once(factored(gram))
+        factors: Any = gram if isinstance(gram, BlockGram) else _once(factorise(gram))
         return _Linear(jacobian, factors), rate
 
 
@@ -357,7 +357,7 @@ _once = lax.optimization_barrier
 
 def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
     """`M⁻¹ Gᵀ λ`."""
-    return problem.factor.of_rows(problem.factor.of_rows(combined(multiplier, rows)))
+    return problem.factor.scale_columns(problem.factor.scale_columns(rmatvec(rows, multiplier)))
 
 
 def _shaken(
@@ -377,7 +377,7 @@ def _shaken(
         once more, for the change of the constraints that the solution causes: in that there is no
         contradiction. Up to four constraints have no such part."""
         x = solve(g)
-        return x if len(g) <= WRITTEN_OUT else solve(times(at.jacobian, moves(x)))
+        return x if len(g) <= WRITTEN_OUT else solve(matvec(at.jacobian, moves(x)))
 
     def advance(x: Array, counter: Array) -> tuple[Array, Array]:
         g = _once(problem.residual(_once(position(x))))
@@ -398,12 +398,12 @@ def _on_tangent(
     def product(x: Array) -> Array:
         """`G M⁻¹ Gᵀ x`, for momenta with the masses in `drift`, which is linear."""
         change = _impulse(problem, x, at.jacobian)
-        return times(at.jacobian, jax.jvp(drift, (p,), (change,))[1])
+        return matvec(at.jacobian, jax.jvp(drift, (p,), (change,))[1])
 
     def iterated(product: Any, b: Array) -> Array:
-        return refined(solve, product, b)
+        return iterative_refinement(solve, product, b)
 
-    wrong = rate + times(at.jacobian, drift(p))
+    wrong = rate + matvec(at.jacobian, drift(p))
     x = lax.custom_linear_solve(product, -wrong, iterated, iterated, symmetric=True)
     v = p + _impulse(problem, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
@@ -411,4 +411,4 @@ def _on_tangent(
     terms = _impulse(problem, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
     sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
     limit = problem.tolerance(jnp.abs(rate) + gradient_scale(at.jacobian, sizes))
-    return v, jnp.all(jnp.abs(rate + times(at.jacobian, drift(v))) <= limit)
+    return v, jnp.all(jnp.abs(rate + matvec(at.jacobian, drift(v))) <= limit)

@@ -18,8 +18,15 @@ from .._interpolation import Packed
 from .._manifold import check_manifold
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._numerics.linear import combined, gram_matrix, saddle, scaled_rows, solve, times
-from .._numerics.problem import NOT_FINITE, OFF, ON, SETTLED, Problem, problem_of
+from .._numerics.linear import gram_matrix, matvec, rmatvec, scaled_rows, solve, solve_kkt
+from .._numerics.problem import (
+    ABOVE_TOLERANCE,
+    AT_ROUNDOFF,
+    NOT_FINITE,
+    WITHIN_TOLERANCE,
+    Problem,
+    problem_of,
+)
 from .._projection.base import adapted
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
@@ -176,7 +183,7 @@ class SymmetricProjection(ForwardingSolver):
             residual,
             ft.partial(_solved, start, end, inner, vector, self.projection.max_steps),
             (vector, state.multiplier),
-            ft.partial(saddle, vector.size),
+            ft.partial(solve_kkt, vector.size),
         )
         info = end.report(candidate, y1, num_iterations, ok=ok)
         off = is_off_manifold(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
@@ -219,7 +226,7 @@ projection. Of other methods it cannot be told: try a solve forwards and backwar
 def _along(problem: Problem, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(problem.residual, y)
-    return problem.factor.of_change(problem.factor.of_rows(vjp(multiplier)[0]))
+    return problem.factor.to_state(problem.factor.scale_columns(vjp(multiplier)[0]))
 
 
 def _solved(
@@ -232,26 +239,28 @@ def _solved(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = scaled_rows(start.factor.of_rows(start.linearise(y0)[1]))
+    sizes, first = scaled_rows(start.factor.scale_columns(start.linearise(y0)[1]))
     gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
 
     def stepped(multiplier: Array, rows: Array | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to
         compute that end, so they are those of the last unknowns, or at the candidate."""
-        candidate, result = inner(y0 + start.factor.of_change(combined(multiplier * sizes, first)))
-        rows = end.factor.of_rows(end.linearise(candidate)[1]) if rows is None else rows
-        y = candidate + end.factor.of_change(combined(multiplier, rows))
+        candidate, result = inner(y0 + start.factor.to_state(rmatvec(first, multiplier * sizes)))
+        rows = end.factor.scale_columns(end.linearise(candidate)[1]) if rows is None else rows
+        y = candidate + end.factor.to_state(rmatvec(rows, multiplier))
         return _Unknowns(y, multiplier, candidate, result)
 
     def advance(now: _Unknowns, counter: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
-        rows = end.factor.of_rows(jacobian)
+        rows = end.factor.scale_columns(jacobian)
         level, wrong = end.level(g, end.scale(jacobian, now.y))
         # What the gradients at the end itself change in the equation for the state.
-        defect = now.candidate + end.factor.of_change(combined(now.multiplier, rows)) - now.y
+        defect = now.candidate + end.factor.to_state(rmatvec(rows, now.multiplier)) - now.y
         off = end.factor.length(defect) / (eps * end.factor.length(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)
-        solved = jnp.where(off <= NOISE, SETTLED, jnp.where(off <= ROUNDOFF, ON, OFF))
+        solved = jnp.where(
+            off <= NOISE, AT_ROUNDOFF, jnp.where(off <= ROUNDOFF, WITHIN_TOLERANCE, ABOVE_TOLERANCE)
+        )
         solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)
         counter = after_test(jnp.minimum(level, solved), counter)
         # Where the inner step has failed, there is nothing to go on with.
@@ -260,7 +269,7 @@ def _solved(
         def move() -> _Unknowns:
             scaled = rows / sizes[:, None]
             gram = gram0 + gram_matrix(scaled, scaled)
-            change = solve(gram, (wrong + times(jacobian, defect)) / sizes) / sizes
+            change = solve(gram, (wrong + matvec(jacobian, defect)) / sizes) / sizes
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(counter > 0), move, lambda: now)

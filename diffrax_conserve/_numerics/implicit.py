@@ -20,8 +20,16 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._tree import tree_tangents, unflatten
-from .iterate import Solved, nearby
-from .linear import combined, corrected, gram_matrix, least_pivot, solve, times, unit_rows
+from .iterate import Solved, simplified_newton
+from .linear import (
+    gram_matrix,
+    least_pivot,
+    matvec,
+    rmatvec,
+    row_space_correction,
+    solve,
+    unit_rows,
+)
 from .problem import Jacobian, Problem
 
 
@@ -64,7 +72,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
 
 
 @final
-class Along(AbstractSystem):
+class MultiplierSystem(AbstractSystem):
     """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
@@ -90,7 +98,9 @@ class Along(AbstractSystem):
     candidate: Float[Array, " n"]
     directions: Jacobian | None = None
     fallback: Float[Array, " n"] | None = eqx.field(default=None, kw_only=True)
-    iteration: Callable[..., Solved] = eqx.field(default=nearby, static=True, kw_only=True)
+    iteration: Callable[..., Solved] = eqx.field(
+        default=simplified_newton, static=True, kw_only=True
+    )
     max_steps: int = eqx.field(static=True, kw_only=True)
 
     def found(self) -> Solved:
@@ -107,26 +117,26 @@ class Along(AbstractSystem):
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
-        return self.problem.factor.of_rows(self.problem.linearise(start)[1])
+        return self.problem.factor.scale_columns(self.problem.linearise(start)[1])
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
         sizes, rows = unit_rows(self._along(start))
-        change = self.problem.factor.measured(jnp.where(solved.ok, solved.y, start) - start)
-        multiplier = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
+        change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
+        multiplier = solve(gram_matrix(rows, rows), matvec(rows, change), least=least_pivot(rows))
         return solved.ok, multiplier / sizes
 
     def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
         start = self._start(ok)
         if self.directions is not None:
-            change = combined(multiplier, self.directions)
+            change = rmatvec(self.directions, multiplier)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
             _, vjp = jax.vjp(self.problem.residual, start)
-            change = self.problem.factor.of_rows(vjp(multiplier)[0])
-        end = start + self.problem.factor.of_change(change)
+            change = self.problem.factor.scale_columns(vjp(multiplier)[0])
+        end = start + self.problem.factor.to_state(change)
         # The second equation at the end of the correction, so that its tangent contains the first.
         return end, self.problem.residual(end)
 
@@ -136,21 +146,21 @@ class Along(AbstractSystem):
         t_y, t_g = (-x for x in right)
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = unit_rows(problem.factor.of_rows(problem.linearise(y)[1]))
+        heights, rows = unit_rows(problem.factor.scale_columns(problem.linearise(y)[1]))
         along = unit_rows(self._along(start))[1]
-        change = corrected(rows, along, t_g / heights, least=least_pivot(rows))
-        return t_y - problem.factor.of_change(change)
+        change = row_space_correction(rows, along, t_g / heights, least=least_pivot(rows))
+        return t_y - problem.factor.to_state(change)
 
 
 @jax.custom_jvp
-def certain(y: Array, is_known: Any) -> Array:
+def nan_tangent_unless(y: Array, is_known: Any) -> Array:
     """`y`, whose derivative is NaN unless it is known."""
     del is_known
     return y
 
 
-@certain.defjvp
-def _certain_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+@nan_tangent_unless.defjvp
+def _nan_tangent_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
     y, is_known = primals
     one_or_nan = lax.stop_gradient(jnp.where(is_known, 1, jnp.nan)).astype(y.dtype)
     return y, one_or_nan * tangents[0]

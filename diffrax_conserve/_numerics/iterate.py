@@ -4,15 +4,15 @@ All are Newton's method, for equations that have at least as many unknowns as th
 They differ in what a step does, so a step is a function of the unknowns and of a counter, and the
 loop around it is written once, in `iterate`.
 
-- `nearby` is for candidates as near as the local error of a solver's step (Hairer, Lubich and
-  Wanner, IV.4, equations (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
-  is on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
+- `simplified_newton` is for candidates as near as the local error of a solver's step (Hairer,
+  Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ` is
+  on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
   gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration
   is Newton's method. With many constraints it is that at the candidate.
-- `bounded` is `nearby` within bounds.
-- `damped` is for starts far away. Each step is the shortest, in the metric, that solves the
+- `projected_newton` is `simplified_newton` within bounds.
+- `damped_newton` is for starts far away. Each step is the shortest, in the metric, that solves the
   equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
   Springer 2004, Section 4.4). A step that increases the largest residual, or leaves the domain of a
   function, is shortened until it does not.
@@ -31,21 +31,29 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import AT_BOUND, FROZEN_STEPS, ROUNDOFF, SHORTER, WRITTEN_OUT
+from .._constants import AT_BOUND, BACKTRACKING_FACTOR, FROZEN_STEPS, ROUNDOFF, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
 from .._large.sparse import SparseRows
 from .linear import (
-    combined,
-    corrected,
-    factored,
+    factorise,
     gram_matrix,
     in_order,
     order_of,
+    rmatvec,
     roundoff_pivot,
+    row_space_correction,
     scaled_rows,
     solve,
 )
-from .problem import NOT_FINITE, OFF, ON, SETTLED, Jacobian, Problem, relative
+from .problem import (
+    ABOVE_TOLERANCE,
+    AT_ROUNDOFF,
+    NOT_FINITE,
+    WITHIN_TOLERANCE,
+    Jacobian,
+    Problem,
+    relative,
+)
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -115,9 +123,9 @@ def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
     unknowns do not solve the equations, the iteration has failed.
     """
     then = jnp.where(level == NOT_FINITE, jnp.minimum(counter - 1, 1), counter - 1)
-    then = jnp.where((level < ON) & (then == 0), -1, then)
-    then = jnp.where(level == ON, jnp.where(counter > 2, 2, 0) if polish else 0, then)
-    then = jnp.where(level == SETTLED, 0, then)
+    then = jnp.where((level < WITHIN_TOLERANCE) & (then == 0), -1, then)
+    then = jnp.where(level == WITHIN_TOLERANCE, jnp.where(counter > 2, 2, 0) if polish else 0, then)
+    then = jnp.where(level == AT_ROUNDOFF, 0, then)
     return jnp.where(counter > 0, then, counter).astype(counter.dtype)
 
 
@@ -153,7 +161,7 @@ def keep_done(counter: Array, moved: Any, y: Any) -> Any:
 # ---- For candidates nearby ----
 
 
-def nearby(
+def simplified_newton(
     problem: Problem,
     candidate: Float[Array, " n"],
     directions: Float[Array, "m n"] | None = None,
@@ -180,7 +188,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     def shared(y: Any) -> Any:
         """What the steps share: the order in which they eliminate the constraints, and in this
         order the directions, or the gradients at the candidate."""
-        rows = scaled_rows(problem.factor.of_rows(problem.linearise(y)[1]))[1]
+        rows = scaled_rows(problem.factor.scale_columns(problem.linearise(y)[1]))[1]
         along = rows if directions is None else directions
         order = order_of(gram_matrix(rows, along))
         return order, in_order(order, along)
@@ -191,7 +199,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
         level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
+        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
         rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
         # In each step the counter goes down by one, but before the last step, which polishes, the
@@ -206,9 +214,9 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # float64 it is short in any case, and a batch is faster without the distinction.
         least = None
         if dtype != jnp.float64:
-            least = jnp.where(level < ON, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - problem.factor.of_change(
-            corrected(rows, along, wrong, least=least, ordered=True)
+            least = jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
+        moved = y - problem.factor.to_state(
+            row_space_correction(rows, along, wrong, least=least, ordered=True)
         )
         return keep_done(counter, moved, y), counter
 
@@ -232,16 +240,16 @@ def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) ->
     candidate = lax.optimization_barrier(candidate)
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
-    along = problem.factor.of_rows(jacobian)
+    along = problem.factor.scale_columns(jacobian)
     sizes, rows = scaled_rows(along)
-    solve = factored(gram_matrix(rows, rows))
+    solve = factorise(gram_matrix(rows, rows))
     _, vjp = jax.vjp(problem.residual, candidate)
 
     def along_gradients(multiplier: Array) -> Array:
         """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
         if isinstance(along, SparseRows):
-            return problem.factor.of_change(problem.factor.of_rows(vjp(multiplier)[0]))
-        return problem.factor.of_change(combined(multiplier, along))
+            return problem.factor.to_state(problem.factor.scale_columns(vjp(multiplier)[0]))
+        return problem.factor.to_state(rmatvec(along, multiplier))
 
     def advance(y: Array, counter: Array) -> tuple[Array, Array]:
         level, wrong = problem.level(problem.residual(y), scale)
@@ -268,7 +276,7 @@ class _Descent(NamedTuple):
     scale: Float[Array, " m"]
 
 
-def damped(
+def damped_newton(
     problem: Problem,
     start: Float[Array, " n"],
     directions: Jacobian | None = None,
@@ -288,15 +296,15 @@ def damped(
         here = problem.scale(jacobian, y)
         level, wrong = problem.level(g, here)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
-        level = jnp.where(first, level, jnp.maximum(level, OFF))
+        level = jnp.where(first, level, jnp.maximum(level, ABOVE_TOLERANCE))
         counter = after_test(level, counter, polish=polish)
         scale = jnp.where(first, here, now.scale)
         residuals = jnp.abs(relative(g, scale))
         better = jnp.all(residuals <= now.largest)  # false if one is NaN
-        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
+        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
         along = rows if directions is None else directions
-        further = y - problem.factor.of_change(corrected(rows, along, wrong / sizes))
-        shorter = now.best + SHORTER * (y - now.best)
+        further = y - problem.factor.to_state(row_space_correction(rows, along, wrong / sizes))
+        shorter = now.best + BACKTRACKING_FACTOR * (y - now.best)
         best = jnp.where(better, y, now.best)
         largest = jnp.where(better, jnp.max(residuals), now.largest)
         moved = keep_done(counter, jnp.where(better, further, shorter), y)
@@ -310,7 +318,7 @@ def damped(
 # ---- Within bounds ----
 
 
-def bounded(
+def projected_newton(
     problem: Problem, start: Float[Array, " n"], directions: Jacobian, *, max_steps: int
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
@@ -325,11 +333,11 @@ def bounded(
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         level, _ = problem.level(g, problem.scale(jacobian, z))
         counter = after_test(level, counter, polish=False)
-        sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
+        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = solve(gram_matrix(rows, directions), g / sizes)
-        change = problem.factor.of_change(combined(multiplier, directions))
+        change = problem.factor.to_state(rmatvec(directions, multiplier))
         share = _share(problem, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 

@@ -43,21 +43,21 @@ def gram_matrix(rows: Any, others: Any) -> Any:
     return jnp.sum(rows[:, None, :] * others[None], axis=2)
 
 
-def combined(multiplier: Float[Array, " m"], rows: Any) -> Float[Array, " n"]:
+def rmatvec(rows: Any, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
     """`rowsᵀ multiplier`."""
     if isinstance(rows, SparseRows):
-        return rows.combined(multiplier)
+        return rows.rmatvec(multiplier)
     if len(rows) > WRITTEN_OUT:
         return jnp.matmul(multiplier, rows, precision=lax.Precision.HIGHEST)
     return jnp.sum(multiplier[:, None] * rows, axis=0)
 
 
-def times(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
+def matvec(rows: Any, x: Float[Array, " n"]) -> Float[Array, " m"]:
     """`rows x`."""
-    return rows.times(x) if isinstance(rows, SparseRows) else combined(x, rows.T)
+    return rows.matvec(x) if isinstance(rows, SparseRows) else rmatvec(rows.T, x)
 
 
-def corrected(
+def row_space_correction(
     rows: Any,
     along: Any,
     b: Float[Array, " m"],
@@ -66,7 +66,7 @@ def corrected(
     ordered: bool = False,
 ) -> Float[Array, " n"]:
     """`alongᵀ (rows alongᵀ)⁻¹ b`, the combination of the rows `along` that changes `rows x` by `b`.
-    The `least` pivot that counts, and whether the rows are `ordered`, are as in `eliminated`.
+    The `least` pivot that counts, and whether the rows are `ordered`: see `forward_elimination`.
 
     If gradients are nearly parallel, the multipliers `(rows alongᵀ)⁻¹ b` are large and cancel in
     the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
@@ -76,8 +76,8 @@ def corrected(
     """
     gram = gram_matrix(rows, along)
     if _is_large(gram):
-        return combined(solve(gram, b, least=least), along)
-    return combined(*eliminated(gram, b, along, least=least, ordered=ordered)[:2])
+        return rmatvec(along, solve(gram, b, least=least))
+    return rmatvec(*forward_elimination(gram, b, along, least=least, ordered=ordered)[:2])
 
 
 def solve(
@@ -85,13 +85,13 @@ def solve(
 ) -> Float[Array, " m"]:
     """`gram⁻¹ b`, for a matrix that is not symmetric in general."""
     if isinstance(gram, BlockGram):
-        return refined(gram.factored(), gram.times, b)
+        return iterative_refinement(gram.factorise(), gram.matvec, b)
     if _is_large(gram):
-        return refined(factored(gram, least=least), lambda x: combined(x, gram.T), b)
-    return combined(*eliminated(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least)[:2])
+        return iterative_refinement(factorise(gram, least=least), lambda x: rmatvec(gram.T, x), b)
+    return rmatvec(*forward_elimination(gram, b, jnp.eye(len(b), dtype=b.dtype), least=least)[:2])
 
 
-def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
+def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
     """`matrix⁻¹ b` for equations of `n` components of the state and of multipliers,
     `A y + B λ = b₁` and `G y = b₂`, without the multipliers whose gradients are nearly parallel;
     see `implicit`.
@@ -106,10 +106,10 @@ def saddle(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[
     factors = jsp.linalg.lu_factor(matrix[:n, :n] + gram_matrix(rows.T, rows.T))
     along = jsp.linalg.lu_solve(factors, along.T).T
     second = b[n:] / heights
-    first = jsp.linalg.lu_solve(factors, b[:n] + combined(second, rows))
-    wrong = times(rows, first) - second
+    first = jsp.linalg.lu_solve(factors, b[:n] + rmatvec(rows, second))
+    wrong = matvec(rows, first) - second
     multiplier = solve(gram_matrix(rows, along), wrong, least=least_pivot(rows))
-    return jnp.concatenate([first - combined(multiplier, along), multiplier / widths])
+    return jnp.concatenate([first - rmatvec(along, multiplier), multiplier / widths])
 
 
 class Factors(eqx.Module):
@@ -129,21 +129,21 @@ class Factors(eqx.Module):
             x = jsp.linalg.lu_solve(self.factors, x)
         else:
             below, above = self.factors
-            x = combined(combined(x, below.T), above.T)
+            x = rmatvec(above.T, rmatvec(below.T, x))
         return x.astype(b.dtype) * self.unit
 
 
-def factored(gram: Any, *, least: float | Array | None = None) -> Solve:
+def factorise(gram: Any, *, least: float | Array | None = None) -> Solve:
     """`gram⁻¹ b` as a function of `b`. What is added to the diagonal of a large matrix is an error
     of the solution, which `solve` removes, and so do the steps of an iteration."""
     if isinstance(gram, BlockGram):
-        return gram.factored()
+        return gram.factorise()
     diagonal = jnp.abs(jnp.diagonal(gram))
     unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
     matrix = gram * unit[:, None] * unit
     if not _is_large(gram):
         one = jnp.eye(len(gram), dtype=gram.dtype)
-        below, above, _ = eliminated(matrix, one, one)
+        above, below, _ = forward_elimination(matrix, one, one)
         return Factors((below, above.T), unit)
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
@@ -155,7 +155,7 @@ def _is_large(gram: Any) -> bool:
     return len(gram) > WRITTEN_OUT
 
 
-def refined(
+def iterative_refinement(
     solve: Solve, product: Callable[[Array], Array], b: Float[Array, " m"]
 ) -> Float[Array, " m"]:
     """The solution of `product(x) = b` by iterative refinement, from a `solve` that is inaccurate,
@@ -170,7 +170,7 @@ def refined(
 Order = tuple[Bool[Array, ""], ...]
 
 
-def eliminated(
+def forward_elimination(
     gram: Float[Array, "m m"],
     b: Array,
     rows: Array,
@@ -178,8 +178,8 @@ def eliminated(
     least: float | Array | None = None,
     ordered: bool = False,
 ) -> tuple[Array, Array, Order]:
-    """`L⁻¹ b` and `R⁻ᵀ rows` for a small matrix `gram = L R`, by Gaussian elimination, and its
-    order. The `combined` of the first two is `rowsᵀ gram⁻¹ b`.
+    """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination, and its
+    order. The `rmatvec` of the first two is `rowsᵀ gram⁻¹ b`.
 
     Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
     angles between the gradient of each constraint and those before it. Next is always the
@@ -205,12 +205,12 @@ def eliminated(
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         right[k] = right[k] / pivot
-    return jnp.stack(right), jnp.stack(sides), tuple(order)
+    return jnp.stack(sides), jnp.stack(right), tuple(order)
 
 
 def order_of(gram: Float[Array, "m m"]) -> Order:
-    """The order in which `eliminated` takes the constraints, whatever the right side is."""
-    return eliminated(gram, gram[0], gram)[2]
+    """The order in which the elimination takes the constraints, whatever the right side is."""
+    return forward_elimination(gram, gram[0], gram)[2]
 
 
 def in_order(order: Order, each: Array) -> Array:

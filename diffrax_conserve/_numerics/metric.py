@@ -40,33 +40,33 @@ class AbstractFactor(eqx.Module):
     is_dense: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def of_rows(self, rows: Any) -> Any:
+    def scale_columns(self, rows: Any) -> Any:
         """`rows S`, for the rows of a Jacobian or for one gradient."""
 
     @abc.abstractmethod
-    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S change`, the change of the state that is `change` when the metric measures it."""
 
     @abc.abstractmethod
-    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S⁻¹ change`."""
 
     def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         """The length of a change of the state in the metric."""
-        return jnp.linalg.norm(self.measured(change))
+        return jnp.linalg.norm(self.to_metric(change))
 
 
 @final
 class Identity(AbstractFactor):
     """`S = 1`, which costs no product."""
 
-    def of_rows(self, rows: Any) -> Any:
+    def scale_columns(self, rows: Any) -> Any:
         return rows
 
-    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change
 
-    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change
 
 
@@ -77,15 +77,15 @@ class Diagonal(AbstractFactor):
 
     diagonal: Float[Array, " n"]
 
-    def of_rows(self, rows: Any) -> Any:
+    def scale_columns(self, rows: Any) -> Any:
         if isinstance(rows, SparseRows):
             return rows.times_columns(self.diagonal)
         return rows * jnp.broadcast_to(self.diagonal, rows.shape)
 
-    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change * self.diagonal
 
-    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         moves = self.diagonal != 0
         return jnp.where(moves, change / jnp.where(moves, self.diagonal, 1), 0)
 
@@ -105,17 +105,17 @@ class Matrices(AbstractFactor):
     starts: tuple[int, ...] = eqx.field(static=True)
     is_dense: ClassVar[bool] = True
 
-    def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scale_columns(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
-        return self._in_parts(solve, self.elsewhere.of_rows(rows))
+        return self._in_parts(solve, self.elsewhere.scale_columns(rows))
 
-    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
-        return self._in_parts(solve, self.elsewhere.of_change(change))
+        return self._in_parts(solve, self.elsewhere.to_state(change))
 
-    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
-        return self._in_parts(product, self.elsewhere.measured(change))
+        return self._in_parts(product, self.elsewhere.to_metric(change))
 
     def _in_parts(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
         """`x` with `fn(L, part)` in the place of each part with a matrix."""
@@ -146,7 +146,7 @@ class Preferring(AbstractFactor):
         made orthogonal to the others twice, because once would leave roundoff in the ratio of its
         length before and after. If no more than a share `δ` of it is new, it is left out: the new
         part has too few digits to keep what the others keep."""
-        changes = jax.vmap(own.measured)(changes)
+        changes = jax.vmap(own.to_metric)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
         least = _outside(changes.dtype) ** 2
@@ -162,14 +162,14 @@ class Preferring(AbstractFactor):
 
         return cls(own, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
-    def of_rows(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-        return self._shared(self.own.of_rows(rows), _outside(rows.dtype))
+    def scale_columns(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        return self._shared(self.own.scale_columns(rows), _outside(rows.dtype))
 
-    def of_change(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.own.of_change(self._shared(change, _outside(change.dtype)))
+    def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.own.to_state(self._shared(change, _outside(change.dtype)))
 
-    def measured(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self._shared(self.own.measured(change), 1 / _outside(change.dtype))
+    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self._shared(self.own.to_metric(change), 1 / _outside(change.dtype))
 
     def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         """In the own metric: a preference says where a correction leads, and not how long it is."""

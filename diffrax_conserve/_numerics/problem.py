@@ -38,7 +38,7 @@ from .report import ProjectionInfo
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
 # level of a state is the minimum over its residuals.
-NOT_FINITE, OFF, ON, SETTLED = -1, 0, 1, 2
+NOT_FINITE, ABOVE_TOLERANCE, WITHIN_TOLERANCE, AT_ROUNDOFF = -1, 0, 1, 2
 # The residuals of one entry of a manifold, as a function of the vector of the state.
 Residual = Callable[[Float[Array, " n"]], Float[Array, " k"]]
 Jacobian = Float[Array, "m n"] | SparseRows
@@ -152,9 +152,8 @@ class Problem(eqx.Module):
     def level(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """The level of a state, `NOT_FINITE`, `OFF`, `ON` or `SETTLED`, and what is to be
-        corrected: the residuals, but for those that are noise. The residuals and their scales are
-        given."""
+        """The level of a state, from `NOT_FINITE` to `AT_ROUNDOFF`, and what is to be corrected:
+        the residuals, but for those that are noise. The residuals and their scales are given."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
         # A tolerance that has underflowed would be met by a residual that has underflowed too,
@@ -164,14 +163,14 @@ class Problem(eqx.Module):
         on = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be
         # shorter, but on a CPU a maximum can lose a NaN.
-        within = jnp.where(noise, jnp.int8(SETTLED), jnp.int8(ON))
-        beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(OFF), jnp.int8(NOT_FINITE))
+        within = jnp.where(noise, jnp.int8(AT_ROUNDOFF), jnp.int8(WITHIN_TOLERANCE))
+        beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(ABOVE_TOLERANCE), jnp.int8(NOT_FINITE))
         return jnp.min(jnp.where(on, within, beyond)), jnp.where(noise, 0, g)
 
     def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.level(g, self.scale(jacobian, y))[0] >= ON
+        return self.level(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
 
     def per_residual(self, of_entries: Sequence[Any]) -> np.ndarray:
         """One element for each residual, from one for each entry of the manifold."""
@@ -202,7 +201,7 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        success = problem.level(after, scale)[0] >= ON if ok is None else ok
+        success = problem.level(after, scale)[0] >= WITHIN_TOLERANCE if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
@@ -246,7 +245,7 @@ def gradient_scale(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array,
     """`Σ_k size_k |∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
     shows, for components of this size."""
     if isinstance(jacobian, SparseRows):
-        return jtu.tree_map(jnp.abs, jacobian).times(size)
+        return jtu.tree_map(jnp.abs, jacobian).matvec(size)
     return jnp.sum(jnp.abs(jacobian) * size[None], axis=1)
 
 

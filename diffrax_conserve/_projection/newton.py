@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import NEAREST, ROUNDOFF
-from .._numerics.implicit import Along, certain, root, solution
-from .._numerics.iterate import Solved, damped
-from .._numerics.linear import gram_matrix, least_pivot, saddle, solve, times, unit_rows
+from .._numerics.implicit import MultiplierSystem, nan_tangent_unless, root, solution
+from .._numerics.iterate import Solved, damped_newton
+from .._numerics.linear import gram_matrix, least_pivot, matvec, solve, solve_kkt, unit_rows
 from .._numerics.metric import Identity
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
@@ -77,7 +77,7 @@ class Newton(AbstractNewton):
         if candidate.size + problem.magnitude.size > NEAREST:
             first = _some_point(problem, given, self.max_steps)
             y, count = given.clip(first.y), first.num_iterations
-            y = certain(y, False)
+            y = nan_tangent_unless(y, False)
         else:
             problem, still = tree_stop_gradient((problem, given))
             first = _some_point(problem, still, self.max_steps)
@@ -105,7 +105,9 @@ def _some_point(problem: Problem, given: _Given, max_steps: int) -> Solved:
     derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
     if given.bounds is not None:
         return project_within(given.bounds, problem, given.candidate, max_steps=max_steps)
-    return solution(Along(problem, given.candidate, iteration=damped, max_steps=max_steps))
+    return solution(
+        MultiplierSystem(problem, given.candidate, iteration=damped_newton, max_steps=max_steps)
+    )
 
 
 class _Conditions(eqx.Module):
@@ -123,15 +125,15 @@ class _Conditions(eqx.Module):
         # else, so that a component that is never moved has the derivative of the candidate.
         candidate, change = self.given.candidate, unknowns[: self.base.size]
         base = self.base + (candidate - lax.stop_gradient(candidate))
-        return self.given.clip(base + self.given.problem.factor.of_change(change))
+        return self.given.clip(base + self.given.problem.factor.to_state(change))
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         problem, away = self.given.problem, self.base - lax.stop_gradient(self.given.candidate)
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
-        gradient = problem.factor.of_rows(vjp(multiplier / self.lengths)[0])
-        return jnp.concatenate([problem.factor.measured(away) + change - gradient, g])
+        gradient = problem.factor.scale_columns(vjp(multiplier / self.lengths)[0])
+        return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
 
 
 def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Problem]:
@@ -139,11 +141,11 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     problem, y = given.problem, given.clip(base)
     jacobian = problem.linearise(y)[1]
-    lengths, rows = unit_rows(problem.factor.of_rows(jacobian))
+    lengths, rows = unit_rows(problem.factor.scale_columns(jacobian))
     conditions = _Conditions(given, base, lengths)
-    sizes_of = [jnp.abs(problem.factor.measured(x)) for x in (base, given.candidate)]
-    change = problem.factor.measured(base - given.candidate)
-    fits = solve(gram_matrix(rows, rows), times(rows, change), least=least_pivot(rows))
+    sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
+    change = problem.factor.to_metric(base - given.candidate)
+    fits = solve(gram_matrix(rows, rows), matvec(rows, change), least=least_pivot(rows))
     scale = problem.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 
@@ -174,8 +176,8 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     def approach(now: Any) -> Any:
         base, _, count, left = now
         _, start, tested = _conditions(still, base)
-        found = damped(tested, start, max_steps=max_steps, polish=True)
-        end = base + still.problem.factor.of_change(found.y[: base.size])
+        found = damped_newton(tested, start, max_steps=max_steps, polish=True)
+        end = base + still.problem.factor.to_state(found.y[: base.size])
         left = jnp.where(found.ok, left - 1, 0)
         return jnp.where(found.ok, end, base), found.ok, count + found.num_iterations, left
 
@@ -186,6 +188,8 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     ok = ok & still.problem.holds(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
-    found = root(conditions, lambda x: Solved(x, ok, count), start, ft.partial(saddle, first.size))
+    found = root(
+        conditions, lambda x: Solved(x, ok, count), start, ft.partial(solve_kkt, first.size)
+    )
     y = conditions.state(found.y)
-    return certain(y, ok | ~still.problem.holds(lax.stop_gradient(y))), count
+    return nan_tangent_unless(y, ok | ~still.problem.holds(lax.stop_gradient(y))), count

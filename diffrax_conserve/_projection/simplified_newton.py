@@ -1,13 +1,13 @@
 """The iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as close to the
 manifold as the local error of a step. It moves along the gradients at the candidate.
-The iteration itself is `iterate.nearby`, that within bounds is in `within_bounds`, the derivative
-in `implicit`."""
+The iteration itself is in `iterate`, that within bounds in `within_bounds`, the derivative in
+`implicit`."""
 
 from typing import final
 
 from jaxtyping import Array, Float
 
-from .._numerics.implicit import Along, solution
+from .._numerics.implicit import MultiplierSystem, solution
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .options import NEWTON_OPTIONS
@@ -61,7 +61,9 @@ class SimplifiedNewton(AbstractNewton):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         bounds = self.bounds(problem.like)
         if bounds is None:
-            y, ok, count, _ = solution(Along(problem, candidate, max_steps=self.max_steps))
+            y, ok, count, _ = solution(
+                MultiplierSystem(problem, candidate, max_steps=self.max_steps)
+            )
         else:
             z, ok, count, _ = project_within(bounds, problem, candidate, max_steps=self.max_steps)
             y = bounds.clip(z)

@@ -15,7 +15,7 @@ from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.scalars import written_out
 from .._manifold import (
-    Along,
+    LieDerivative,
     check_manifold,
     check_vector_field,
     conserved_values,
@@ -25,7 +25,7 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
-from .._numerics.linear import corrected, gram_matrix, scaled_rows, solve
+from .._numerics.linear import gram_matrix, row_space_correction, scaled_rows, solve
 from .._numerics.metric import factor_of, positive_weights
 from .._numerics.problem import problem_of
 from .._options import check_number
@@ -107,7 +107,7 @@ def tangent(
     check_number("gain", gain, least=-math.inf, optional=False)
     damped = not (isinstance(gain, float | int) and gain == 0)
     for name, entry in named_entries(manifold):
-        if metric is None and isinstance(entry.fn, Along):
+        if metric is None and isinstance(entry.fn, LieDerivative):
             raise ValueError(
                 f"`{name}` is the derivative of a constraint, but `tangent` has no `metric`, which "
                 "decides the forces. Pass `metric=(jnp.inf, masses)` for a state of positions and "
@@ -168,9 +168,9 @@ class TangentField(eqx.Module):
             sizes, and so is the right side."""
             vector, wrong = given
             _, jacobian = problem.linearise(vector)
-            sizes, rows = scaled_rows(problem.factor.of_rows(jacobian))
+            sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
             gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = problem.factor.of_change(corrected(rows, rows, right))
+            change = problem.factor.to_state(row_space_correction(rows, rows, right))
             return change, solve(gram, right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))

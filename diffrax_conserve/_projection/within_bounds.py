@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._constants import AT_BOUND, MAX_STEPS
-from .._numerics.implicit import Along, solution
-from .._numerics.iterate import Solved, bounded
+from .._numerics.implicit import MultiplierSystem, solution
+from .._numerics.iterate import Solved, projected_newton
 from .._numerics.metric import positive_weights, spread
 from .._numerics.problem import Problem
 from .._printing import is_traced
@@ -73,9 +73,13 @@ def project_within(
     without the clip. A component that reaches its bound costs a step, so there may be twice as many
     of them.
     """
-    rows = problem.factor.of_rows(problem.linearise(candidate)[1])
+    rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
     within = bounds.compose(problem)
-    return solution(Along(within, candidate, rows, iteration=bounded, max_steps=2 * max_steps))
+    return solution(
+        MultiplierSystem(
+            within, candidate, rows, iteration=projected_newton, max_steps=2 * max_steps
+        )
+    )
 
 
 class AbstractNewton(AbstractProjection):

@@ -18,7 +18,7 @@ from .._manifold import FirstIntegral
 from .._numerics.implicit import root
 from .._numerics.iterate import after_test, iterate, keep_done
 from .._numerics.linear import solve
-from .._numerics.problem import OFF, SETTLED
+from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
 from .._projection.closed_form import ClosedForm
 from ._base import real
 
@@ -209,7 +209,7 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
     def advance(multiplier: Array, counter: Array) -> tuple[Array, Array]:
         left = missing(multiplier)
         met = jnp.all(jnp.abs(left) <= small * jnp.abs(target))
-        counter = after_test(jnp.where(met, SETTLED, OFF), counter)
+        counter = after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), counter)
         gram = jnp.sum(weights[:, None, :] * weights * state(multiplier), axis=2)
         change = solve(gram, left)
         # An exponent changes by at most one in a step.

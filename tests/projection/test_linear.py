@@ -14,7 +14,7 @@ from ..problems import EPS
 def correction(rows, others, b):
     """`othersᵀ (rows othersᵀ)⁻¹ b`, and the multipliers."""
     gram = linear.gram_matrix(rows, others)
-    along = linear.corrected(rows, others, b)
+    along = linear.row_space_correction(rows, others, b)
     return along, linear.solve(gram, b)
 
 
@@ -62,7 +62,7 @@ def test_columns_in_other_units_change_no_bit(m):
 
 
 def test_a_factor_is_the_inverse_and_exists_for_dependent_rows():
-    rng, solved = np.random.default_rng(0), jax.jit(lambda gram, b: linear.factored(gram)(b))
+    rng, solved = np.random.default_rng(0), jax.jit(lambda gram, b: linear.factorise(gram)(b))
     rows, b = rng.normal(size=(8, 10)), rng.normal(size=8)
     np.testing.assert_allclose(rows @ rows.T @ solved(rows @ rows.T, b), b, rtol=0, atol=1e-9)
     rows[3] = rows[1]

@@ -17,7 +17,7 @@ from jaxtyping import Array
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve._large import asdex_import, sparse
-from diffrax_conserve._numerics.linear import combined, gram_matrix, times
+from diffrax_conserve._numerics.linear import gram_matrix, matvec, rmatvec
 from diffrax_conserve._numerics.linear import solve as gram_solve
 from diffrax_conserve._numerics.metric import Diagonal
 from diffrax_conserve._numerics.problem import Problem, problem_of
@@ -78,13 +78,13 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
 
     def rows(problem: Problem, y: Array) -> Any:
-        return problem.factor.of_rows(problem.linearise(y.reshape(-1))[1])
+        return problem.factor.scale_columns(problem.linearise(y.reshape(-1))[1])
 
     @jax.jit
     def found() -> Any:
         a, b = rows(problem, y), rows(problem, beside)
         solved = (gram_solve(gram_matrix(a, other), multiplier) for other in (a, b))
-        return times(a, x), combined(multiplier, a), *solved
+        return matvec(a, x), rmatvec(a, multiplier), *solved
 
     dense = dataclasses.replace(problem, pattern=None)
     a, b = (np.asarray(rows(dense, state), np.float64) for state in (y, beside))
@@ -153,7 +153,7 @@ def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
         dense = dataclasses.replace(problem, pattern=None)
         x, y = np.arange(NUM) * 1.0, np.linspace(1, 2, NUM)
         found, expected = (
-            jax.jit(lambda x, y, e=e: times(e.linearise(y)[1], x))(x, y) for e in (problem, dense)
+            jax.jit(lambda x, y, e=e: matvec(e.linearise(y)[1], x))(x, y) for e in (problem, dense)
         )
         assert problem.pattern is not None
         np.testing.assert_allclose(found, expected)

@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._numerics.linear import combined, gram_matrix, solve
+from ..._numerics.linear import gram_matrix, rmatvec, solve
 from ..._numerics.problem import Problem, relative
 from .trainable import LayerSchedule
 
@@ -31,7 +31,7 @@ def iterated(
     before, rows = problem.linearise(candidate)
 
     def improve(multipliers: Array) -> Array:
-        y = candidate + combined(multipliers, rows)
+        y = candidate + rmatvec(rows, multipliers)
         g, jacobian = problem.linearise(y)
         if radius is None:
             return multipliers - solve(gram_matrix(rows, rows), g)
@@ -39,7 +39,7 @@ def iterated(
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         gram = gram_matrix(jacobian, rows)
         change = solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)
-        step = combined(change, rows)
+        step = rmatvec(rows, change)
         return multipliers - lax.rsqrt(1 + jnp.sum(step * step) / radius**2) * change
 
     def iterate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
@@ -47,4 +47,4 @@ def iterated(
 
     zeros = jnp.zeros_like(before)
     (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
-    return candidate + combined(previous + s.astype(dtype) * (last - previous), rows)
+    return candidate + rmatvec(rows, previous + s.astype(dtype) * (last - previous))

@@ -10,8 +10,8 @@ from ..._balance import refuse_rates
 from ..._constants import MAX_STEPS
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
-from ..._numerics.implicit import Along, solution
-from ..._numerics.iterate import Solved, damped
+from ..._numerics.implicit import MultiplierSystem, solution
+from ..._numerics.iterate import Solved, damped_newton
 from ..._numerics.problem import Problem, problem_of
 from ..._options import check_counts
 from ..._tree import ravel, unravel
@@ -80,7 +80,7 @@ class ConservativeLayer(eqx.Module):
             # The start is on the manifold, so the functions are finite there.
             known = ravel(start[1]).astype(vector.dtype)
             options: Any = dict(iteration=_damped_along, max_steps=MAX_STEPS)
-            projected = solution(Along(problem, vector, fallback=known, **options))
+            projected = solution(MultiplierSystem(problem, vector, fallback=known, **options))
             y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)
@@ -111,8 +111,8 @@ def _damped_along(
 ) -> Solved:
     """The damped iteration along the gradients at the candidate."""
     del directions
-    rows = problem.factor.of_rows(problem.linearise(candidate)[1])
-    return damped(problem, candidate, rows, max_steps=max_steps)
+    rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
+    return damped_newton(problem, candidate, rows, max_steps=max_steps)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
