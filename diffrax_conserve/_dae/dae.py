@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Args, RealScalarLike, Values, Y
+from .._fast.scalars import small
 from .._manifold import Constraint, slope_like
 from .._options import check_function
 from .._projection.base import AbstractProjection, Problem, ProjectionInfo, Target
@@ -31,6 +32,7 @@ from .newton import MOST, algebraic_newton, at_rest_near, divided
 from .radau import Radau
 from .reduction import (
     Implicit,
+    Reduction,
     Singular,
     Structure,
     structure_of,
@@ -512,16 +514,18 @@ def _solved_for(
 ) -> Float[Array, " n"]:
     """The state of equations of index 1, moved without what they differentiate; NaN if Newton's
     method finds none."""
-    structure, equations, t, y = _at(dae, t, state, args)
-    along, free = structure.freely_moved(equations, t, y)
-    fits = structure.fits(equations, t, y)
+    structure = _structure(dae, t, state, args)
+    reduction, t, y = _at(dae, structure, t, state, args)
+    along, free = reduction.freely_moved(t, y)
+    fits = reduction.fits(t, y)
 
     def moved(z: Array) -> Array:
         return (y + along @ (z - y[free])).at[free].set(z)
 
     def residual(z: Array) -> Array:
-        return jnp.where(fits, structure.constraints(equations, 1)(t, moved(z))[0], jnp.nan)
+        return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
+    residual = small(residual, y[free])
     return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
 
 
@@ -532,10 +536,7 @@ class _Slopes(eqx.Module):
     dae: DAE
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
-        slopes = structure.slopes(equations, structure.index, t, vector)
-        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
-        return unravel(jnp.where(fits, slopes, jnp.nan), y)
+        return unravel(_slopes(self.dae, _structure(self.dae, t, y, args), t, y, args), y)
 
 
 @final
@@ -547,12 +548,10 @@ class _Constraints(eqx.Module):
     asked: Bool[Array, " rounds"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
+        structure = _structure(self.dae, t, y, args)
         if not structure.index:
-            return [jnp.zeros_like(vector[:1])]  # every state will do
-        found = structure.constraints(equations, structure.index)(t, vector)
-        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
-        found = [jnp.where(fits, h, jnp.nan) for h in found]
+            return [jnp.zeros_like(ravel(y)[:1])]  # every state will do
+        found = _constraints(self.dae, structure, t, y, args)
         if self.asked is None:
             return found
         return [jnp.where(asked, h, 0) for asked, h in zip(self.asked, found, strict=True)]
@@ -574,11 +573,37 @@ class _Stages(eqx.Module):
             )
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
-        return structure.reduced(equations, max(structure.index - 1, 0))(t, vector, ravel(slopes))
+        structure = _structure(self.dae, t, y, args)
+        return _reduced(self.dae, structure, t, y, slopes, args)
 
 
-def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Implicit, Array, Array]:
+# Each is traced once for all uses.
+
+
+@eqx.filter_jit
+def _slopes(dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args) -> Array:
+    reduction, t, y = _at(dae, structure, t, y, args)
+    return reduction.where_it_fits(reduction.slopes(structure.index))(t, y)
+
+
+@eqx.filter_jit
+def _constraints(dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args) -> Values:
+    reduction, t, y = _at(dae, structure, t, y, args)
+    return reduction.where_it_fits(reduction.constraints)(t, y)
+
+
+@eqx.filter_jit
+def _reduced(
+    dae: DAE, structure: Structure, t: RealScalarLike, y: Y, slopes: Y, args: Args
+) -> Array:
+    reduction, t, y = _at(dae, structure, t, y, args)
+    return reduction.reduced(max(structure.index - 1, 0))(t, y, ravel(slopes))
+
+
+def _at(
+    dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Reduction, Array, Array]:
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(float, t))
-    return _structure(dae, t, y, args), dae._equations(t, y, args), t, ravel(y)
+    vector = ravel(y)
+    return Reduction(structure, dae._equations(t, y, args), t, vector), t, vector

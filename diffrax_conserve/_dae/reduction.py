@@ -22,12 +22,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.core
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER
+from .._fast.scalars import small
 from .._step.implicit import root
 from .._tree import without_pattern
 from .newton import algebraic_newton, divided
@@ -98,107 +100,135 @@ class Structure:
         last = np.full((2, self.index), True), np.full((2, self.size), True)
         return np.stack([*asked, *last[0]]), np.stack([*moving, *last[1]])
 
-    def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
+
+class Reduction:
+    """The functions that belong to a structure of equations, for times and vectors like these.
+
+    Each is derived from those before it, and written out as a small program, if the system is small
+    enough, before the next is derived. `constraints(t, y)` returns `h_0` to `h_{ν-1}`.
+    """
+
+    def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
+        self.like = t, y
+        self.structure = dataclasses.replace(structure, rounds=())
+        self.equations = small(equations, t, y, y)
+        self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
+        for selected in structure.rounds:
+            self.differentiate(selected)
+        self.structure = structure
+
+    def differentiate(self, selected: Round) -> None:
+        """Adds the constraints of the equations that are left when these are solved. The first are
+        the equations at the slopes that are selected; each of the others is a derivative of what is
+        left of the one before."""
+        rounds = *self.structure.rounds, selected
+        self.structure = structure = dataclasses.replace(self.structure, rounds=rounds)
+        k, before, equations = len(rounds) - 1, self.constraints, self.equations
+        left = np.array(structure.left(k), int)
+        none = k == 0 and structure.apart
+        slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
+
+        def constraints(t: Array, y: Array) -> list[Array]:
+            if k == 0:
+                return [equations(t, y, slopes(t, y))[left]]
+            given, rates = _along(before, t, y, slopes(t, y))
+            return [*given, rates[-1][np.searchsorted(structure.left(k - 1), left)]]
+
+        self.constraints = small(constraints, *self.like)
+
+    def slopes(self, k: int) -> Callable[[Array, Array], Array]:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
         are not selected are zero."""
-        every = tuple(range(self.size))
-        rows, columns = (
-            np.array(x, int) for x in (self.rounds[k] if k < self.index else Round(every, every))
-        )
-        none = jnp.zeros_like(y)
-        if not rows.size:
-            return none
-        as_given = not self.rounds or not set(rows) & set(self.left(0))
-        begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
-        if not as_given:  # once, for all slopes that are tried
-            by_both = jax.jacfwd(self.constraints(equations, k), (0, 1))(t, y)
-            by_t, by_y = zip(*by_both, strict=True)
+        structure, equations, constraints = self.structure, self.equations, self.constraints
+        every = tuple(range(structure.size))
+        selected = structure.rounds[k] if k < structure.index else Round(every, every)
+        rows, columns = (np.array(x, int) for x in selected)
+        as_given = not structure.rounds or not set(rows) & set(structure.left(0))
 
-        def residual(slopes: Array) -> Array:
-            slopes = none.at[columns].set(slopes)
-            rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
-            return self._replaced(equations(t, y, slopes), rates)[rows]
+        def slopes(t: Array, y: Array) -> Array:
+            if not rows.size:
+                return jnp.zeros_like(y)
+            begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
+            if not as_given:  # once, for all slopes that are tried
+                by_t, by_y = zip(*jax.jacfwd(constraints, (0, 1))(t, y), strict=True)
 
-        if as_given and self.mass is not None:
-            inverse = np.linalg.inv(self.mass[np.ix_(rows, columns)])
-            slopes = -jnp.asarray(inverse, y.dtype) @ residual(begin)
-        elif self.is_linear:
-            both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
-            matrix, value = both(begin)
-            slopes = divided(matrix, -value)
-        else:
-            slopes = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
-        return none.at[columns].set(slopes)
+            def residual(slopes: Array) -> Array:
+                slopes = jnp.zeros_like(y).at[columns].set(slopes)
+                rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
+                return self._replaced(equations(t, y, slopes), rates)[rows]
 
-    def freely_moved(
-        self, equations: Implicit, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray]:
-        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
-        what the equations differentiate, such as the charges of condensers; and which unknowns are
-        the coordinates along it."""
-        rows, columns = (np.array(x, int) for x in self.rounds[0])
-        free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
-        matrix = self.mass if self.mass is not None else self._by_slopes(equations, t, y)
-        solve = np.linalg.solve if self.mass is not None else jnp.linalg.solve
-        one = jnp.eye(free.size, dtype=y.dtype)
-        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(one)
-        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
-        return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
+            if as_given and structure.mass is not None:
+                inverse = np.linalg.inv(structure.mass[np.ix_(rows, columns)])
+                found = -jnp.asarray(inverse, y.dtype) @ residual(begin)
+            elif structure.is_linear:
+                both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
+                matrix, value = both(begin)
+                found = divided(matrix, -value)
+            else:
+                found = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
+            return jnp.zeros_like(y).at[columns].set(found)
 
-    def _by_slopes(self, equations: Implicit, t: Array, y: Array) -> Float[Array, "n n"]:
-        return jax.jacfwd(equations, 2)(t, y, self.slopes(equations, 0, t, y))
+        return small(slopes, *self.like)
 
-    def fits(self, equations: Implicit, t: Array, y: Array) -> Bool[Array, ""]:
-        """Whether the equations that are left contain no slopes with the numbers at hand, which may
-        be others than those with which the structure was found."""
-        if self.mass is not None or not self.rounds:
-            return jnp.asarray(True)
-        left = self._by_slopes(equations, t, y)[np.array(self.left(0), int)]
-        if self.apart:
-            return ~jnp.any(left)
-        along, _ = self.freely_moved(equations, t, y)
-        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
-        return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
-
-    def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
-        """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
-        selected; each of the others is a derivative of what is left of the one before."""
-        if k == 0:
-            return lambda t, y: []
-        left = np.array(self.left(k - 1), int)
-
-        def given(t: Array, y: Array) -> list[Array]:
-            slopes = jnp.zeros_like(y) if self.apart else self.slopes(equations, 0, t, y)
-            return [equations(t, y, slopes)[left]]
-
-        def further(t: Array, y: Array) -> list[Array]:
-            before = self.constraints(equations, k - 1)
-            given, rates = _along(before, t, y, self.slopes(equations, k - 1, t, y))
-            return [*given, rates[-1][np.searchsorted(self.left(k - 2), left)]]
-
-        return given if k == 1 else further
-
-    def last_gradients(self, equations: Implicit, t: Array, y: Array) -> np.ndarray:
-        constraints = self.constraints(equations, self.index)
-        return np.asarray(jax.jit(jax.jacfwd(lambda t, y: constraints(t, y)[-1], 1))(t, y))
-
-    def reduced(self, equations: Implicit, k: int) -> Implicit:
+    def reduced(self, k: int) -> Implicit:
         """`F_k`, the equations after so many differentiations."""
         if k == 0:
-            return equations
+            return self.equations
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
-            _, rates = _along(self.constraints(equations, k), t, y, slopes)
-            return self._replaced(equations(t, y, slopes), rates)
+            first = lambda t, y: self.constraints(t, y)[:k]  # noqa: E731
+            _, rates = _along(first, t, y, slopes)
+            return self._replaced(self.equations(t, y, slopes), rates)
 
-        return differentiated
+        return small(differentiated, *self.like, self.like[1])
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
         rates of their constraints."""
         for k, rate in enumerate(rates):
-            values = values.at[np.array(self.left(k), int)].set(rate)
+            values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
+
+    def freely_moved(
+        self, t: Array, y: Float[Array, " n"]
+    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
+        what the equations differentiate, such as the charges of condensers; and which unknowns are
+        the coordinates along it."""
+        structure = self.structure
+        rows, columns = (np.array(x, int) for x in structure.rounds[0])
+        free = np.array([j for j in range(structure.size) if j not in columns], int)
+        matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
+        solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
+        one = jnp.eye(free.size, dtype=y.dtype)
+        along = jnp.zeros((structure.size, free.size), y.dtype).at[free].set(one)
+        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
+        return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
+
+    def _by_slopes(self, t: Array, y: Array) -> Float[Array, "n n"]:
+        return jax.jacfwd(self.equations, 2)(t, y, self.slopes(0)(t, y))
+
+    def fits(self, t: Array, y: Array) -> Bool[Array, ""]:
+        """Whether the equations that are left contain no slopes with the numbers at hand, which may
+        be others than those with which the structure was found."""
+        structure = self.structure
+        if structure.mass is not None or not structure.rounds:
+            return jnp.asarray(True)
+        left = self._by_slopes(t, y)[np.array(structure.left(0), int)]
+        if structure.apart:
+            return ~jnp.any(left)
+        along, _ = self.freely_moved(t, y)
+        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
+        return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
+
+    def where_it_fits(self, fn: Callable[[Array, Array], Any]) -> Callable[[Array, Array], Any]:
+        """`fn(t, y)`, and NaN where the structure does not fit."""
+
+        def checked(t: Array, y: Array) -> Any:
+            fits = self.fits(*lax.stop_gradient((t, y)))
+            return jtu.tree_map(lambda x: jnp.where(fits, x, jnp.nan), fn(t, y))
+
+        return small(checked, *self.like)
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
@@ -229,11 +259,13 @@ def find_structure(
     selected, gradients = _extended(matrix, _NONE), np.zeros((0, y.size))
     rest = np.delete(np.stack([matrix, other]), selected.equations, axis=1)
     structure = Structure(y.size, (), is_linear, mass, apart=not np.any(rest))
-    brought, met = [], []
+    reduction, brought, met = Reduction(structure, equations, t, y), [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
-        structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
+        reduction.differentiate(selected)
+        structure = reduction.structure
         left = structure.left(structure.index - 1)
-        new = structure.last_gradients(equations, t, y)
+        last = lambda t, y, of=reduction.constraints: of(t, y)[-1]  # noqa: E731
+        new = np.asarray(jax.jit(jax.jacfwd(last, 1))(t, y))
         brought.append((new != 0).any(0) & ~(gradients != 0).any(0))
         met.append(len(_extended(new[:, brought[-1]], _NONE).equations) == len(new))
         gradients = np.concatenate([gradients, new])
@@ -313,7 +345,8 @@ def structure_of(equations: Implicit, t: Array, y: Array, mass: np.ndarray | Non
         there = [1.5 * x + 1 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
 
         def of(consts: list[Array]) -> Implicit:
-            return lambda t, y, slopes: jax.core.eval_jaxpr(closed.jaxpr, consts, t, y, slopes)[0]
+            evaluate = lambda *given: jax.core.eval_jaxpr(closed.jaxpr, consts, *given)[0]  # noqa: E731
+            return small(evaluate, t, slopes, slopes)
 
         return find_structure(of(here), of(there), _stand_in(t), _stand_in(y), mass)
 

@@ -11,11 +11,17 @@ the *places* of its elements in that list. A primitive that only moves elements 
 which costs nothing at run time. An elementwise primitive, a reduction, or a product of matrices
 appends new scalars to the list. Any other primitive stays in arrays in its place: its operands are
 stacked, and its results taken apart.
+
+In scalars one sees what an operation on arrays hides. An operation on the same places is the same
+number, so it is in the list once. Operations on known numbers, such as indices, are computed at
+once, a sum with zero and a product with one are no operations, and what no result needs is left
+out. A derivative of a derivative, as JAX makes it, consists mostly of these (A. Griewank and
+A. Walther, *Evaluating Derivatives*, SIAM 2008).
 """
 
 import functools as ft
 import itertools as it
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -23,18 +29,14 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.custom_batching
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._constants import OPERATIONS
+from .._constants import OPERATIONS, TRIED
 from .jaxprs import closed_jaxpr, outputs, walk
-
-# An array as a tuple of its elements.
-Scalars = tuple[Any, ...]
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
@@ -43,50 +45,71 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     XLA tends to repeat the whole computation for each element of the result, so the limit is
     divided by their number.
     """
-    out = jax.eval_shape(fn, y)
-    size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
-    written = in_scalars(fn, y, limit=OPERATIONS // size, differentiated=True)
-    if written is None:
-        return fn(y)
-    return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
+    return _in_arrays(fn, (y,), lambda size: OPERATIONS // max(1, size), zeros=False)(y)
 
 
-def in_scalars(
-    fn: Callable[..., Any],
-    *like: Any,
-    limit: int = OPERATIONS,
-    differentiated: bool = False,
-) -> Callable[..., Any] | None:
+def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[Array]]:
+    """`fn`, a function of arrays like these, as a small program, whose derivatives are small too;
+    `fn` itself if that is not possible or is still too large.
+
+    A product with the number zero is zero here, also where the other factor is infinite, as in all
+    derivatives by JAX.
+    """
+    return _in_arrays(fn, like, lambda size: OPERATIONS, zeros=True)
+
+
+def _in_arrays(
+    fn: Callable[..., Any], like: Any, limit: Callable[[int], int], zeros: bool
+) -> Callable[..., Any]:
+    """`fn`, computed in scalars with its derivative, if it has at most `limit(size)` operations for
+    a result with so many numbers."""
+    leaves, treedef = jtu.tree_flatten(like)
+    if sum(map(jnp.size, leaves)) > OPERATIONS:
+        return fn
+    closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
+    outs, out_treedef = jtu.tree_flatten(out)
+    program = _Program(limit(sum(map(jnp.size, outs))), differentiated=True, zeros=zeros)
+    try:
+        wholes = [program.given() for _ in leaves]
+        inputs = [program.taken_apart(*x) for x in zip(wholes, map(jnp.shape, leaves), strict=True)]
+        found = program.results(closed, inputs)
+        arrays = [program.array(x, like.dtype) for x, like in zip(found, outs, strict=True)]
+        evaluate = program.evaluation(arrays)
+    except _NotWrittenOut:
+        return fn
+
+    def written(*args: Any) -> Any:
+        found = zip(evaluate(treedef.flatten_up_to(args)), outs, strict=True)
+        return out_treedef.unflatten([jnp.asarray(x, like.dtype) for x, like in found])
+
+    return written
+
+
+def in_scalars(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements.
 
-    It is `None` if `fn` is too large, has an effect or uses random keys. With `differentiated` it
-    has the derivative of `fn`, even if a function inside has a derivative rule of its own: then
-    such a function stays as it is. Without it the function is looked into, and its rule is lost.
+    It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
+    a derivative rule of its own is looked into, and its rule is lost.
     """
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
-    if sum(map(prod, shapes)) > limit:
+    if sum(map(prod, shapes)) > OPERATIONS:
         return None
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)
-
-    def write_out(*scalars: Any) -> list[Array]:
-        rest = iter(scalars)
-        given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
-        return _WriteOut(limit, differentiated)(closed, shapes, given)
-
-    # Tracing `write_out` once gives a jaxpr of scalars. It can be evaluated without rewriting
-    # again.
-    flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(x.size)]
+    program = _Program(OPERATIONS, differentiated=False, zeros=False)
+    inputs = [np.array([program.given() for _ in range(prod(x))], int).reshape(x) for x in shapes]
     try:
-        evaluate = jex.jaxpr_as_fun(jax.make_jaxpr(write_out)(*flat))
+        found = program.results(closed, inputs)
+        evaluate = program.evaluation([int(i) for x in found for i in x.flat])
     except _NotWrittenOut:
         return None
 
     def written(*args: Any) -> Any:
         given = treedef.flatten_up_to(args)
-        rest = iter(evaluate(*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))))
-        results = (tuple(it.islice(rest, x.size)) if x.ndim else next(rest) for x in outs)
+        rest = iter(evaluate([*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))]))
+        cast = lambda like: jnp.asarray(next(rest), like.dtype)  # noqa: E731
+        results = (tuple(cast(x) for _ in range(x.size)) if x.ndim else cast(x) for x in outs)
         return out_treedef.unflatten(results)
 
     return written
@@ -158,12 +181,12 @@ rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xo
 """
 _ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 _REDUCTIONS = {
-    "reduce_sum": lax.add,
-    "reduce_prod": lax.mul,
-    "reduce_max": lax.max,
-    "reduce_min": lax.min,
-    "reduce_and": lax.bitwise_and,
-    "reduce_or": lax.bitwise_or,
+    "reduce_sum": ("add", lax.add),
+    "reduce_prod": ("mul", lax.mul),
+    "reduce_max": ("max", lax.max),
+    "reduce_min": ("min", lax.min),
+    "reduce_and": ("and", lax.bitwise_and),
+    "reduce_or": ("or", lax.bitwise_or),
 }
 # The parameters of a product of matrices that we can treat. A requested precision may be ignored,
 # because the sums of products are computed in the type of the state.
@@ -220,16 +243,26 @@ _BY_INDICES = {
     "scatter": (1, 2),
     "scatter-add": (1, 2),
 }
-# What JAX does to indices before it uses them, for example to replace -1 by the last place. These
-# are computed by numpy, so that the indices remain known.
-_ON_INDICES: dict[str, Callable[..., np.ndarray]] = {
+# What is computed at once for known numbers. Indices need all of it: JAX replaces -1 by the last
+# place before it uses them.
+_KNOWN: dict[str, Callable[..., Any]] = {
+    "abs": np.abs,
     "add": np.add,
-    "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
+    "and": np.bitwise_and,
+    "convert_element_type": lambda x: x,
+    "eq": np.equal,
+    "ge": np.greater_equal,
+    "gt": np.greater,
+    "le": np.less_equal,
     "lt": np.less,
     "max": np.maximum,
     "min": np.minimum,
     "mul": np.multiply,
-    "select_n": lambda which, *cases: np.choose(which, cases),
+    "ne": np.not_equal,
+    "neg": np.negative,
+    "not": np.bitwise_not,
+    "or": np.bitwise_or,
+    "select_n": lambda which, *cases: cases[int(which)],
     "sub": np.subtract,
 }
 
@@ -251,23 +284,50 @@ _INSTEAD: dict[str, Callable[..., Any]] = {
 }
 
 
-class _WriteOut:
-    """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
+class _Program:
+    """A list of operations, each on results of earlier ones, in which none stands twice."""
 
-    def __init__(self, limit: int, differentiated: bool):
-        self.limit, self.differentiated = limit, differentiated
-        self.scalars: list[Any] = []
+    def __init__(self, limit: int, differentiated: bool, zeros: bool):
+        self.limit, self.differentiated, self.zeros = limit, differentiated, zeros
         self.num_operations = 0
+        # At each place: a number, an operation with the places of its operands, or `None` for what
+        # is given.
+        self.entries: list[Any] = []
+        self.places: dict[Any, int] = {}  # of operations and numbers
+        self.negated: dict[int, int] = {}  # the place of `x` by that of `-x`
         # The arrays that were taken apart, by the place of their first element. If one is needed as
         # a whole again, it need not be stacked.
-        self.arrays: dict[int, Array] = {}
+        self.wholes: dict[int, tuple[int, _Places]] = {}
 
-    def __call__(
-        self, closed: Any, shapes: list[tuple[int, ...]], inputs: Iterable[Scalars]
-    ) -> list[Array]:
-        places = [self._add(x, shape) for x, shape in zip(inputs, shapes, strict=True)]
-        outputs = walk(closed, places, self._constant, self._equation)
-        return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
+    def given(self) -> int:
+        self.entries.append(None)
+        return len(self.entries) - 1
+
+    def results(self, closed: Any, inputs: list[_Places]) -> list[_Places]:
+        return walk(closed, inputs, self._constant, self._equation)
+
+    def evaluation(self, results: list[int]) -> Callable[[list[Any]], list[Any]]:
+        """The results as a function of what is given."""
+        needed, rest = set(), [*results]
+        while rest:
+            i = rest.pop()
+            if i not in needed and isinstance(self.entries[i], tuple):
+                needed.add(i)
+                rest += self.entries[i][1]
+        if len(needed) > self.limit:
+            raise _NotWrittenOut
+        entries, order = self.entries, sorted(needed)
+
+        def evaluate(given: list[Any]) -> list[Any]:
+            values = given + entries[len(given) :]
+            for i in order:
+                fn, row = entries[i]
+                values[i] = fn(*(values[j] for j in row))
+            return [values[i] for i in results]
+
+        return evaluate
+
+    # ---- Equations ----
 
     def _equation(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         """The places of the results of an equation, by the rule for its kind of primitive."""
@@ -281,6 +341,7 @@ class _WriteOut:
             for key, value in params.items()
             if value is not None and key not in ("sharding", "out_sharding")
         }
+        dtype = eqn.outvars[0].aval.dtype if eqn.outvars else None
         if name in _MOVES:
             moved = _MOVES[name](*inputs, **given)
             return moved if isinstance(moved, list) else [moved]
@@ -290,38 +351,42 @@ class _WriteOut:
             indices = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
             return [self._constant(_broadcast(indices, params["shape"], (params["dimension"],)))]
         if name in _ELEMENTWISE:
-            known = self._known_integers(inputs) if name in _ON_INDICES else None
-            if known is not None:
-                computed = _ON_INDICES[name](*known, **given)
-                return [self._constant(computed.astype(eqn.outvars[0].aval.dtype))]
-            fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
-            return [self._elementwise(fn, inputs)]
+            if name == "copy" or (
+                name == "convert_element_type" and dtype == eqn.invars[0].aval.dtype
+            ):
+                return inputs
+            fn = ft.partial(eqn.primitive.bind, **params)
+            fn = fn if self.zeros else _INSTEAD.get(name, fn)
+            return [self._elementwise(name, fn, inputs, dtype, tuple(sorted(given.items())))]
         if name in _REDUCTIONS and given.keys() == {"axes"} and inputs[0].size:
-            return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
+            return [self._reduce(*_REDUCTIONS[name], inputs[0], params["axes"], dtype)]
         types = {var.aval.dtype for var in (*eqn.invars, *eqn.outvars)}
         if name == "dot_general" and given.keys() <= _DOT and len(types) == 1:
-            return [self._dot(inputs, params["dimension_numbers"])]
+            return [self._dot(inputs, params["dimension_numbers"], dtype)]
         if name in _CALLS or (name in _CALLS_WITH_A_RULE and not self.differentiated):
-            inner = params.get("call_jaxpr", params.get("jaxpr"))
-            return walk(closed_jaxpr(inner), inputs, self._constant, self._equation)
-        return self._in_arrays(eqn, inputs)
+            return self.results(closed_jaxpr(params.get("call_jaxpr", params.get("jaxpr"))), inputs)
+        return self._as_it_is(eqn, inputs)
 
-    def _elementwise(self, fn: Callable[..., Array], inputs: list[_Places]) -> _Places:
+    def _elementwise(
+        self, name: str, fn: Any, inputs: list[_Places], dtype: Any, params: Any = ()
+    ) -> _Places:
         inputs = [*np.broadcast_arrays(*inputs)]
         self._count(inputs[0].size)
-        rows = zip(*(places.flat for places in inputs), strict=True)
-        return self._add((fn(*(self.scalars[i] for i in row)) for row in rows), inputs[0].shape)
+        rows = zip(*(places.ravel().tolist() for places in inputs), strict=True)
+        out = [self._scalar(name, fn, row, dtype, params) for row in rows]
+        return np.array(out, int).reshape(inputs[0].shape)
 
     def _reduce(
-        self, fn: Callable[[Array, Array], Array], places: _Places, axes: tuple[int, ...]
+        self, name: str, fn: Any, places: _Places, axes: tuple[int, ...], dtype: Any
     ) -> _Places:
         self._count(places.size)
         places = np.moveaxis(places, axes, range(-len(axes), 0))
         shape = places.shape[: places.ndim - len(axes)]
-        rows = places.reshape(prod(shape), -1)
-        return self._add((ft.reduce(fn, [self.scalars[i] for i in row]) for row in rows), shape)
+        rows = places.reshape(prod(shape), -1).tolist()
+        both = lambda a, b: self._scalar(name, fn, (a, b), dtype)  # noqa: E731
+        return np.array([ft.reduce(both, row) for row in rows], int).reshape(shape)
 
-    def _dot(self, inputs: list[_Places], dimensions: Any) -> _Places:
+    def _dot(self, inputs: list[_Places], dimensions: Any, dtype: Any) -> _Places:
         """A product of arrays, as products of their elements that are summed. The axes of both are
         brought into the order batch, free, contracted, and the free ones are spread out."""
         contracted, batch = dimensions
@@ -335,15 +400,16 @@ class _WriteOut:
         middle = first + free[0]
         a = a.reshape(*a.shape[:middle], *[1] * free[1], *a.shape[middle:])
         b = b.reshape(*b.shape[:first], *[1] * free[0], *b.shape[first:])
-        product = self._elementwise(lax.mul, [a, b])
-        return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
+        product = self._elementwise("mul", lax.mul, [a, b], dtype)
+        axes = tuple(range(product.ndim - last, product.ndim))
+        return self._reduce("add", lax.add, product, axes, dtype)
 
     def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
         first, last = _BY_INDICES[name]
-        indices = self._known_integers(inputs[first:last])
-        if indices is None:
-            return self._in_arrays(eqn, inputs)
+        indices = [self._integers(x) for x in inputs[first:last]]
+        if any(x is None for x in indices):
+            return self._as_it_is(eqn, inputs)
 
         def moved(*others: np.ndarray, **given: Any) -> np.ndarray:
             """What the primitive does to numbers in the place of the other operands."""
@@ -359,9 +425,7 @@ class _WriteOut:
             nothing, out = np.zeros(operand.shape, dtype), operand.copy()
             for one, place in zip(np.eye(updates.size, dtype=dtype), updates.flat, strict=True):
                 for at in zip(*np.nonzero(moved(nothing, one.reshape(updates.shape))), strict=True):
-                    (out[at],) = self._add(
-                        [lax.add(self.scalars[out[at]], self.scalars[place])], (1,)
-                    )
+                    out[at] = self._scalar("add", lax.add, (int(out[at]), int(place)), dtype)
             return [out]
         places = [x.astype(np.int32) for x in (*inputs[:first], *inputs[first:][len(indices) :])]
         if name != "gather":
@@ -374,58 +438,169 @@ class _WriteOut:
             out = np.where(out < 0, self._constant(filled), out)
         return [out]
 
-    def _in_arrays(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
+    def _as_it_is(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         """A primitive for which there is no rule here: its inputs are stacked to arrays, and its
         outputs are taken apart."""
         self._count(sum(prod(var.aval.shape) for var in (*eqn.invars, *eqn.outvars)))
-        given = [self._array(x, var.aval.dtype) for x, var in zip(inputs, eqn.invars, strict=True)]
-        return [self._taken_apart(x) for x in outputs(eqn, *given)]
+        row = tuple(self.array(x, v.aval.dtype) for x, v in zip(inputs, eqn.invars, strict=True))
+        called = self._operation(id(eqn), lambda *xs: outputs(eqn, *xs), row)
+        out = []
+        for k, var in enumerate(eqn.outvars):
+            one = self._operation("output", lambda xs, k=k: xs[k], (called,), k)
+            out.append(self.taken_apart(one, var.aval.shape))
+        return out
 
-    def _array(self, places: _Places, dtype: Any) -> Any:
-        """The array of these elements. If they are those of an array that was taken apart, in the
-        same order, it is that array."""
-        whole = self.arrays.get(places.flat[0]) if places.size else None
-        if whole is not None and np.array_equal(
-            np.arange(whole.size), places.ravel() - places.flat[0]
-        ):
-            return whole.reshape(places.shape)
-        elements = [self.scalars[i] for i in places.flat]
-        if any(isinstance(x, jax.core.Tracer) for x in elements):
-            return jnp.stack(elements).reshape(places.shape)
-        return np.array(elements, dtype).reshape(places.shape)
+    # ---- Arrays and their elements ----
 
-    def _taken_apart(self, x: Array) -> _Places:
-        self.arrays[len(self.scalars)] = x
-        return self._add(components(jnp.atleast_1d(x)), x.shape)
+    def taken_apart(self, whole: int, shape: tuple[int, ...]) -> _Places:
+        """The places of the elements of an array whose own place is given."""
+        if not shape:
+            return np.array(whole)
+        flat = self._operation("elements", components, (whole,))
+        each = [
+            self._operation("element", lambda x, k=k: x[k], (flat,), k) for k in range(prod(shape))
+        ]
+        places = np.array(each, int).reshape(shape)
+        if each:
+            self.wholes[each[0]] = whole, places
+        return places
 
-    def _known_integers(self, inputs: list[_Places]) -> list[np.ndarray] | None:
-        """The values of integer or boolean arrays, as indices are; `None` if they are not known."""
-        if any(
-            isinstance(x := self.scalars[i], jax.core.Tracer) or x.dtype.kind not in "iub"
-            for places in inputs
-            for i in places.flat
-        ):
-            return None
-        return [np.array([self.scalars[i] for i in x.flat]).reshape(x.shape) for x in inputs]
+    def array(self, places: _Places, dtype: Any) -> int:
+        """The place of the array of these elements. If they are those of an array that was taken
+        apart, in the same order, it is that array."""
+        shape = places.shape
+        if not shape:
+            return int(places)
+        row = tuple(places.ravel().tolist())
+        whole, those = self.wholes.get(row[0], (0, None)) if row else (0, None)
+        if those is not None and row == tuple(those.ravel().tolist()):
+            if shape == those.shape:
+                return whole
+            return self._operation("reshape", lambda x: x.reshape(shape), (whole,), shape)
+
+        def stacked(*scalars: Any) -> Any:
+            if any(isinstance(x, jax.core.Tracer) for x in scalars):
+                return jnp.stack(scalars).reshape(shape)
+            return np.array(scalars, dtype).reshape(shape)
+
+        return self._operation("array", stacked, row, (shape, dtype))
 
     def _constant(self, x: Any) -> _Places:
         self._count(np.size(x))
         if _is_key(x):
             raise _NotWrittenOut
         if isinstance(x, jax.core.Tracer):
-            return self._taken_apart(x)
-        return self._add(np.asarray(x).flat, np.shape(x))
+            return self.taken_apart(self._operation(id(x), lambda: x, ()), x.shape)
+        x = np.asarray(x)
+        return np.array([self._number(e) for e in x.flat], int).reshape(x.shape)
 
-    def _add(self, scalars: Iterable[Any], shape: tuple[int, ...]) -> _Places:
-        """Appends scalars to the list, and returns their places in an array of this shape."""
-        first = len(self.scalars)
-        self.scalars.extend(scalars)
-        return np.arange(first, len(self.scalars)).reshape(shape)
+    def _integers(self, places: _Places) -> np.ndarray | None:
+        """The values of an array of integers or booleans, as indices are; `None` if they are not
+        known."""
+        numbers = [self.entries[i] for i in places.flat]
+        known = all(isinstance(x, np.generic) and x.dtype.kind in "iub" for x in numbers)
+        return np.array(numbers).reshape(places.shape) if known else None
+
+    # ---- Scalars ----
+
+    def _number(self, x: Any) -> int:
+        key = x.dtype, x.tobytes()
+        if key not in self.places:
+            self.places[key] = len(self.entries)
+            self.entries.append(x)
+        return self.places[key]
+
+    def _operation(self, name: Any, fn: Any, row: tuple[int, ...], params: Any = ()) -> int:
+        key = name, params, row
+        if key not in self.places:
+            self.places[key] = len(self.entries)
+            self.entries.append((fn, row))
+        return self.places[key]
+
+    def _scalar(
+        self, name: str, fn: Any, row: tuple[int, ...], dtype: Any, params: Any = ()
+    ) -> int:
+        """The place of the result of an operation on scalars."""
+        name = "add" if name == "add_any" else name
+        known = [x if isinstance(x := self.entries[i], np.generic) else None for i in row]
+        if name in _KNOWN and all(x is not None for x in known):
+            with np.errstate(all="ignore"):
+                return self._number(np.asarray(_KNOWN[name](*known)).astype(dtype)[()])
+        if name in _SIMPLER:
+            simpler = _SIMPLER[name](self, row, known, dtype)
+            if simpler is not None:
+                return simpler
+        if name in ("add", "mul"):
+            row = tuple(sorted(row))
+        place = self._operation(name, fn, row, params)
+        if name == "neg":
+            self.negated[place] = row[0]
+        return place
 
     def _count(self, operations: int) -> None:
         self.num_operations += operations
-        if self.num_operations > self.limit:
+        if self.num_operations > (TRIED * self.limit if self.zeros else self.limit):
             raise _NotWrittenOut
+
+
+# ---- What is no operation, or a simpler one ----
+
+
+def _product(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
+    for (i, x), j in zip(zip(row, known, strict=True), row[::-1], strict=True):
+        if x is not None and x == 0 and program.zeros:
+            return i
+        if x is not None and x == 1:
+            return j
+        if x is not None and x == -1 and dtype.kind in "fc":
+            return program._scalar("neg", lax.neg, (j,), dtype)
+        if i in program.negated:
+            product = program._scalar("mul", lax.mul, (program.negated[i], j), dtype)
+            return program._scalar("neg", lax.neg, (product,), dtype)
+    return None
+
+
+def _sum(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
+    for (i, x), j in zip(zip(row, known, strict=True), row[::-1], strict=True):
+        if x is not None and x == 0:
+            return j
+        if i in program.negated:
+            return program._scalar("sub", lax.sub, (j, program.negated[i]), dtype)
+    return None
+
+
+def _difference(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
+    if known[1] is not None and known[1] == 0:
+        return row[0]
+    if known[0] is not None and known[0] == 0:
+        return program._scalar("neg", lax.neg, (row[1],), dtype)
+    if row[1] in program.negated:
+        return program._scalar("add", lax.add, (row[0], program.negated[row[1]]), dtype)
+    return None
+
+
+def _quotient(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
+    del dtype
+    if known[1] is not None and known[1] == 1:
+        return row[0]
+    return row[0] if program.zeros and known[0] is not None and known[0] == 0 else None
+
+
+def _choice(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
+    del program, dtype
+    if known[0] is not None:
+        return row[1 + int(known[0])]
+    return row[1] if len(set(row[1:])) == 1 else None
+
+
+_SIMPLER: dict[str, Callable[..., int | None]] = {
+    "add": _sum,
+    "div": _quotient,
+    "mul": _product,
+    "neg": lambda program, row, known, dtype: program.negated.get(row[0]),
+    "select_n": _choice,
+    "sub": _difference,
+}
 
 
 def _is_key(x: Any) -> bool:
