@@ -489,7 +489,7 @@ def _consistent(
     units = structure.units(jnp.where(sizes == 0, 1, sizes))
     if moves is not None:
         units = jnp.where(moves, units, 0)
-    none = jnp.zeros_like(jnp.concatenate(_Constraints(dae)(t, y, args)))
+    none = jnp.zeros(sum(len(structure.left(k)) for k in range(structure.index)), units.dtype)
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, free = stage
@@ -514,8 +514,9 @@ def _solved_for(
 ) -> Float[Array, " n"]:
     """The state of equations of index 1, moved without what they differentiate; NaN if Newton's
     method finds none."""
-    structure = _structure(dae, t, state, args)
-    reduction, t, y = _at(dae, structure, t, state, args)
+    structure, t, state = _at(dae, t, state, args)
+    y = ravel(state)
+    reduction = Reduction(structure, dae._equations(t, state, args), t, y)
     along, free = reduction.freely_moved(t, y)
     fits = reduction.fits(t, y)
 
@@ -536,7 +537,8 @@ class _Slopes(eqx.Module):
     dae: DAE
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        return unravel(_slopes(self.dae, _structure(self.dae, t, y, args), t, y, args), y)
+        structure, t, y = _at(self.dae, t, y, args)
+        return unravel(_slopes(self.dae, structure, t, y, args), y)
 
 
 @final
@@ -548,7 +550,7 @@ class _Constraints(eqx.Module):
     asked: Bool[Array, " rounds"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        structure = _structure(self.dae, t, y, args)
+        structure, t, y = _at(self.dae, t, y, args)
         if not structure.index:
             return [jnp.zeros_like(ravel(y)[:1])]  # every state will do
         found = _constraints(self.dae, structure, t, y, args)
@@ -573,37 +575,32 @@ class _Stages(eqx.Module):
             )
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
-        structure = _structure(self.dae, t, y, args)
-        return _reduced(self.dae, structure, t, y, slopes, args)
+        structure, t, y = _at(self.dae, t, y, args)
+        return _reduced(self.dae, structure, t, y, ravel(slopes), args)
 
 
-# Each is traced once for all uses.
-
-
-@eqx.filter_jit
-def _slopes(dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args) -> Array:
-    reduction, t, y = _at(dae, structure, t, y, args)
-    return reduction.where_it_fits(reduction.slopes(structure.index))(t, y)
+# Each is traced once for all uses, of times and states that have no weak types.
 
 
 @eqx.filter_jit
-def _constraints(dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args) -> Values:
-    reduction, t, y = _at(dae, structure, t, y, args)
-    return reduction.where_it_fits(reduction.constraints)(t, y)
+def _slopes(dae: DAE, structure: Structure, t: Array, y: Y, args: Args) -> Array:
+    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
+    return reduction.where_it_fits(reduction.slopes(structure.index))(t, ravel(y))
 
 
 @eqx.filter_jit
-def _reduced(
-    dae: DAE, structure: Structure, t: RealScalarLike, y: Y, slopes: Y, args: Args
-) -> Array:
-    reduction, t, y = _at(dae, structure, t, y, args)
-    return reduction.reduced(max(structure.index - 1, 0))(t, y, ravel(slopes))
+def _constraints(dae: DAE, structure: Structure, t: Array, y: Y, args: Args) -> Values:
+    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
+    return reduction.where_it_fits(reduction.constraints)(t, ravel(y))
 
 
-def _at(
-    dae: DAE, structure: Structure, t: RealScalarLike, y: Y, args: Args
-) -> tuple[Reduction, Array, Array]:
-    y = jtu.tree_map(jnp.asarray, y)
+@eqx.filter_jit
+def _reduced(dae: DAE, structure: Structure, t: Array, y: Y, slopes: Array, args: Args) -> Array:
+    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
+    return reduction.reduced(max(structure.index - 1, 0))(t, ravel(y), slopes)
+
+
+def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Array, Y]:
+    y = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), y)
     t = jnp.asarray(t, jnp.result_type(float, t))
-    vector = ravel(y)
-    return Reduction(structure, dae._equations(t, y, args), t, vector), t, vector
+    return _structure(dae, t, y, args), t, y

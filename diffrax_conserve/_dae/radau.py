@@ -19,6 +19,7 @@ from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
 from .._step.implicit import root
 from .._step.iterate import Solved, after_step, iterate, keep_done
+from .._step.linear import lu_factors, lu_solution
 from .._tree import ravel, unravel
 
 # The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
@@ -149,21 +150,16 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
             times = t0 + jnp.asarray(_NODES, jnp.result_type(t0)) * (t1 - t0)
             return at_stages(times, y, inverse @ (y - start) / length)
 
-        by_y, by_slope = lax.stop_gradient(
-            (
-                jax.jacfwd(lambda y: residual(t0, y, slope))(start),
-                jax.jacfwd(lambda slope: residual(t0, start, slope))(slope),
-            )
-        )
-        real = jax.scipy.linalg.lu_factor(_REAL / length * by_slope + by_y)
-        pair = jax.scipy.linalg.lu_factor(_PAIR / length * by_slope + by_y)
+        by_y, by_slope = lax.stop_gradient(jax.jacfwd(residual, (1, 2))(t0, start, slope))
+        real = lu_factors(_REAL / length * by_slope + by_y)
+        pair = lu_factors(_PAIR / length * by_slope + by_y)
 
         def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
             """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
             by the eigenvectors of `A⁻¹`."""
             modes = -jnp.asarray(_TO_MODES, pair[0].dtype) @ residuals
-            first = jax.scipy.linalg.lu_solve(real, modes[0].real)
-            second = jax.scipy.linalg.lu_solve(pair, modes[1])
+            first = lu_solution(real, modes[0].real)
+            second = lu_solution(pair, modes[1])
             vectors = jnp.asarray(_VECTORS, pair[0].dtype)
             other = 2 * (vectors[:, 1, None] * second).real
             return vectors[:, 0, None].real * first + other
@@ -196,7 +192,7 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
         # The error estimate.
         slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
-        filtered = lambda y: -jax.scipy.linalg.lu_solve(real, residual(t0, y, slopes))  # noqa: E731
+        filtered = lambda y: -lu_solution(real, residual(t0, y, slopes))  # noqa: E731
         error = filtered(start + filtered(start))
         ok = found.ok & jnp.all(jnp.isfinite(error))
         big = float(jnp.finfo(start.dtype).max) ** 0.5

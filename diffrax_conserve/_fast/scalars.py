@@ -68,7 +68,7 @@ def _in_arrays(
         return fn
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)
-    program = _Program(limit(sum(map(jnp.size, outs))), differentiated=True, zeros=zeros)
+    program = _Program(limit(sum(x.size for x in outs)), differentiated=True, zeros=zeros)
     try:
         wholes = [program.given() for _ in leaves]
         inputs = [program.taken_apart(*x) for x in zip(wholes, map(jnp.shape, leaves), strict=True)]
@@ -216,6 +216,81 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     return out[tuple(kept)]
 
 
+_FILL = lax.GatherScatterMode.FILL_OR_DROP
+
+
+def _filling(dtype: Any) -> Any:
+    """What a gather returns for elements outside, unless it says otherwise."""
+    if jnp.issubdtype(dtype, jnp.inexact):
+        return np.nan
+    if dtype.kind == "b":
+        return True
+    limits = jnp.iinfo(dtype)
+    return limits.min if limits.min else limits.max
+
+
+def _slices(shape: Sequence[int], starts: Sequence[Any], sizes: Sequence[int]) -> tuple[slice, ...]:
+    starts = [int(np.clip(i, 0, n - size)) for i, n, size in zip(starts, shape, sizes, strict=True)]
+    return tuple(slice(i, i + size) for i, size in zip(starts, sizes, strict=True))
+
+
+def _replaced(operand: _Places, at: Any, updates: _Places) -> _Places:
+    out = operand.copy()
+    out[at] = updates
+    return out
+
+
+def _gathered(
+    shape: Sequence[int], indices: np.ndarray, numbers: Any, sizes: Sequence[int]
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Which elements of an array of this shape a gather takes, as indices like its result, and
+    whether its slices are inside of the array; they are moved inside. The result has the axes of
+    the indices but the last, and in the places `offset_dims` those of a slice."""
+    map_, batching = numbers.start_index_map, numbers.operand_batching_dims
+    offsets, gone = numbers.offset_dims, (*numbers.collapsed_slice_dims, *batching)
+    kept = [d for d in range(len(shape)) if d not in gone]
+    ndim = indices.ndim - 1 + len(offsets)
+    others = [d for d in range(ndim) if d not in offsets]
+
+    def spread(x: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+        out = [1] * ndim
+        for axis, size in zip(axes, x.shape, strict=True):
+            out[axis] = size
+        return x.reshape(out)
+
+    at, inside = [], np.ones([1] * ndim, bool)
+    for d, (n, size) in enumerate(zip(shape, sizes, strict=True)):
+        start = np.zeros(indices.shape[:-1], int)
+        if d in map_:
+            start = indices[..., map_.index(d)].astype(int)
+        elif d in batching:
+            axis = numbers.start_indices_batching_dims[batching.index(d)]
+            start = start + np.expand_dims(np.arange(n), [*range(1, start.ndim - axis)])
+        inside = inside & spread((start >= 0) & (start <= n - size), others)
+        place = spread(np.clip(start, 0, n - size), others)
+        if d in kept:
+            place = place + spread(np.arange(size), [offsets[kept.index(d)]])
+        at.append(place)
+    return tuple(np.broadcast_arrays(*at)), inside
+
+
+def _scattered(
+    shape: Sequence[int], indices: np.ndarray, numbers: Any, updates: Sequence[int]
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Where a scatter puts its updates, as the gather that would take them from there."""
+    gone = *numbers.inserted_window_dims, *numbers.operand_batching_dims
+    windows = iter([updates[d] for d in numbers.update_window_dims])
+    gather = lax.GatherDimensionNumbers(
+        offset_dims=numbers.update_window_dims,
+        collapsed_slice_dims=numbers.inserted_window_dims,
+        start_index_map=numbers.scatter_dims_to_operand_dims,
+        operand_batching_dims=numbers.operand_batching_dims,
+        start_indices_batching_dims=numbers.scatter_indices_batching_dims,
+    )
+    sizes = [1 if d in gone else next(windows) for d in range(len(shape))]
+    return _gathered(shape, indices, gather, sizes)
+
+
 # The primitives that only move elements, as functions that move their places by numpy. JAX itself
 # could do that too, but it would compile each of them for each shape, which takes 15 to 50 ms.
 _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
@@ -234,8 +309,7 @@ _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
 }
 # The primitives that move elements by indices. The operands from the first number to before the
-# last are the indices. The rules for them are intricate, so we let JAX itself move the places. That
-# is possible if the indices are known when the function is rewritten.
+# last are the indices. We can move the places if the indices are known.
 _BY_INDICES = {
     "dynamic_slice": (1, None),
     "dynamic_update_slice": (2, None),
@@ -410,32 +484,31 @@ class _Program:
         indices = [self._integers(x) for x in inputs[first:last]]
         if any(x is None for x in indices):
             return self._as_it_is(eqn, inputs)
-
-        def moved(*others: np.ndarray, **given: Any) -> np.ndarray:
-            """What the primitive does to numbers in the place of the other operands."""
-            xs = [*others[:first], *indices, *others[first:]]
-            with jax.ensure_compile_time_eval():
-                return np.asarray(eqn.primitive.bind(*xs, **(params | given)))
-
-        if name == "scatter-add":
-            # To find out which update is added to which elements, we let JAX add a one in its place
-            # to zeros.
-            dtype, updates = eqn.outvars[0].aval.dtype, inputs[2]
-            self._count(updates.size)
-            nothing, out = np.zeros(operand.shape, dtype), operand.copy()
-            for one, place in zip(np.eye(updates.size, dtype=dtype), updates.flat, strict=True):
-                for at in zip(*np.nonzero(moved(nothing, one.reshape(updates.shape))), strict=True):
-                    out[at] = self._scalar("add", lax.add, (int(out[at]), int(place)), dtype)
+        dtype, shape = eqn.outvars[0].aval.dtype, operand.shape
+        if name.startswith("dynamic"):
+            sizes = params["slice_sizes"] if name == "dynamic_slice" else inputs[1].shape
+            at = _slices(shape, indices, sizes)
+            return [operand[at] if name == "dynamic_slice" else _replaced(operand, at, inputs[1])]
+        numbers, some = params["dimension_numbers"], params["mode"] == _FILL
+        if name == "gather":
+            at, inside = _gathered(shape, indices[0], numbers, params["slice_sizes"])
+            out = operand[at]
+            if some and not np.all(inside):
+                filling = params["fill_value"]
+                filling = _filling(dtype) if filling is None else filling
+                out = np.where(inside, out, self._constant(np.asarray(filling, dtype)))
             return [out]
-        places = [x.astype(np.int32) for x in (*inputs[:first], *inputs[first:][len(indices) :])]
-        if name != "gather":
-            return [moved(*places)]
-        # Where an index is outside of the operand, a gather returns a filling value, which has no
-        # place yet. We mark it by -1, and let JAX tell the value.
-        out = moved(*places, fill_value=-1)
-        if np.any(out < 0):
-            filled = moved(np.zeros(operand.shape, eqn.outvars[0].aval.dtype))
-            out = np.where(out < 0, self._constant(filled), out)
+        updates = inputs[2]
+        at, inside = _scattered(shape, indices[0], numbers, updates.shape)
+        inside = np.broadcast_to(inside | (not some), updates.shape)
+        at, updates = tuple(x[inside] for x in at), updates[inside]
+        if name == "scatter":
+            return [_replaced(operand, at, updates)]
+        self._count(updates.size)
+        out = operand.copy()
+        for *one, place in zip(*at, updates, strict=True):
+            one = tuple(one)
+            out[one] = self._scalar("add", lax.add, (int(out[one]), int(place)), dtype)
         return [out]
 
     def _as_it_is(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
