@@ -30,14 +30,8 @@ from .._step.roundoff import hidden_scale
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, at_rest_near, divided
 from .radau import Radau
-from .reduction import (
-    Implicit,
-    Reduction,
-    Singular,
-    Structure,
-    structure_of,
-    tree_key,
-)
+from .reduction import Implicit, Reduction, Singular, Structure
+from .search import Search, any_traced, lifted, tree_key
 
 
 @final
@@ -86,11 +80,11 @@ class DAE(eqx.Module):
     solves the ordinary differential equation that follows from the last; that is good for equations
     that are not stiff.
 
-    Which equations are differentiated is found once for the same functions and shapes, from numbers
-    in general position: the guess of the first `consistent`, or where that is not called before,
-    random numbers in the place of states and arguments that JAX traces. So call `consistent` first
-    if zeros in `args` decide about the index. With other zeros, for which an equation that had no
-    slopes has some, a solve fails: make another `DAE` of new functions.
+    Which equations are differentiated belongs to the equations: it is found from numbers in general
+    position in the place of the state and of all arrays in `args`, whatever their values are and
+    whatever is called first. Where the values decide, such as zeros in a matrix that is in `args`,
+    or where the equations are not finite at such numbers, `dae.at(guess, args=args)` gives the same
+    equations as they are there, and `consistent` and `report` say so.
 
     !!! example
 
@@ -130,6 +124,7 @@ class DAE(eqx.Module):
     mass: Any = eqx.field(default=None, kw_only=True, converter=_mass)
     algebraic: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
     residual: Callable[..., Any] | None = eqx.field(default=None, kw_only=True)
+    structure: Structure | None = eqx.field(default=None, kw_only=True, static=True)
 
     def __check_init__(self):
         forms = [x is not None for x in (self.mass, self.algebraic, self.residual)]
@@ -216,7 +211,7 @@ class DAE(eqx.Module):
         `ValueError` if no consistent state is found, or inside of `jit` an error at run time.
         """
         y = self._state(guess)
-        _structure(self, t, y, args)  # from numbers, which JAX does not trace yet
+        _checked_structure(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         moves = None if fixed is None else ~_flags(fixed, y)
         found, ok = _consistent(self, t, y, args, moves)
@@ -248,21 +243,48 @@ class DAE(eqx.Module):
         As `consistent`.
         """
         y = self._state(guess)
-        structure = _structure(self, t, y, args)
+        structure = _checked_structure(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
-        times = [
-            sum(i in structure.left(k) for k in range(structure.index))
-            for i in range(len(equations))
-        ]
+        times = structure.times
         off = eqx.filter_jit(_Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
-            algebraic=tuple(unknowns[j] for j in structure.algebraic),
-            freedom=len(unknowns) - sum(times),
+            algebraic=tuple(unknowns[j] for j in structure.without_slopes),
+            freedom=structure.freedom,
             residuals=tuple(float(jnp.max(jnp.abs(h), initial=0)) for h in off),
         )
+
+    def at(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAE":
+        """The same equations, with the structure that they have near a guess with these `args`.
+
+        Use it where values in `args` decide which equations contain slopes, or if the equations are
+        not finite, or of a lower rank, at numbers in general position. `consistent`, `term` and
+        `wrap` of the result keep this structure. If a solve has other `args` that it does not fit,
+        that solve fails.
+
+        **Arguments:**
+
+        - `guess`, `t`, `args`: as those of `consistent`; numbers that JAX does not trace.
+
+        **Returns:**
+
+        A `DAE`.
+
+        **Raises:**
+
+        As `consistent`, and `TypeError` where JAX traces.
+        """
+        y = self._state(guess)
+        search = _search(self, y, args)
+        if search.is_traced or any_traced((self, t, y, args)):
+            raise TypeError(
+                "`at` of a `DAE` finds its structure from numbers, but JAX traces them here: call "
+                "it outside of `jax.jit` and the like."
+            )
+        found = _found(self, t, y, args, lambda: search.at((self, args), *_numbers(t, y)))
+        return dataclasses.replace(self, structure=found)
 
     def _state(self, guess: tuple[Any, ...]) -> Any:
         wanted = 1 if self.algebraic is None else 2
@@ -340,6 +362,8 @@ DAE.__init__.__doc__ = r"""**Arguments:**
 - `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as
     `z` has.
 - `residual`: called as `residual(t, y, dy, args)`; a PyTree with as many numbers as `y` has.
+- `structure`: which equations are differentiated, if it is not that of numbers in general position.
+    The method `at` sets it.
 
 JAX differentiates all of them, as often as the index is.
 
@@ -374,40 +398,108 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The structures that were found, by the functions and the shapes.
+# The searches and the structures that were found, by the functions and the shapes. Both are functions
+# of these alone, so that it does not matter which are known.
+_SEARCHES: dict[Any, Search] = {}
 _FOUND: dict[Any, Structure] = {}
 
 
+# What JAX raises where a function asks for the value of a number that is traced.
+_ASKED = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
 def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
-    """The structure of the equations. It is found once, because the numbers are not known any more
-    inside a solve, and programs that are compiled keep it."""
+    """The structure of the equations. Inside a solve the numbers are not known any more, so it does
+    not depend on them."""
+    if dae.structure is not None:
+        if dae.structure.size != ravel(y).size:
+            raise ValueError(
+                f"The state has {ravel(y).size} numbers, but the structure that `at` found is one "
+                f"of {dae.structure.size} unknowns: call `at` with a state of this shape."
+            )
+        return dae.structure
     key = tree_key((dae, y, args))
     if key not in _FOUND:
-        t = jnp.asarray(t, jnp.result_type(float, t))
-        mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
-        try:
-            _FOUND[key] = structure_of(dae._equations(t, y, args), t, ravel(y), mass)
-        except Singular as error:
-            names = dae._names(t, y, args)
-            which = ", ".join(f"`{names[i]}`" for i in error.left)
-            unknowns = ", ".join(f"`{_names('y', y)[j]}`" for j in error.absent)
-            lacking = (
-                f"No equation contains {unknowns}."
-                if unknowns
-                else "So some unknown is not determined."
-            )
-            raise ValueError(
-                f"The equations are singular: {which}, or a derivative of it, follows from the "
-                f"other equations or contradicts them. {lacking} Leave out what is stated twice, "
-                "and add the equation that is missing."
-            ) from None
-        except FloatingPointError:
-            raise ValueError(
-                "The equations, or their derivatives, are not finite near the state. Start at a "
-                "state where they are, and find it by `dae.consistent(guess, t=t0, args=args)`, "
-                "outside of functions that JAX traces."
-            ) from None
+        search = _search(dae, y, args)
+        _FOUND[key] = _found(dae, t, y, args, lambda: search.general((dae, args)))
     return _FOUND[key]
+
+
+def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
+    """The structure; raises if the equations have another one with the numbers that are given."""
+    structure = _structure(dae, t, y, args)
+    if dae.structure is not None or any_traced((dae, t, y, args)):
+        return structure
+    search = _search(dae, y, args)
+    if search.is_traced:
+        return structure
+    here = _found(dae, t, y, args, lambda: search.at((dae, args), *_numbers(t, y)))
+    if here.ranks != structure.ranks:
+        raise ValueError(
+            f"With these values the equations have {here}, but with values in general position "
+            f"{structure}. Where values decide, such as zeros in `args`, write `dae = dae.at(guess, "
+            "t=t0, args=args)`, and take `consistent`, `report`, `term` and `wrap` of that."
+        )
+    return structure
+
+
+def _search(dae: DAE, y: Y, args: Args) -> Search:
+    mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
+
+    def equations(tree: Any) -> Implicit:
+        dae, args = tree
+        return dae._equations(0.0, y, args)
+
+    # A Python float is traced, so that a solve in which JAX traces that number needs no search of
+    # its own; unless the functions ask for its value.
+    tree = dae, args
+    key = tree_key((lifted(tree), y))
+    if key not in _SEARCHES:
+        try:
+            _SEARCHES[key] = Search(equations, tree, ravel(y), mass, floats=True)
+        except _ASKED:
+            key = tree_key((tree, y))
+            if key not in _SEARCHES:
+                _SEARCHES[key] = Search(equations, tree, ravel(y), mass, floats=False)
+    return _SEARCHES[key]
+
+
+def _numbers(t: RealScalarLike, y: Y) -> tuple[Array, Array]:
+    return jnp.asarray(t, jnp.result_type(float, t)), ravel(y)
+
+
+def _found(
+    dae: DAE, t: RealScalarLike, y: Y, args: Args, search: Callable[[], Structure]
+) -> Structure:
+    """What a search finds; its errors with the names of the user."""
+    elsewhere = (
+        " If they are so only far from the state of the solve, find their structure at it, by "
+        "`dae = dae.at(guess, t=t0, args=args)`, outside of functions that JAX traces."
+    )
+    try:
+        return search()
+    except Singular as error:
+        names = dae._names(t, y, args)
+        which = ", ".join(f"`{names[i]}`" for i in error.left)
+        unknowns = ", ".join(f"`{_names('y', y)[j]}`" for j in error.absent)
+        lacking = (
+            f"No equation contains {unknowns}."
+            if unknowns
+            else "So some unknown is not determined."
+        )
+        raise ValueError(
+            f"The equations are singular: {which}, or a derivative of it, follows from the "
+            f"other equations or contradicts them. {lacking} Leave out what is stated twice, "
+            f"and add the equation that is missing.{elsewhere}"
+        ) from None
+    except FloatingPointError:
+        raise ValueError(
+            f"The equations, or their derivatives, are not finite near the state.{elsewhere}"
+        ) from None
 
 
 def _names(root: str, tree: Any) -> list[str]:

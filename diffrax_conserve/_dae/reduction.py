@@ -13,15 +13,12 @@ Which equations and slopes are selected is the `Structure`. It is that of almost
 is found from numbers at a single state in general position.
 """
 
-import concurrent.futures
 import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.core
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -61,6 +58,7 @@ class Structure:
     - `brought`: for each differentiation the unknowns that its constraints contain and those before
       do not, such as positions, velocities and forces; empty if not all constraints can be met by
       these alone.
+    - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     """
 
     size: int
@@ -69,10 +67,40 @@ class Structure:
     mass: np.ndarray | None = None
     apart: bool = False
     brought: tuple[tuple[int, ...], ...] = ()
+    without_slopes: tuple[int, ...] = ()
+
+    def _values(self) -> tuple[Any, ...]:
+        others = dataclasses.astuple(dataclasses.replace(self, mass=None))
+        return *others, None if self.mass is None else self.mass.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Structure) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
 
     @property
     def index(self) -> int:
         return len(self.rounds)
+
+    @property
+    def ranks(self) -> tuple[int, ...]:
+        """For how many slopes the equations are solved before each differentiation."""
+        return tuple(len(round.slopes) for round in self.rounds)
+
+    @property
+    def times(self) -> tuple[int, ...]:
+        """How often each equation is differentiated."""
+        lefts = [self.left(k) for k in range(self.index)]
+        return tuple(sum(i in left for left in lefts) for i in range(self.size))
+
+    @property
+    def freedom(self) -> int:
+        """The number of degrees of freedom."""
+        return self.size - sum(self.times)
+
+    def __str__(self) -> str:
+        return f"index {self.index} and {self.freedom} degrees of freedom"
 
     def left(self, k: int) -> tuple[int, ...]:
         """The equations that are left in a round, and give constraints."""
@@ -80,7 +108,7 @@ class Structure:
 
     @property
     def algebraic(self) -> tuple[int, ...]:
-        """The unknowns whose slopes no equation contains before the last differentiation."""
+        """The unknowns for whose slopes no equation is solved before the last differentiation."""
         known = self.rounds[-1].slopes if self.rounds else range(self.size)
         return tuple(j for j in range(self.size) if j not in known)
 
@@ -247,25 +275,39 @@ class Singular(ValueError):
         self.left, self.absent = left, absent
 
 
+# The equations as a function of the numbers in them, and of what an `Implicit` takes.
+Numbers = list[Array]
+WithNumbers = Callable[[Numbers, Array, Array, Array], Array]
+
+
 def find_structure(
-    equations: Implicit, changed: Implicit, t: Array, y: Array, mass: np.ndarray | None
+    equations: WithNumbers,
+    numbers: Numbers,
+    others: Numbers,
+    t: Array,
+    y: Array,
+    mass: np.ndarray | None,
 ) -> Structure:
-    """The structure of concrete equations near a state, by elimination."""
-    t, y, matrix, is_linear, absent = _general_position(equations, t, y)
+    """The structure of equations with these numbers near a state, by elimination. Whether `∂F/∂y'`
+    is constant, the other numbers tell."""
+    t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
-        other = np.asarray(jax.jit(jax.jacfwd(changed, 2))(2 * t + 1, 2 * y, y))
+        later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
+        other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
     selected, gradients = _extended(matrix, _NONE), np.zeros((0, y.size))
-    rest = np.delete(np.stack([matrix, other]), selected.equations, axis=1)
-    structure = Structure(y.size, (), is_linear, mass, apart=not np.any(rest))
-    reduction, brought, met = Reduction(structure, equations, t, y), [], []
+    both = np.stack([matrix, other])
+    rest = np.delete(both, selected.equations, axis=1)
+    without = tuple(np.flatnonzero(~both.any((0, 1))).tolist())
+    structure = Structure(
+        y.size, (), is_linear, mass, apart=not np.any(rest), without_slopes=without
+    )
+    brought, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
-        reduction.differentiate(selected)
-        structure = reduction.structure
+        structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
-        last = lambda t, y, of=reduction.constraints: of(t, y)[-1]  # noqa: E731
-        new = np.asarray(jax.jit(jax.jacfwd(last, 1))(t, y))
+        new = np.asarray(_last_gradients(equations, structure, numbers, t, y))
         brought.append((new != 0).any(0) & ~(gradients != 0).any(0))
         met.append(len(_extended(new[:, brought[-1]], _NONE).equations) == len(new))
         gradients = np.concatenate([gradients, new])
@@ -279,6 +321,42 @@ def find_structure(
         found = tuple(tuple(np.flatnonzero(one).tolist()) for one in brought)
         structure = dataclasses.replace(structure, brought=found)
     return structure
+
+
+# What a search evaluates is compiled once for the equations, and then serves all numbers.
+
+
+@ft.partial(jax.jit, static_argnums=0)
+def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
+    return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
+
+
+@ft.partial(jax.jit, static_argnums=(0, 1))
+def _last_gradients(
+    equations: WithNumbers, structure: Structure, numbers: Numbers, t: Array, y: Array
+) -> Array:
+    constraints = Reduction(structure, ft.partial(equations, numbers), t, y).constraints
+    return jax.jacfwd(lambda y: constraints(t, y)[-1])(y)
+
+
+@ft.partial(jax.jit, static_argnums=0)
+def _near(
+    equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float
+) -> tuple[Array, ...]:
+    """A time and a state at this relative distance, and what is known of the equations there."""
+    given = small(ft.partial(equations, numbers), t, y, y)
+    pattern = without_pattern(3 * y.size + 1, y.dtype)
+    largest = jnp.max(jnp.abs(y), initial=0)
+    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
+    moved = y + share * size * (1 + pattern[: y.size] / 2)
+    later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
+    slopes = size * pattern[:-1].reshape(3, -1)[1:]
+    all_at = small(lambda *now: (given(*now), *jax.jacfwd(given, (1, 2))(*now)), t, y, y)
+    values, by_ys, by_slope = jax.vmap(lambda slope: all_at(later, moved, slope))(slopes)
+    value, by_y = values[0], by_ys[0]
+    finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
+    absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
+    return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
 
 
 def _extended(matrix: np.ndarray, round: Round) -> Round:
@@ -305,68 +383,14 @@ def _extended(matrix: np.ndarray, round: Round) -> Round:
 
 
 def _general_position(
-    equations: Implicit, t: Array, y: Array
+    equations: WithNumbers, numbers: Numbers, t: Array, y: Array
 ) -> tuple[Array, Array, np.ndarray, bool, tuple[int, ...]]:
     """A time and a state in general position, near the given ones, at which the equations and their
     derivatives are finite; `∂F/∂y'` there; whether it depends on `y'`; and the unknowns that no
     equation contains."""
-    pattern = without_pattern(3 * y.size + 1, y.dtype)
-    largest = jnp.max(jnp.abs(y), initial=0)
-    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
-
-    @jax.jit
-    def near(share: float) -> tuple[Array, ...]:
-        moved = y + share * size * (1 + pattern[: y.size] / 2)
-        later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
-        slopes = size * pattern[:-1].reshape(3, -1)[1:]
-        by_y = jax.jacfwd(equations, 1)(later, moved, slopes[0])
-        by_slope = jax.vmap(lambda slope: jax.jacfwd(equations, 2)(later, moved, slope))(slopes)
-        value = equations(later, moved, slopes[0])
-        finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
-        absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
-        return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
-
     for share in (1e-1, 1e-3, 1e-5, 0.0):
-        t, moved, by_slope, is_linear, absent, finite = near(share)
+        later, moved, by_slope, is_linear, absent, finite = _near(equations, numbers, t, y, share)
         if finite:
             positions = tuple(np.flatnonzero(absent).tolist())
-            return t, moved, np.array(by_slope), bool(is_linear), positions
+            return later, moved, np.array(by_slope), bool(is_linear), positions
     raise FloatingPointError
-
-
-def structure_of(equations: Implicit, t: Array, y: Array, mass: np.ndarray | None) -> Structure:
-    """The structure of equations. What JAX traces in them is replaced by numbers in general
-    position. JAX traces in one thread, so that another one computes with numbers."""
-    slopes = jax.ShapeDtypeStruct(y.shape, y.dtype)
-    closed = jax.make_jaxpr(equations)(t, slopes, slopes)
-
-    def numbers() -> Structure:
-        here = [_stand_in(x) for x in closed.consts]
-        there = [1.5 * x + 1 if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in here]
-
-        def of(consts: list[Array]) -> Implicit:
-            evaluate = lambda *given: jax.core.eval_jaxpr(closed.jaxpr, consts, *given)[0]  # noqa: E731
-            return small(evaluate, t, slopes, slopes)
-
-        return find_structure(of(here), of(there), _stand_in(t), _stand_in(y), mass)
-
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        return thread.submit(numbers).result()
-
-
-def _stand_in(x: Any) -> Any:
-    if not isinstance(x, jax.core.Tracer):
-        return jnp.asarray(x)
-    if not jnp.issubdtype(x.dtype, jnp.inexact):
-        return jnp.ones(x.shape, x.dtype)
-    pattern = without_pattern(max(x.size, 1), jnp.finfo(x.dtype).dtype)[: x.size]
-    return (1 + pattern / 2).reshape(x.shape).astype(x.dtype)
-
-
-def tree_key(tree: Any) -> Any:
-    """What tells two trees apart when they are traced: their structure, what is not an array, and
-    the shapes of arrays."""
-    leaves, treedef = jtu.tree_flatten(tree)
-    return treedef, tuple(
-        (x.shape, x.dtype) if eqx.is_array_like(x) and hasattr(x, "shape") else x for x in leaves
-    )

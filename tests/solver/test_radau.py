@@ -95,13 +95,13 @@ def test_a_singular_mass_matrix_and_a_gradient_through_it():
 
 @pytest.mark.slow
 def test_zeros_in_args_decide_about_the_index():
-    """With those of the first `consistent` by an exact solution; with others it is no success."""
+    """With those of `at` by an exact solution; with others it is no success."""
+    guess, singular, regular = (jnp.array(x) for x in ([0.5, 0.1], [2.0, 0.0], [2.0, 3.0]))
     dae = dfc.DAE(
         lambda t, y, a: jnp.stack([-y[0] + y[1], y[0] ** 2 - y[1]]),
         mass=lambda t, y, a: jnp.diag(a),
-    )
-    singular, regular = jnp.array([2.0, 0.0]), jnp.array([2.0, 3.0])
-    y0 = dae.consistent(jnp.array([0.5, 0.1]), args=singular)
+    ).at(guess, args=singular)
+    y0 = dae.consistent(guess, args=singular)
     end = lambda args: solve(dae.term, dae.wrap(dfc.Radau()), 1.0, y0, args, 1e-8)  # noqa: E731
     x = 1 / (1 + np.exp(1 / 2))  # `2 x' = x² - x`
     assert np.allclose(end(singular).ys[-1], [x, x**2], rtol=1e-7)
