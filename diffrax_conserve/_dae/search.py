@@ -54,7 +54,7 @@ class Search:
         kinds = [_shape(x) for x in leaves]
         closed = jax.make_jaxpr(flat)(kinds, time, state, state)
         jaxpr, count = closed.jaxpr, len(closed.consts)
-        consts = [None if _is_traced(x) else jnp.asarray(x) for x in closed.consts]
+        consts = [None if _is_traced(x) else x for x in closed.consts]
         self._kinds = [_shape(x) for x in closed.consts], kinds, time, state
         self._consts, self._mass = consts, mass
         self.is_traced = any(x is None for x in consts)  # what the functions close over
