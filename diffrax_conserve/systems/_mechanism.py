@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
+from scipy.optimize import linprog
 
 from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import Args, RealScalarLike
@@ -44,7 +45,8 @@ class Mechanism(eqx.Module):
     where reaction $j$ consumes $a_{ij}$ molecules of species $i$ and produces $b_{ij}$. The rate
     constants $k$ are numbers, or a function of `(t, y, args)`. Whatever they are, $w \cdot y$ is
     conserved for each $w$ with $w^\top S = 0$: these are the balances of elements or of groups that
-    the reactions do not split. They are computed in exact arithmetic.
+    the reactions do not split. They are computed in exact arithmetic, and have positive weights
+    wherever there are such balances.
 
     !!! example
 
@@ -139,17 +141,24 @@ class Mechanism(eqx.Module):
 
         It returns $y_i = \max(\hat y_i, 0)\, e^{(W^\top \mu)_i}$ with the $\mu$ for which $W y$ has
         the conserved values: the nearest state in relative entropy, found by Newton's method for
-        the convex dual problem. A concentration of zero stays zero. No balance may have a negative
-        weight.
+        the convex dual problem. A concentration of zero stays zero. The balances must have a basis
+        with positive weights, and an error names the species for which there is none.
 
         Source: I. Csiszár, "I-divergence geometry of probability distributions and minimization
         problems", Ann. Probab. 3 (1975).
         """
         rows = self._tables.balances
-        if not rows or min(min(row) for row in rows) < 0:
+        if not rows:
+            raise ValueError("No balance is conserved by this mechanism, so none can be restored.")
+        signed = [name for name, row in zip(self.balances, rows, strict=True) if min(row) < 0]
+        if signed:
+            positive = np.any([row for row in rows if min(row) >= 0], axis=0)
+            lacking = np.any(rows, axis=0) & ~positive
+            species = ", ".join(x for x, lacks in zip(self.species, lacking, strict=True) if lacks)
             raise ValueError(
-                "Not every balance of this mechanism is a sum with positive weights, so that "
-                "factors cannot restore them. Project with `SimplifiedNewton()`."
+                f"The balance {signed[0]} has negative weights, so that factors cannot restore it, "
+                f"and no other basis of the balances is without them: {species} occur in no balance "
+                "with positive weights alone. Project with `SimplifiedNewton()`."
             )
         return ClosedForm(_Entropic(rows, tuple(self.balances)))
 
@@ -229,7 +238,8 @@ def _tables(reactions: tuple[str, ...], species: tuple[str, ...]) -> _Tables:
         factors.append([species.index(name) for name, count in taken.items() for _ in range(count)])
     width = max(map(len, factors), default=0)
     padded = [row + [len(species)] * (width - len(row)) for row in factors]
-    return _Tables(change, np.array(padded, int).reshape(-1, width), _left_null_space(change))
+    balances = tuple(tuple(vector.tolist()) for vector in _balances(change))
+    return _Tables(change, np.array(padded, int).reshape(len(padded), width), balances)
 
 
 def _sides(reaction: str) -> tuple[dict[str, int], dict[str, int]]:
@@ -249,9 +259,8 @@ def _sides(reaction: str) -> tuple[dict[str, int], dict[str, int]]:
     return found
 
 
-def _left_null_space(matrix: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """An integer basis of the `w` with `wᵀ matrix = 0`, without negative entries where these are
-    easily removed."""
+def _left_null_space(matrix: np.ndarray) -> list[np.ndarray]:
+    """An integer basis of the `w` with `wᵀ matrix = 0`."""
     rows = matrix.T * Fraction(1)
     pivots: list[int] = []
     for column in range(len(matrix)):
@@ -267,8 +276,7 @@ def _left_null_space(matrix: np.ndarray) -> tuple[tuple[int, ...], ...]:
     basis = np.zeros((len(free), len(matrix)), int) * Fraction(1)
     basis[:, free] = np.eye(len(free), dtype=int)
     basis[:, pivots] = -rows[: len(pivots), free].T
-    vectors = _without_negative([_whole(vector) for vector in basis])
-    return tuple(tuple(_whole(vector).tolist()) for vector in vectors)
+    return [_whole(vector) for vector in basis]
 
 
 def _whole(vector: np.ndarray) -> np.ndarray:
@@ -279,13 +287,59 @@ def _whole(vector: np.ndarray) -> np.ndarray:
 
 def _without_negative(vectors: list[np.ndarray]) -> list[np.ndarray]:
     """A basis of the same space, where multiples of other vectors are added to those with negative
-    entries."""
+    entries. It is quick and keeps entries small, but does not find every positive basis."""
     for i, vector in enumerate(vectors):
         for j, other in enumerate(vectors):
             if i != j and vector.min() < 0 and other.min() >= 0:
                 ratio = [-(v // o) for v, o in zip(vector, other, strict=True) if v < 0 < o]
                 vectors[i] = vector = vector + max(ratio, default=0) * other
-    return vectors
+    return [_whole(vector) for vector in vectors]
+
+
+def _balances(change: np.ndarray) -> list[np.ndarray]:
+    """An integer basis of the left null space, with as many vectors without negative entries as
+    there are.
+
+    The vectors without negative entries are a cone. While a vector `c` that is orthogonal to those
+    that are known has a product other than zero with one of the cone, so has an edge of the cone,
+    which is independent of them: of the vectors with the product 1, a vertex with the least sum. A
+    linear program tells where the vertex is not zero. The rest is exact: there one vector of the
+    null space, and only one, is zero elsewhere.
+    """
+    vectors = _without_negative(_left_null_space(change))
+    found = [vector for vector in vectors if vector.min() >= 0]
+    edge = None
+    while len(found) < len(vectors):
+        orthogonal = _left_null_space(np.stack([*change.T, *found], axis=1))
+        directions = (sign * c for c in orthogonal for sign in (1, -1))
+        edge = next((x for c in directions if (x := _edge(change, c)) is not None), None)
+        if edge is None:
+            break
+        found.append(edge)
+    if all(any(x is v for v in vectors) for x in found):  # no edge was missing
+        return vectors
+    for vector in vectors:
+        if np.linalg.matrix_rank(np.stack([*found, vector])) > len(found):
+            found.append(vector)
+    return found
+
+
+def _edge(change: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+    """The lightest edge of the cone of balances without negative weights, among those whose product
+    with the direction is positive; `None` if there is none."""
+    rows = np.concatenate([change.T, direction[None] / np.abs(direction).max()])
+    given = np.zeros(len(rows))
+    given[-1] = 1
+    solution = linprog(np.ones(len(change)), A_eq=rows, b_eq=given, method="highs-ds")
+    if not solution.success:
+        return None
+    support = np.flatnonzero(solution.x > 1e-6 * np.max(solution.x))
+    inside = _left_null_space(change[support])
+    if len(inside) != 1:
+        return None
+    edge = np.zeros(len(change), int)
+    edge[support] = inside[0] * np.sign(inside[0][0])
+    return edge if edge.min() >= 0 and edge @ direction > 0 else None
 
 
 def _formula(weights: tuple[int, ...], species: tuple[str, ...]) -> str:

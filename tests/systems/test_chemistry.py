@@ -1,6 +1,11 @@
 """Reactions as differential equations, what they conserve, and the two stiff problems."""
 
+import itertools
+import re
+
 import equinox as eqx
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -8,6 +13,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scipy.linalg
+from hypothesis import assume, given, settings
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
@@ -63,6 +69,128 @@ def test_the_balances_are_the_left_null_space(seed):
     assert np.linalg.matrix_rank(found) == len(found) == expected.shape[1]
 
 
+# ---- Positive weights ----
+
+
+def of_columns(change):
+    """A mechanism with these changes, a column for each reaction."""
+    side = lambda numbers: " + ".join(f"{n} X{i}" for i, n in enumerate(numbers) if n > 0)  # noqa: E731
+    reactions = [f"{side(-column)} -> {side(column)}" for column in change.T]
+    names = [f"X{i}" for i in range(len(change))]
+    return Mechanism(reactions, np.ones(len(reactions)), species=names)
+
+
+def weights_of(mechanism):
+    """The weights, which are checked to be a basis of all balances, by integers."""
+    change = mechanism.stoichiometry
+    weights = [b.weights for b in mechanism.balances.values()]
+    weights = np.array(weights, int).reshape(-1, len(change))
+    assert not np.any(weights @ change)
+    assert len(weights) == np.linalg.matrix_rank(weights)
+    assert len(weights) + np.linalg.matrix_rank(change) == len(change)
+    return weights
+
+
+def edges(change):
+    """All edges of the cone of the balances without negative weights, by the algorithm of Farkas
+    (J. Martinez and M. Silva, "A simple and fast algorithm to obtain all invariants of a
+    generalised Petri net", 1982)."""
+    rows = [(tuple(c), tuple(e)) for c, e in zip(change, np.eye(len(change), dtype=int))]  # noqa: B905
+    for j in range(change.shape[1]):
+        kept = {row for row in rows if row[0][j] == 0}
+        for a in (row for row in rows if row[0][j] > 0):
+            for b in (row for row in rows if row[0][j] < 0):
+                both = -b[0][j] * np.concatenate(a) + a[0][j] * np.concatenate(b)
+                both = both // np.gcd.reduce(both)
+                kept.add((tuple(both[: change.shape[1]]), tuple(both[change.shape[1] :])))
+        support = lambda row: {i for i, w in enumerate(row[1]) if w}  # noqa: E731
+        rows = [x for x in kept if not any(support(y) < support(x) for y in kept)]
+    return np.array([w for _, w in rows]).reshape(-1, len(change))
+
+
+def kernel(weights):
+    """An integer basis of the vectors with `weights @ vector = 0`: for each column
+    outside of a regular block, by Cramer's rule."""
+    n = len(weights)
+    pivots = next(
+        list(p)
+        for p in itertools.combinations(range(weights.shape[1]), n)
+        if round(np.linalg.det(weights[:, p]))
+    )
+    inner = weights[:, pivots]
+    scale = round(np.linalg.det(inner))
+    change = np.zeros((weights.shape[1], weights.shape[1] - n), int)
+    for k, j in enumerate(set(range(weights.shape[1])) - set(pivots)):
+        change[j, k] = scale
+        change[pivots, k] = -np.rint(scale * np.linalg.solve(inner, weights[:, j])).astype(int)
+    return change
+
+
+small = st.integers(1, 3).flatmap(
+    lambda n: hnp.arrays(int, st.tuples(st.just(n), st.integers(n + 1, 7)), elements=st.integers(0, 2))
+)  # fmt: skip
+
+
+@settings(max_examples=60)
+@given(small, st.randoms(use_true_random=False))
+def test_balances_with_positive_weights_are_found_where_there_are_any(weights, random):
+    """Reactions that keep a chosen positive basis, and only that."""
+    assume(np.linalg.matrix_rank(weights) == len(weights))
+    change = kernel(weights)
+    mixing = np.tril([[random.randint(-1, 1) for _ in change.T] for _ in change.T], -1)
+    mechanism = of_columns(change @ (mixing + np.eye(len(mixing), dtype=int)))
+    found = weights_of(mechanism)
+    assert found.min() >= 0
+    assert np.linalg.matrix_rank(np.concatenate([weights, found])) == len(weights) == len(found)
+    mechanism.positive_projection()
+
+
+@settings(max_examples=60)
+@given(hnp.arrays(int, st.tuples(st.integers(2, 6), st.integers(1, 4)), elements=st.integers(-2, 2)))
+def test_a_mechanism_is_refused_only_if_it_has_no_positive_basis(change):
+    """Against an enumeration. What is named occurs in no balance without negative weights."""
+    mechanism = of_columns(change)
+    found, all_edges = weights_of(mechanism), edges(change)
+    assume(len(found))
+    most = np.linalg.matrix_rank(all_edges) if len(all_edges) else 0
+    assert sum(w.min() >= 0 for w in found) == most
+    if most == len(found):
+        mechanism.positive_projection()
+    else:
+        with pytest.raises(ValueError, match="negative weights") as error:
+            mechanism.positive_projection()
+        named = set(re.search(": (.*) occur in", str(error.value))[1].split(", "))
+        absent = found.any(axis=0) & ~all_edges.any(axis=0)
+        assert named == {f"X{i}" for i in np.flatnonzero(absent)} != set()
+
+
+@pytest.mark.parametrize(
+    ("reactions", "positive"),
+    [
+        (
+            ["X + Y -> Z", "Z -> X + Y", "Q + Y -> Z2", "Z2 -> W"],
+            [{"X": 1, "Z": 1}, {"Q": 1, "Z2": 1, "W": 1}, {"Y": 1, "Z": 1, "Z2": 1, "W": 1}],
+        ),
+        (
+            ["A + B -> AB", "AB + B -> ABB", "AB -> H", "H -> I + W", "I + W -> IW"],
+            [
+                {"A": 1, "AB": 1, "ABB": 1, "H": 1, "I": 1, "IW": 1},
+                {"B": 1, "AB": 1, "ABB": 2, "H": 1, "I": 1, "IW": 1},
+                {"A": 1, "AB": 1, "ABB": 1, "H": 1, "W": 1, "IW": 1},
+            ],
+        ),
+    ],
+    ids=["Q needs another order", "none is positive at first"],
+)
+def test_closed_mechanisms(reactions, positive):
+    mechanism = Mechanism(reactions, np.ones(len(reactions)))
+    known = np.array([[w.get(name, 0) for name in mechanism.species] for w in positive])
+    found = weights_of(mechanism)
+    assert found.min() >= 0 and found.max() <= 2
+    assert np.linalg.matrix_rank(np.concatenate([known, found])) == len(known)
+    mechanism.positive_projection()
+
+
 def test_the_law_of_mass_action():
     mechanism = Mechanism(["2 A + B -> 3 C", "C -> ", "-> A"], [2.0, 3.0, 5.0])
     a, b, c = y = np.array([0.3, 0.7, 1.1])
@@ -98,8 +226,13 @@ test_mistakes_are_named = refused(
         "must name each species once",
     ),
     (lambda: Mechanism(["A -> B"], [1.0]).state({"X": 1.0}), ValueError, "no species X"),
-    # Its balance is A - B, which has signs.
     (lambda: Mechanism(["A + B -> "], [1.0]).positive_projection(), ValueError, "SimplifiedNewton"),
+    (  # Its balances are X + Y and A - B.
+        lambda: Mechanism(["A + B -> ", "X -> Y"], [1.0, 1.0]).positive_projection(),
+        ValueError,
+        "negative weights.*: A, B occur in no balance.*SimplifiedNewton",
+    ),
+    (lambda: Mechanism(["-> A"], [1.0]).positive_projection(), ValueError, "No balance"),
 )
 
 
