@@ -45,7 +45,8 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     XLA tends to repeat the whole computation for each element of the result, so the limit is
     divided by their number.
     """
-    return _in_arrays(fn, (y,), lambda size: OPERATIONS // max(1, size), zeros=False)(y)
+    written = _written(fn, (y,), lambda size: OPERATIONS // max(1, size), differentiated=True)
+    return (written or fn)(y)
 
 
 def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[Array]]:
@@ -55,34 +56,7 @@ def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[
     A product with the number zero is zero here, also where the other factor is infinite, as in all
     derivatives by JAX.
     """
-    return _in_arrays(fn, like, lambda size: OPERATIONS, zeros=True)
-
-
-def _in_arrays(
-    fn: Callable[..., Any], like: Any, limit: Callable[[int], int], zeros: bool
-) -> Callable[..., Any]:
-    """`fn`, computed in scalars with its derivative, if it has at most `limit(size)` operations for
-    a result with so many numbers."""
-    leaves, treedef = jtu.tree_flatten(like)
-    if sum(map(jnp.size, leaves)) > OPERATIONS:
-        return fn
-    closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
-    outs, out_treedef = jtu.tree_flatten(out)
-    program = _Program(limit(sum(x.size for x in outs)), differentiated=True, zeros=zeros)
-    try:
-        wholes = [program.given() for _ in leaves]
-        inputs = [program.taken_apart(*x) for x in zip(wholes, map(jnp.shape, leaves), strict=True)]
-        found = program.results(closed, inputs)
-        arrays = [program.array(x, like.dtype) for x, like in zip(found, outs, strict=True)]
-        evaluate = program.evaluation(arrays)
-    except _NotWrittenOut:
-        return fn
-
-    def written(*args: Any) -> Any:
-        found = zip(evaluate(treedef.flatten_up_to(args)), outs, strict=True)
-        return out_treedef.unflatten([jnp.asarray(x, like.dtype) for x, like in found])
-
-    return written
+    return _written(fn, like, lambda size: OPERATIONS, differentiated=True, zeros=True) or fn
 
 
 def in_scalars(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
@@ -91,26 +65,49 @@ def in_scalars(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
     a derivative rule of its own is looked into, and its rule is lost.
     """
+    return _written(fn, like, lambda size: OPERATIONS, arrays=False)
+
+
+def _written(
+    fn: Callable[..., Any],
+    like: Any,
+    limit: Callable[[int], int],
+    *,
+    arrays: bool = True,
+    differentiated: bool = False,
+    zeros: bool = False,
+) -> Callable[..., Any] | None:
+    """`fn` computed in scalars, if it has at most `limit(size)` operations for a result with so
+    many numbers. It takes and returns `arrays`, or tuples of their elements."""
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
     if sum(map(prod, shapes)) > OPERATIONS:
         return None
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)
-    program = _Program(OPERATIONS, differentiated=False, zeros=False)
-    inputs = [np.array([program.given() for _ in range(prod(x))], int).reshape(x) for x in shapes]
+    program = _Program(limit(sum(x.size for x in outs)), differentiated, zeros)
+    given = [[program.given() for _ in range(1 if arrays else prod(x))] for x in shapes]
     try:
-        found = program.results(closed, inputs)
-        evaluate = program.evaluation([int(i) for x in found for i in x.flat])
+        inputs = [
+            program.taken_apart(*i, x) if arrays else np.array(i, int).reshape(x)
+            for i, x in zip(given, shapes, strict=True)
+        ]
+        found = [*zip(program.results(closed, inputs), outs, strict=True)]
+        rows = [[program.array(i, x.dtype)] if arrays else i.ravel().tolist() for i, x in found]
+        evaluate = program.evaluation([i for row in rows for i in row])
     except _NotWrittenOut:
         return None
 
     def written(*args: Any) -> Any:
         given = treedef.flatten_up_to(args)
         rest = iter(evaluate([*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))]))
-        cast = lambda like: jnp.asarray(next(rest), like.dtype)  # noqa: E731
-        results = (tuple(cast(x) for _ in range(x.size)) if x.ndim else cast(x) for x in outs)
-        return out_treedef.unflatten(results)
+        parts = (
+            tuple(jnp.asarray(next(rest), x.dtype) for _ in row)
+            for row, x in zip(rows, outs, strict=True)
+        )
+        return out_treedef.unflatten(
+            x if like.ndim and not arrays else x[0] for x, like in zip(parts, outs, strict=True)
+        )
 
     return written
 
@@ -216,79 +213,32 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     return out[tuple(kept)]
 
 
-_FILL = lax.GatherScatterMode.FILL_OR_DROP
-
-
-def _filling(dtype: Any) -> Any:
-    """What a gather returns for elements outside, unless it says otherwise."""
-    if jnp.issubdtype(dtype, jnp.inexact):
-        return np.nan
-    if dtype.kind == "b":
-        return True
-    limits = jnp.iinfo(dtype)
-    return limits.min if limits.min else limits.max
-
-
-def _slices(shape: Sequence[int], starts: Sequence[Any], sizes: Sequence[int]) -> tuple[slice, ...]:
-    starts = [int(np.clip(i, 0, n - size)) for i, n, size in zip(starts, shape, sizes, strict=True)]
-    return tuple(slice(i, i + size) for i, size in zip(starts, sizes, strict=True))
-
-
-def _replaced(operand: _Places, at: Any, updates: _Places) -> _Places:
-    out = operand.copy()
-    out[at] = updates
-    return out
-
-
-def _gathered(
-    shape: Sequence[int], indices: np.ndarray, numbers: Any, sizes: Sequence[int]
+def _slices(
+    shape: Sequence[int], indices: np.ndarray, numbers: Any, moved: Sequence[int]
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Which elements of an array of this shape a gather takes, as indices like its result, and
-    whether its slices are inside of the array; they are moved inside. The result has the axes of
-    the indices but the last, and in the places `offset_dims` those of a slice."""
-    map_, batching = numbers.start_index_map, numbers.operand_batching_dims
-    offsets, gone = numbers.offset_dims, (*numbers.collapsed_slice_dims, *batching)
-    kept = [d for d in range(len(shape)) if d not in gone]
-    ndim = indices.ndim - 1 + len(offsets)
-    others = [d for d in range(ndim) if d not in offsets]
+    """Which elements of an array of this shape a gather or scatter moves, as indices with the shape
+    of what is moved; and whether its slices are inside of the array. If not, they are moved there.
 
-    def spread(x: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-        out = [1] * ndim
-        for axis, size in zip(axes, x.shape, strict=True):
-            out[axis] = size
-        return x.reshape(out)
-
-    at, inside = [], np.ones([1] * ndim, bool)
-    for d, (n, size) in enumerate(zip(shape, sizes, strict=True)):
-        start = np.zeros(indices.shape[:-1], int)
-        if d in map_:
-            start = indices[..., map_.index(d)].astype(int)
-        elif d in batching:
-            axis = numbers.start_indices_batching_dims[batching.index(d)]
-            start = start + np.expand_dims(np.arange(n), [*range(1, start.ndim - axis)])
-        inside = inside & spread((start >= 0) & (start <= n - size), others)
-        place = spread(np.clip(start, 0, n - size), others)
-        if d in kept:
-            place = place + spread(np.arange(size), [offsets[kept.index(d)]])
-        at.append(place)
-    return tuple(np.broadcast_arrays(*at)), inside
-
-
-def _scattered(
-    shape: Sequence[int], indices: np.ndarray, numbers: Any, updates: Sequence[int]
-) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Where a scatter puts its updates, as the gather that would take them from there."""
-    gone = *numbers.inserted_window_dims, *numbers.operand_batching_dims
-    windows = iter([updates[d] for d in numbers.update_window_dims])
-    gather = lax.GatherDimensionNumbers(
-        offset_dims=numbers.update_window_dims,
-        collapsed_slice_dims=numbers.inserted_window_dims,
-        start_index_map=numbers.scatter_dims_to_operand_dims,
-        operand_batching_dims=numbers.operand_batching_dims,
-        start_indices_batching_dims=numbers.scatter_indices_batching_dims,
-    )
-    sizes = [1 if d in gone else next(windows) for d in range(len(shape))]
-    return _gathered(shape, indices, gather, sizes)
+    What is moved has the axes of the indices but the last, and in the places `offsets` those of a
+    slice. `starts` are the axes along which the last axis of the indices counts.
+    """
+    offsets, collapsed, starts, batching, of_indices = numbers
+    along = {d: axis for axis, d in zip(of_indices, batching, strict=True)}
+    kept = [d for d in range(len(shape)) if d not in (*collapsed, *batching)]
+    windows = dict(zip(kept, offsets, strict=True))
+    others = [axis for axis in range(len(moved)) if axis not in offsets]
+    positions = np.meshgrid(*map(np.arange, moved), indexing="ij", sparse=True)
+    at, inside = [], np.ones([1] * len(moved), bool)
+    for d, n in enumerate(shape):
+        start = np.zeros([1] * len(moved), int)
+        if d in starts:
+            start = np.expand_dims(indices[..., starts.index(d)].astype(int), offsets)
+        elif d in along:
+            start = positions[others[along[d]]]
+        last = n - (moved[windows[d]] if d in windows else 1)
+        inside = inside & (start >= 0) & (start <= last)
+        at.append(np.clip(start, 0, last) + (positions[windows[d]] if d in windows else 0))
+    return tuple(np.broadcast_to(x, moved) for x in at), np.broadcast_to(inside, moved)
 
 
 # The primitives that only move elements, as functions that move their places by numpy. JAX itself
@@ -481,34 +431,34 @@ class _Program:
     def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
         first, last = _BY_INDICES[name]
-        indices = [self._integers(x) for x in inputs[first:last]]
+        indices, dtype = [self._integers(x) for x in inputs[first:last]], eqn.outvars[0].aval.dtype
         if any(x is None for x in indices):
             return self._as_it_is(eqn, inputs)
-        dtype, shape = eqn.outvars[0].aval.dtype, operand.shape
-        if name.startswith("dynamic"):
-            sizes = params["slice_sizes"] if name == "dynamic_slice" else inputs[1].shape
-            at = _slices(shape, indices, sizes)
-            return [operand[at] if name == "dynamic_slice" else _replaced(operand, at, inputs[1])]
-        numbers, some = params["dimension_numbers"], params["mode"] == _FILL
-        if name == "gather":
-            at, inside = _gathered(shape, indices[0], numbers, params["slice_sizes"])
-            out = operand[at]
-            if some and not np.all(inside):
-                filling = params["fill_value"]
-                filling = _filling(dtype) if filling is None else filling
-                out = np.where(inside, out, self._constant(np.asarray(filling, dtype)))
+        dynamic, takes = name.startswith("dynamic"), name in ("gather", "dynamic_slice")
+        axes = tuple(range(operand.ndim))
+        numbers = (axes, (), axes, (), ()) if dynamic else params["dimension_numbers"]
+        updates = inputs[1 if dynamic else 2] if not takes else operand
+        moved = eqn.outvars[0].aval.shape if takes else updates.shape
+        starts = np.stack(indices, -1) if dynamic else indices[0]
+        at, inside = _slices(operand.shape, starts, numbers, moved)
+        outside = params.get("mode") == lax.GatherScatterMode.FILL_OR_DROP and not np.all(inside)
+        if takes and not outside:
+            return [operand[at]]
+        if takes:
+            filling = params["fill_value"]
+            if filling is None and not jnp.issubdtype(dtype, jnp.inexact):
+                return self._as_it_is(eqn, inputs)
+            filling = np.asarray(np.nan if filling is None else filling, dtype)
+            return [np.where(inside, operand[at], self._constant(filling))]
+        out, counted = operand.copy(), inside | (not outside)
+        at, updates = tuple(x[counted] for x in at), updates[counted]
+        if name != "scatter-add":
+            out[at] = updates
             return [out]
-        updates = inputs[2]
-        at, inside = _scattered(shape, indices[0], numbers, updates.shape)
-        inside = np.broadcast_to(inside | (not some), updates.shape)
-        at, updates = tuple(x[inside] for x in at), updates[inside]
-        if name == "scatter":
-            return [_replaced(operand, at, updates)]
         self._count(updates.size)
-        out = operand.copy()
-        for *one, place in zip(*at, updates, strict=True):
-            one = tuple(one)
-            out[one] = self._scalar("add", lax.add, (int(out[one]), int(place)), dtype)
+        for *one, place in zip(*at, updates.tolist(), strict=True):
+            both = int(out[tuple(one)]), place
+            out[tuple(one)] = self._scalar("add", lax.add, both, dtype)
         return [out]
 
     def _as_it_is(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
@@ -565,7 +515,8 @@ class _Program:
         if isinstance(x, jax.core.Tracer):
             return self.taken_apart(self._operation(id(x), lambda: x, ()), x.shape)
         x = np.asarray(x)
-        return np.array([self._number(e) for e in x.flat], int).reshape(x.shape)
+        numbers = [*map(self._number, x.flat)]
+        return np.array(numbers, int).reshape(x.shape)
 
     def _integers(self, places: _Places) -> np.ndarray | None:
         """The values of an array of integers or booleans, as indices are; `None` if they are not
@@ -599,10 +550,9 @@ class _Program:
         if name in _KNOWN and all(x is not None for x in known):
             with np.errstate(all="ignore"):
                 return self._number(np.asarray(_KNOWN[name](*known)).astype(dtype)[()])
-        if name in _SIMPLER:
-            simpler = _SIMPLER[name](self, row, known, dtype)
-            if simpler is not None:
-                return simpler
+        simpler = self._simpler(name, row, known, dtype)
+        if simpler is not None:
+            return simpler
         if name in ("add", "mul"):
             row = tuple(sorted(row))
         place = self._operation(name, fn, row, params)
@@ -610,70 +560,44 @@ class _Program:
             self.negated[place] = row[0]
         return place
 
+    def _simpler(self, name: str, row: Any, known: list[Any], dtype: Any) -> int | None:
+        """The place of a result that needs no operation, or a simpler one."""
+        zero, one, minus = ([x is not None and x == v for x in known] for v in (0, 1, -1))
+        apply = lambda name, *row: self._scalar(name, getattr(lax, name), row, dtype)  # noqa: E731
+        opposite = [self.negated.get(i) for i in row]
+        match name:
+            case "neg":
+                return opposite[0]
+            case "select_n" if known[0] is not None or len(set(row[1:])) == 1:
+                return row[1 + int(known[0] or 0)]
+            case "div" if one[1] or (zero[0] and self.zeros):
+                return row[0]
+            case "sub" if zero[1]:
+                return row[0]
+            case "sub" if zero[0]:
+                return apply("neg", row[1])
+            case "sub" if opposite[1] is not None:
+                return apply("add", row[0], opposite[1])
+            case "add":
+                for i, j in ((0, 1), (1, 0)):
+                    if zero[i]:
+                        return row[j]
+                    if opposite[i] is not None:
+                        return apply("sub", row[j], opposite[i])
+            case "mul":
+                for i, j in ((0, 1), (1, 0)):
+                    if one[i] or (zero[i] and self.zeros):
+                        return row[j if one[i] else i]
+                    if minus[i] and dtype.kind in "fc":
+                        return apply("neg", row[j])
+                    if opposite[i] is not None:
+                        return apply("neg", apply("mul", opposite[i], row[j]))
+        return None
+
     def _count(self, operations: int) -> None:
         self.num_operations += operations
         if self.num_operations > (TRIED * self.limit if self.zeros else self.limit):
             raise _NotWrittenOut
-
-
-# ---- What is no operation, or a simpler one ----
-
-
-def _product(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
-    for (i, x), j in zip(zip(row, known, strict=True), row[::-1], strict=True):
-        if x is not None and x == 0 and program.zeros:
-            return i
-        if x is not None and x == 1:
-            return j
-        if x is not None and x == -1 and dtype.kind in "fc":
-            return program._scalar("neg", lax.neg, (j,), dtype)
-        if i in program.negated:
-            product = program._scalar("mul", lax.mul, (program.negated[i], j), dtype)
-            return program._scalar("neg", lax.neg, (product,), dtype)
-    return None
-
-
-def _sum(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
-    for (i, x), j in zip(zip(row, known, strict=True), row[::-1], strict=True):
-        if x is not None and x == 0:
-            return j
-        if i in program.negated:
-            return program._scalar("sub", lax.sub, (j, program.negated[i]), dtype)
-    return None
-
-
-def _difference(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
-    if known[1] is not None and known[1] == 0:
-        return row[0]
-    if known[0] is not None and known[0] == 0:
-        return program._scalar("neg", lax.neg, (row[1],), dtype)
-    if row[1] in program.negated:
-        return program._scalar("add", lax.add, (row[0], program.negated[row[1]]), dtype)
-    return None
-
-
-def _quotient(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
-    del dtype
-    if known[1] is not None and known[1] == 1:
-        return row[0]
-    return row[0] if program.zeros and known[0] is not None and known[0] == 0 else None
-
-
-def _choice(program: _Program, row: Any, known: Any, dtype: Any) -> int | None:
-    del program, dtype
-    if known[0] is not None:
-        return row[1 + int(known[0])]
-    return row[1] if len(set(row[1:])) == 1 else None
-
-
-_SIMPLER: dict[str, Callable[..., int | None]] = {
-    "add": _sum,
-    "div": _quotient,
-    "mul": _product,
-    "neg": lambda program, row, known, dtype: program.negated.get(row[0]),
-    "select_n": _choice,
-    "sub": _difference,
-}
 
 
 def _is_key(x: Any) -> bool:
