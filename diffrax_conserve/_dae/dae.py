@@ -629,8 +629,8 @@ class _Slopes(eqx.Module):
     dae: DAE
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        structure, t, y = _at(self.dae, t, y, args)
-        return unravel(_slopes(self.dae, structure, t, y, args), y)
+        given = _at(self.dae, t, y, args)
+        return unravel(_value(Reduction.all_slopes, self.dae, given, args), given[2])
 
 
 @final
@@ -642,10 +642,10 @@ class _Constraints(eqx.Module):
     asked: Bool[Array, " rounds"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        structure, t, y = _at(self.dae, t, y, args)
-        if not structure.index:
-            return [jnp.zeros_like(ravel(y)[:1])]  # every state will do
-        found = _constraints(self.dae, structure, t, y, args)
+        given = _at(self.dae, t, y, args)
+        if not given[0].index:
+            return [jnp.zeros_like(ravel(given[2])[:1])]  # every state will do
+        found = _value(Reduction.all_constraints, self.dae, given, args)
         if self.asked is None:
             return found
         return [jnp.where(asked, h, 0) for asked, h in zip(self.asked, found, strict=True)]
@@ -667,32 +667,26 @@ class _Stages(eqx.Module):
             )
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
-        structure, t, y = _at(self.dae, t, y, args)
-        return _reduced(self.dae, structure, t, y, ravel(slopes), args)
-
-
-# Each is traced once for all uses, of times and states that have no weak types.
-
-
-@eqx.filter_jit
-def _slopes(dae: DAE, structure: Structure, t: Array, y: Y, args: Args) -> Array:
-    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
-    return reduction.where_it_fits(reduction.slopes(structure.index))(t, ravel(y))
-
-
-@eqx.filter_jit
-def _constraints(dae: DAE, structure: Structure, t: Array, y: Y, args: Args) -> Values:
-    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
-    return reduction.where_it_fits(reduction.constraints)(t, ravel(y))
-
-
-@eqx.filter_jit
-def _reduced(dae: DAE, structure: Structure, t: Array, y: Y, slopes: Array, args: Args) -> Array:
-    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
-    return reduction.reduced(max(structure.index - 1, 0))(t, ravel(y), slopes)
+        given = _at(self.dae, t, y, args)
+        return _value(Reduction.stages, self.dae, given, args, ravel(slopes))
 
 
 def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Array, Y]:
+    """The structure, and time and state without weak types, so that each is traced once."""
     y = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), y)
     t = jnp.asarray(t, jnp.result_type(float, t))
     return _structure(dae, t, y, args), t, y
+
+
+@eqx.filter_jit
+def _value(
+    of: Callable[..., Any],
+    dae: DAE,
+    given: tuple[Structure, Array, Y],
+    args: Args,
+    *slopes: Array,
+) -> Any:
+    """A function that belongs to the structure, at a time and a state; traced once for all uses."""
+    structure, t, y = given
+    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
+    return of(reduction, t, ravel(y), *slopes)

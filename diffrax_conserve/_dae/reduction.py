@@ -137,32 +137,29 @@ class Reduction:
     """
 
     def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
-        self.like = t, y
-        self.structure = dataclasses.replace(structure, rounds=())
+        self.like, self.structure = (t, y), structure
         self.equations = small(equations, t, y, y)
         self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
-        for selected in structure.rounds:
-            self.differentiate(selected)
-        self.structure = structure
+        for k in range(structure.index):
+            self.constraints = small(self._further(k), t, y)
 
-    def differentiate(self, selected: Round) -> None:
-        """Adds the constraints of the equations that are left when these are solved. The first are
-        the equations at the slopes that are selected; each of the others is a derivative of what is
-        left of the one before."""
-        rounds = *self.structure.rounds, selected
-        self.structure = structure = dataclasses.replace(self.structure, rounds=rounds)
-        k, before, equations = len(rounds) - 1, self.constraints, self.equations
+    def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
+        """The constraints with those of round `k`. The first are the equations that are left at the
+        slopes that are selected; each of the others is a derivative of what is left of the one
+        before."""
+        structure, before, equations = self.structure, self.constraints, self.equations
         left = np.array(structure.left(k), int)
-        none = k == 0 and structure.apart
+        none = k == 0 and structure.apart  # such equations contain no slopes
         slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
+        if k == 0:
+            return lambda t, y: [equations(t, y, slopes(t, y))[left]]
+        those = np.searchsorted(structure.left(k - 1), left)
 
-        def constraints(t: Array, y: Array) -> list[Array]:
-            if k == 0:
-                return [equations(t, y, slopes(t, y))[left]]
+        def further(t: Array, y: Array) -> list[Array]:
             given, rates = _along(before, t, y, slopes(t, y))
-            return [*given, rates[-1][np.searchsorted(structure.left(k - 1), left)]]
+            return [*given, rates[-1][those]]
 
-        self.constraints = small(constraints, *self.like)
+        return further
 
     def slopes(self, k: int) -> Callable[[Array, Array], Array]:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
@@ -198,17 +195,14 @@ class Reduction:
 
         return small(slopes, *self.like)
 
-    def reduced(self, k: int) -> Implicit:
-        """`F_k`, the equations after so many differentiations."""
-        if k == 0:
-            return self.equations
+    def stages(self, t: Array, y: Array, slopes: Array) -> Array:
+        """`F_{ν-1}`, the equations after all differentiations but the last."""
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
-            first = lambda t, y: self.constraints(t, y)[:k]  # noqa: E731
-            _, rates = _along(first, t, y, slopes)
+            _, rates = _along(lambda t, y: self.constraints(t, y)[:-1], t, y, slopes)
             return self._replaced(self.equations(t, y, slopes), rates)
 
-        return small(differentiated, *self.like, self.like[1])
+        return small(differentiated, t, y, slopes)(t, y, slopes)
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
@@ -249,14 +243,20 @@ class Reduction:
         least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
         return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
 
-    def where_it_fits(self, fn: Callable[[Array, Array], Any]) -> Callable[[Array, Array], Any]:
-        """`fn(t, y)`, and NaN where the structure does not fit."""
+    def all_slopes(self, t: Array, y: Array) -> Array:
+        """The slopes after all differentiations; NaN where the structure does not fit."""
+        return self._where_it_fits(self.slopes(self.structure.index), t, y)
 
+    def all_constraints(self, t: Array, y: Array) -> list[Array]:
+        """The constraints; NaN where the structure does not fit."""
+        return self._where_it_fits(self.constraints, t, y)
+
+    def _where_it_fits(self, fn: Callable[[Array, Array], Any], t: Array, y: Array) -> Any:
         def checked(t: Array, y: Array) -> Any:
             fits = self.fits(*lax.stop_gradient((t, y)))
             return jtu.tree_map(lambda x: jnp.where(fits, x, jnp.nan), fn(t, y))
 
-        return small(checked, *self.like)
+        return small(checked, t, y)(t, y)
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
