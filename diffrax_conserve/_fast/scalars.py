@@ -94,7 +94,7 @@ def written(
     given = [[program.given() for _ in range(1 if arrays else prod(x))] for x in shapes]
     try:
         inputs = [
-            program.taken_apart(*i, x) if arrays else np.array(i, int).reshape(x)
+            program.taken_apart(i[0], x) if arrays else np.array(i, int).reshape(x)
             for i, x in zip(given, shapes, strict=True)
         ]
         found = [*zip(program.results(closed, inputs), outs, strict=True)]
@@ -388,7 +388,8 @@ class _Program:
             fn = fn if self.zeros else _INSTEAD.get(name, fn)
             return [self._elementwise(name, fn, inputs, dtype, tuple(sorted(given.items())))]
         if name in _REDUCTIONS and given.keys() == {"axes"} and inputs[0].size:
-            return [self._reduce(*_REDUCTIONS[name], inputs[0], params["axes"], dtype)]
+            both, fn = _REDUCTIONS[name]
+            return [self._reduce(both, fn, inputs[0], params["axes"], dtype)]
         types = {var.aval.dtype for var in (*eqn.invars, *eqn.outvars)}
         if name == "dot_general" and given.keys() <= _DOT and len(types) == 1:
             return [self._dot(inputs, params["dimension_numbers"], dtype)]
@@ -436,8 +437,9 @@ class _Program:
     def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
         first, last = _BY_INDICES[name]
-        indices, dtype = [self._integers(x) for x in inputs[first:last]], eqn.outvars[0].aval.dtype
-        if any(x is None for x in indices):
+        found, dtype = [self._integers(x) for x in inputs[first:last]], eqn.outvars[0].aval.dtype
+        indices = [x for x in found if x is not None]
+        if len(indices) < len(found):
             return self._as_it_is(eqn, inputs)
         dynamic, takes = name.startswith("dynamic"), name in ("gather", "dynamic_slice")
         axes = tuple(range(operand.ndim))
