@@ -398,8 +398,8 @@ class DAEReport:
 
 # ---- The structure ----
 
-# The searches and the structures that were found, by the functions and the shapes. Both are functions
-# of these alone, so that it does not matter which are known.
+# The searches, and the structures that were found, by the functions and the shapes. Both depend on
+# these alone, so that it does not matter which are known.
 _SEARCHES: dict[Any, Search] = {}
 _FOUND: dict[Any, Structure] = {}
 
@@ -437,12 +437,20 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
     search = _search(dae, y, args)
     if search.is_traced:
         return structure
-    here = _found(dae, t, y, args, lambda: search.at((dae, args), *_numbers(t, y)))
+
+    def near() -> Structure:
+        try:
+            return search.at((dae, args), *_numbers(t, y), structure)
+        except FloatingPointError:  # a poor guess tells nothing
+            return structure
+
+    here = _found(dae, t, y, args, near)
     if here.ranks != structure.ranks:
         raise ValueError(
             f"With these values the equations have {here}, but with values in general position "
-            f"{structure}. Where values decide, such as zeros in `args`, write `dae = dae.at(guess, "
-            "t=t0, args=args)`, and take `consistent`, `report`, `term` and `wrap` of that."
+            f"{structure}. Where values decide, such as zeros in `args`, write "
+            "`dae = dae.at(guess, t=t0, args=args)`, and take `consistent`, `report`, `term` and "
+            "`wrap` of that."
         )
     return structure
 

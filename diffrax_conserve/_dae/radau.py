@@ -154,8 +154,8 @@ class Radau(dfx.AbstractImplicitSolver[_Last]):
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
         size_of_slopes = jnp.abs(start / length)
-        terms = jnp.abs(by_y) @ jnp.abs(start) + jnp.abs(by_slope) @ size_of_slopes
-        least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * terms
+        sizes = jnp.abs(by_y) @ jnp.abs(start) + jnp.abs(by_slope) @ size_of_slopes
+        least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
         real = lu_factors(_REAL / length * by_slope + by_y)
         pair = lu_factors(_PAIR / length * by_slope + by_y)

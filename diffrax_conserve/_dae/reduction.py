@@ -287,9 +287,11 @@ def find_structure(
     t: Array,
     y: Array,
     mass: np.ndarray | None,
+    known: Structure | None = None,
 ) -> Structure:
     """The structure of equations with these numbers near a state, by elimination. Whether `∂F/∂y'`
-    is constant, the other numbers tell."""
+    is constant, the other numbers tell. While the ranks are those of a known structure, what that
+    selects is taken, for which the programs are compiled."""
     t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
@@ -305,6 +307,9 @@ def find_structure(
     )
     brought, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
+        before = known.rounds[structure.index :] if known is not None else ()
+        if before and len(before[0].slopes) == len(selected.slopes):
+            selected = before[0]
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         new = np.asarray(_last_gradients(equations, structure, numbers, t, y))

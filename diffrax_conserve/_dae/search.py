@@ -65,10 +65,12 @@ class Search:
 
         self._given = given
 
-    def at(self, tree: Any, t: Array, y: Array) -> Structure:
-        """The structure with these numbers, near a state."""
-        leaves = [jnp.asarray(x) for x in jtu.tree_leaves(tree) if self._is_number(x)]
-        return _computed(lambda: self._found(self._consts, leaves, t, y))
+    def at(self, tree: Any, t: Array, y: Array, known: Structure | None = None) -> Structure:
+        """The structure with these numbers, near a state; the known one, where that fits."""
+        _, kinds, time, _ = self._kinds
+        leaves = _either((x for x in jtu.tree_leaves(tree) if self._is_number(x)), kinds)
+        consts, t = _either(self._consts, self._kinds[0]), jnp.asarray(t, time.dtype)
+        return _computed(lambda: self._found(consts, leaves, t, y, known))
 
     def general(self, tree: Any) -> Structure:
         """The structure with numbers in general position, except for Python's floats."""
@@ -89,10 +91,12 @@ class Search:
 
         return _computed(found)
 
-    def _found(self, consts: Any, leaves: Any, t: Array, y: Array) -> Structure:
+    def _found(
+        self, consts: Any, leaves: Any, t: Array, y: Array, known: Structure | None = None
+    ) -> Structure:
         numbers = [*consts, *leaves]
         others = [_another(x) for x in numbers]
-        return find_structure(self._given, numbers, others, t, y, self._mass)
+        return find_structure(self._given, numbers, others, t, y, self._mass, known)
 
 
 def _is_array(x: Any) -> bool:
@@ -142,7 +146,8 @@ def _another(x: Any) -> Any:
 
 
 def _either(known: Iterable[Any], general: Iterable[Any]) -> Numbers:
-    return [b if a is None else jnp.asarray(a, b.dtype) for a, b in zip(known, general, strict=True)]
+    pairs = zip(known, general, strict=True)
+    return [b if a is None else jnp.asarray(a, b.dtype) for a, b in pairs]
 
 
 def tree_key(tree: Any) -> Any:

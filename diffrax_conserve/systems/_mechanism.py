@@ -157,8 +157,8 @@ class Mechanism(eqx.Module):
             species = ", ".join(x for x, lacks in zip(self.species, lacking, strict=True) if lacks)
             raise ValueError(
                 f"The balance {signed[0]} has negative weights, so that factors cannot restore it, "
-                f"and no other basis of the balances is without them: {species} occur in no balance "
-                "with positive weights alone. Project with `SimplifiedNewton()`."
+                f"and no other basis of the balances is without them: {species} occur in no "
+                "balance with positive weights alone. Project with `SimplifiedNewton()`."
             )
         return ClosedForm(_Entropic(rows, tuple(self.balances)))
 
