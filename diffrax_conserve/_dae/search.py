@@ -67,10 +67,14 @@ class Search:
 
     def at(self, tree: Any, t: Array, y: Array, known: Structure | None = None) -> Structure:
         """The structure with these numbers, near a state; the known one, where that fits."""
-        _, kinds, time, _ = self._kinds
-        leaves = _either((x for x in jtu.tree_leaves(tree) if self._is_number(x)), kinds)
-        consts, t = _either(self._consts, self._kinds[0]), jnp.asarray(t, time.dtype)
-        return _computed(lambda: self._found(consts, leaves, t, y, known))
+        closed, kinds, time, _ = self._kinds
+        leaves = [x for x in jtu.tree_leaves(tree) if self._is_number(x)]
+
+        def found() -> Structure:
+            numbers = _either(self._consts, closed), _either(leaves, kinds)
+            return self._found(*numbers, jnp.asarray(t, time.dtype), y, known)
+
+        return _computed(found)
 
     def general(self, tree: Any) -> Structure:
         """The structure with numbers in general position, except for Python's floats."""
