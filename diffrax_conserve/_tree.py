@@ -9,7 +9,6 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import numpy as np
 from jaxtyping import Array, PyTree, Shaped
 
 from ._custom_types import Y
