@@ -48,6 +48,9 @@ NEAREST = 512
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
 # nothing is.
 OPERATIONS = 2048
+# Where most operations are expected to be none, as in a derivative of a derivative, so many times
+# as many are tried. Each takes about 5 µs.
+TRIED = 8
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).
 LEAST_SPARSE = 33

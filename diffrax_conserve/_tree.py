@@ -8,6 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree, Shaped
 
 from ._custom_types import Y
@@ -84,7 +85,7 @@ def key_of(entry: Any) -> Any:
 def without_pattern(n: int, dtype: Any) -> Array:
     """The sines of 1, 4, 9, ..., in which there is no pattern: as a direction they are in general
     position, and the same in every call."""
-    return jnp.sin(jnp.arange(1, n + 1, dtype=dtype) ** 2)
+    return jnp.asarray(np.sin(np.arange(1, n + 1, dtype=float) ** 2), dtype)
 
 
 def ravel(y: Any) -> Any:

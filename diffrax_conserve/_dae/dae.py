@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._custom_types import Args, RealScalarLike, Values, Y
+from .._fast.scalars import small
 from .._hashable import Hashable
 from .._manifold import Constraint, slope_like
 from .._numerics.implicit import root
@@ -32,7 +33,7 @@ from .._solver.manifold_projection import ManifoldProjection
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MOST, algebraic_newton, at_rest_near, divided
 from .radau import Radau
-from .reduction import Implicit, Singular, Structure
+from .reduction import Implicit, Reduction, Singular, Structure
 from .search import Search, any_traced, lifted, tree_key
 
 
@@ -589,7 +590,7 @@ def _consistent(
     units = structure.units(jnp.where(sizes == 0, 1, sizes))
     if moves is not None:
         units = jnp.where(moves, units, 0)
-    none = jnp.zeros_like(jnp.concatenate(_Constraints(dae)(t, y, args)))
+    none = jnp.zeros(sum(len(structure.left(k)) for k in range(structure.index)), units.dtype)
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, free = stage
@@ -615,16 +616,19 @@ def _solved_for(
 ) -> Float[Array, " n"]:
     """The state of equations of index 1, moved without what they differentiate; NaN if Newton's
     method finds none."""
-    structure, equations, t, y = _at(dae, t, state, args)
-    along, free = structure.freely_moved(equations, t, y)
-    fits = structure.fits(equations, t, y)
+    structure, t, state = _at(dae, t, state, args)
+    y = ravel(state)
+    reduction = Reduction(structure, dae._equations(t, state, args), t, y)
+    along, free = reduction.freely_moved(t, y)
+    fits = reduction.fits(t, y)
 
     def moved(z: Array) -> Array:
         return (y + along @ (z - y[free])).at[free].set(z)
 
     def residual(z: Array) -> Array:
-        return jnp.where(fits, structure.constraints(equations, 1)(t, moved(z))[0], jnp.nan)
+        return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
+    residual = small(residual, y[free])
     return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
 
 
@@ -635,10 +639,8 @@ class _Slopes(eqx.Module):
     dae: DAE
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
-        slopes = structure.slopes(equations, structure.index, t, vector)
-        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
-        return unravel(jnp.where(fits, slopes, jnp.nan), y)
+        given = _at(self.dae, t, y, args)
+        return unravel(_value(Reduction.all_slopes, self.dae, given, args), given[2])
 
 
 @final
@@ -650,12 +652,10 @@ class _Constraints(eqx.Module):
     asked: Bool[Array, " rounds"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
-        if not structure.index:
-            return [jnp.zeros_like(vector[:1])]  # every state will do
-        found = structure.constraints(equations, structure.index)(t, vector)
-        fits = structure.fits(equations, *lax.stop_gradient((t, vector)))
-        found = [jnp.where(fits, h, jnp.nan) for h in found]
+        given = _at(self.dae, t, y, args)
+        if not given[0].index:
+            return [jnp.zeros_like(ravel(given[2])[:1])]  # every state will do
+        found = _value(Reduction.all_constraints, self.dae, given, args)
         if self.asked is None:
             return found
         return [jnp.where(asked, h, 0) for asked, h in zip(self.asked, found, strict=True)]
@@ -677,11 +677,26 @@ class _Stages(eqx.Module):
             )
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
-        structure, equations, t, vector = _at(self.dae, t, y, args)
-        return structure.reduced(equations, max(structure.index - 1, 0))(t, vector, ravel(slopes))
+        given = _at(self.dae, t, y, args)
+        return _value(Reduction.stages, self.dae, given, args, ravel(slopes))
 
 
-def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Implicit, Array, Array]:
-    y = jtu.tree_map(jnp.asarray, y)
+def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Array, Y]:
+    """The structure, and time and state without weak types, so that each is traced once."""
+    y = jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x)), y)
     t = jnp.asarray(t, jnp.result_type(float, t))
-    return _structure(dae, t, y, args), dae._equations(t, y, args), t, ravel(y)
+    return _structure(dae, t, y, args), t, y
+
+
+@eqx.filter_jit
+def _value(
+    of: Callable[..., Any],
+    dae: DAE,
+    given: tuple[Structure, Array, Y],
+    args: Args,
+    *slopes: Array,
+) -> Any:
+    """A function that belongs to the structure, at a time and a state; traced once for all uses."""
+    structure, t, y = given
+    reduction = Reduction(structure, dae._equations(t, y, args), t, ravel(y))
+    return of(reduction, t, ravel(y), *slopes)

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
 from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
+from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.problem import gradient_scale
 from .._numerics.roundoff import cancellation_terms
 
@@ -47,14 +47,12 @@ class _Factored(NamedTuple):
         rows, columns = _sizes(jacobian)
         scaled = jacobian / rows[:, None] / columns
         one = scaled, jnp.zeros(1, jnp.int32)
-        return cls(one if rows.size == 1 else jsp.linalg.lu_factor(scaled), rows, columns)
+        return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns)
 
     def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
         right = residual / self.rows
         one = right.size == 1
-        return (
-            -(right / self.lu[0][0] if one else jsp.linalg.lu_solve(self.lu, right)) / self.columns
-        )
+        return -(right / self.lu[0][0] if one else lu_solution(self.lu, right)) / self.columns
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one

@@ -17,6 +17,7 @@ from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike,
 from .._hashable import Hashable
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, after_step, iterate, keep_done
+from .._numerics.linear import lu_factors, lu_solution
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
@@ -151,27 +152,22 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             times = t0 + jnp.asarray(_NODES, jnp.result_type(t0)) * (t1 - t0)
             return at_stages(times, y, inverse @ (y - start) / length)
 
-        by_y, by_slope = lax.stop_gradient(
-            (
-                jax.jacfwd(lambda y: residual(t0, y, slope))(start),
-                jax.jacfwd(lambda slope: residual(t0, start, slope))(slope),
-            )
-        )
+        by_y, by_slope = lax.stop_gradient(jax.jacfwd(residual, (1, 2))(t0, start, slope))
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
         size_of_slopes = jnp.abs(start / length)
         sizes = jnp.abs(by_y) @ jnp.abs(start) + jnp.abs(by_slope) @ size_of_slopes
         least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
-        real = jax.scipy.linalg.lu_factor(_REAL / length * by_slope + by_y)
-        pair = jax.scipy.linalg.lu_factor(_PAIR / length * by_slope + by_y)
+        real = lu_factors(_REAL / length * by_slope + by_y)
+        pair = lu_factors(_PAIR / length * by_slope + by_y)
 
         def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
             """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
             by the eigenvectors of `A⁻¹`."""
             modes = -jnp.asarray(_TO_MODES, pair[0].dtype) @ residuals
-            first = jax.scipy.linalg.lu_solve(real, modes[0].real)
-            second = jax.scipy.linalg.lu_solve(pair, modes[1])
+            first = lu_solution(real, modes[0].real)
+            second = lu_solution(pair, modes[1])
             vectors = jnp.asarray(_VECTORS, pair[0].dtype)
             other = 2 * (vectors[:, 1, None] * second).real
             return vectors[:, 0, None].real * first + other
@@ -206,7 +202,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
 
         def filtered(y: Array) -> Array:
-            return -jax.scipy.linalg.lu_solve(real, seen(residual(t0, y, slopes)))
+            return -lu_solution(real, seen(residual(t0, y, slopes)))
 
         error = filtered(start + filtered(start))
         ok = found.ok & jnp.all(jnp.isfinite(error))

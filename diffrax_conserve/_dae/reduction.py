@@ -19,11 +19,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import ADDED_POWER
+from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import without_pattern
 from .newton import algebraic_newton, divided
@@ -125,103 +128,135 @@ class Structure:
         last = np.full((2, self.index), True), np.full((2, self.size), True)
         return np.stack([*asked, *last[0]]), np.stack([*moving, *last[1]])
 
-    def slopes(self, equations: Implicit, k: int, t: Array, y: Array) -> Array:
-        """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
-        are not selected are zero."""
-        every = tuple(range(self.size))
-        rows, columns = (
-            np.array(x, int) for x in (self.rounds[k] if k < self.index else Round(every, every))
-        )
-        none = jnp.zeros_like(y)
-        if not rows.size:
-            return none
-        as_given = not self.rounds or not set(rows) & set(self.left(0))
-        begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
-        if not as_given:  # once, for all slopes that are tried
-            by_both = jax.jacfwd(self.constraints(equations, k), (0, 1))(t, y)
-            by_t, by_y = zip(*by_both, strict=True)
 
-        def residual(slopes: Array) -> Array:
-            slopes = none.at[columns].set(slopes)
-            rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
-            return self._replaced(equations(t, y, slopes), rates)[rows]
+class Reduction:
+    """The functions that belong to a structure of equations, for times and vectors like these.
 
-        if as_given and self.mass is not None:
-            inverse = np.linalg.inv(self.mass[np.ix_(rows, columns)])
-            slopes = -jnp.asarray(inverse, y.dtype) @ residual(begin)
-        elif self.is_linear:
-            both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
-            matrix, value = both(begin)
-            slopes = divided(matrix, -value)
-        else:
-            slopes = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
-        return none.at[columns].set(slopes)
+    Each is derived from those before it, and written out as a small program, if the system is small
+    enough, before the next is derived. `constraints(t, y)` returns `h_0` to `h_{ν-1}`.
+    """
 
-    def freely_moved(
-        self, equations: Implicit, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray]:
-        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
-        what the equations differentiate, such as the charges of condensers; and which unknowns are
-        the coordinates along it."""
-        rows, columns = (np.array(x, int) for x in self.rounds[0])
-        free = np.array([j for j in range(self.size) if j not in self.rounds[0].slopes], int)
-        matrix = self.mass if self.mass is not None else self._by_slopes(equations, t, y)
-        solve = np.linalg.solve if self.mass is not None else jnp.linalg.solve
-        one = jnp.eye(free.size, dtype=y.dtype)
-        along = jnp.zeros((self.size, free.size), y.dtype).at[free].set(one)
-        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
-        return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
+    def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
+        self.like, self.structure = (t, y), structure
+        self.equations = small(equations, t, y, y)
+        self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
+        for k in range(structure.index):
+            self.constraints = small(self._further(k), t, y)
 
-    def _by_slopes(self, equations: Implicit, t: Array, y: Array) -> Float[Array, "n n"]:
-        return jax.jacfwd(equations, 2)(t, y, self.slopes(equations, 0, t, y))
-
-    def fits(self, equations: Implicit, t: Array, y: Array) -> Bool[Array, ""]:
-        """Whether the equations that are left contain no slopes with the numbers at hand, which may
-        be others than those with which the structure was found."""
-        if self.mass is not None or not self.rounds:
-            return jnp.asarray(True)
-        left = self._by_slopes(equations, t, y)[np.array(self.left(0), int)]
-        if self.apart:
-            return ~jnp.any(left)
-        along, _ = self.freely_moved(equations, t, y)
-        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
-        return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
-
-    def constraints(self, equations: Implicit, k: int) -> Callable[[Array, Array], list[Array]]:
-        """`h_0` to `h_{k-1}`. The first are the equations that are left at the slopes that are
-        selected; each of the others is a derivative of what is left of the one before."""
+    def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
+        """The constraints with those of round `k`. The first are the equations that are left at the
+        slopes that are selected; each of the others is a derivative of what is left of the one
+        before."""
+        structure, before, equations = self.structure, self.constraints, self.equations
+        left = np.array(structure.left(k), int)
+        none = k == 0 and structure.apart  # such equations contain no slopes
+        slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
         if k == 0:
-            return lambda t, y: []
-        left = np.array(self.left(k - 1), int)
-
-        def given(t: Array, y: Array) -> list[Array]:
-            slopes = jnp.zeros_like(y) if self.apart else self.slopes(equations, 0, t, y)
-            return [equations(t, y, slopes)[left]]
+            return lambda t, y: [equations(t, y, slopes(t, y))[left]]
+        those = np.searchsorted(structure.left(k - 1), left)
 
         def further(t: Array, y: Array) -> list[Array]:
-            before = self.constraints(equations, k - 1)
-            given, rates = _along(before, t, y, self.slopes(equations, k - 1, t, y))
-            return [*given, rates[-1][np.searchsorted(self.left(k - 2), left)]]
+            given, rates = _along(before, t, y, slopes(t, y))
+            return [*given, rates[-1][those]]
 
-        return given if k == 1 else further
+        return further
 
-    def reduced(self, equations: Implicit, k: int) -> Implicit:
-        """`F_k`, the equations after so many differentiations."""
-        if k == 0:
-            return equations
+    def slopes(self, k: int) -> Callable[[Array, Array], Array]:
+        """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
+        are not selected are zero."""
+        structure, equations, constraints = self.structure, self.equations, self.constraints
+        every = tuple(range(structure.size))
+        selected = structure.rounds[k] if k < structure.index else Round(every, every)
+        rows, columns = (np.array(x, int) for x in selected)
+        as_given = not structure.rounds or not set(rows) & set(structure.left(0))
+
+        def slopes(t: Array, y: Array) -> Array:
+            if not rows.size:
+                return jnp.zeros_like(y)
+            begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
+            if not as_given:  # once, for all slopes that are tried
+                by_t, by_y = zip(*jax.jacfwd(constraints, (0, 1))(t, y), strict=True)
+
+            def residual(slopes: Array) -> Array:
+                slopes = jnp.zeros_like(y).at[columns].set(slopes)
+                rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
+                return self._replaced(equations(t, y, slopes), rates)[rows]
+
+            if as_given and structure.mass is not None:
+                inverse = np.linalg.inv(structure.mass[np.ix_(rows, columns)])
+                found = -jnp.asarray(inverse, y.dtype) @ residual(begin)
+            elif structure.is_linear:
+                both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
+                matrix, value = both(begin)
+                found = divided(matrix, -value)
+            else:
+                found = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
+            return jnp.zeros_like(y).at[columns].set(found)
+
+        return small(slopes, *self.like)
+
+    def stages(self, t: Array, y: Array, slopes: Array) -> Array:
+        """`F_{ν-1}`, the equations after all differentiations but the last."""
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
-            _, rates = _along(self.constraints(equations, k), t, y, slopes)
-            return self._replaced(equations(t, y, slopes), rates)
+            _, rates = _along(lambda t, y: self.constraints(t, y)[:-1], t, y, slopes)
+            return self._replaced(self.equations(t, y, slopes), rates)
 
-        return differentiated
+        return small(differentiated, t, y, slopes)(t, y, slopes)
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
         rates of their constraints."""
         for k, rate in enumerate(rates):
-            values = values.at[np.array(self.left(k), int)].set(rate)
+            values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
+
+    def freely_moved(
+        self, t: Array, y: Float[Array, " n"]
+    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+        """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
+        what the equations differentiate, such as the charges of condensers; and which unknowns are
+        the coordinates along it."""
+        structure = self.structure
+        rows, columns = (np.array(x, int) for x in structure.rounds[0])
+        free = np.array([j for j in range(structure.size) if j not in columns], int)
+        matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
+        solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
+        one = jnp.eye(free.size, dtype=y.dtype)
+        along = jnp.zeros((structure.size, free.size), y.dtype).at[free].set(one)
+        inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
+        return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
+
+    def _by_slopes(self, t: Array, y: Array) -> Float[Array, "n n"]:
+        return jax.jacfwd(self.equations, 2)(t, y, self.slopes(0)(t, y))
+
+    def fits(self, t: Array, y: Array) -> Bool[Array, ""]:
+        """Whether the equations that are left contain no slopes with the numbers at hand, which may
+        be others than those with which the structure was found."""
+        structure = self.structure
+        if structure.mass is not None or not structure.rounds:
+            return jnp.asarray(True)
+        left = self._by_slopes(t, y)[np.array(structure.left(0), int)]
+        if structure.apart:
+            return ~jnp.any(left)
+        along, _ = self.freely_moved(t, y)
+        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
+        return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
+
+    def all_slopes(self, t: Array, y: Array) -> Array:
+        """The slopes after all differentiations; NaN where the structure does not fit."""
+        return self._where_it_fits(self.slopes(self.structure.index), t, y)
+
+    def all_constraints(self, t: Array, y: Array) -> list[Array]:
+        """The constraints; NaN where the structure does not fit."""
+        return self._where_it_fits(self.constraints, t, y)
+
+    def _where_it_fits(self, fn: Callable[[Array, Array], Any], t: Array, y: Array) -> Any:
+        def checked(t: Array, y: Array) -> Any:
+            fits = self.fits(*lax.stop_gradient((t, y)))
+            return jtu.tree_map(lambda x: jnp.where(fits, x, jnp.nan), fn(t, y))
+
+        return small(checked, t, y)(t, y)
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
@@ -260,7 +295,8 @@ def find_structure(
     t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
-        other = np.asarray(_by_slope(equations, others, 2 * t + 1, 2 * y, y))
+        later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
+        other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
     selected, gradients = _extended(matrix, _NONE), np.zeros((0, y.size))
     both = np.stack([matrix, other])
@@ -297,14 +333,14 @@ def find_structure(
 
 @ft.partial(jax.jit, static_argnums=0)
 def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
-    return jax.jacfwd(equations, 3)(numbers, t, y, slopes)
+    return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
 
 
 @ft.partial(jax.jit, static_argnums=(0, 1))
 def _last_gradients(
     equations: WithNumbers, structure: Structure, numbers: Numbers, t: Array, y: Array
 ) -> Array:
-    constraints = structure.constraints(ft.partial(equations, numbers), structure.index)
+    constraints = Reduction(structure, ft.partial(equations, numbers), t, y).constraints
     return jax.jacfwd(lambda y: constraints(t, y)[-1])(y)
 
 
@@ -313,16 +349,16 @@ def _near(
     equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float
 ) -> tuple[Array, ...]:
     """A time and a state at this relative distance, and what is known of the equations there."""
-    given = ft.partial(equations, numbers)
+    given = small(ft.partial(equations, numbers), t, y, y)
     pattern = without_pattern(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
     size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
     moved = y + share * size * (1 + pattern[: y.size] / 2)
     later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
     slopes = size * pattern[:-1].reshape(3, -1)[1:]
-    by_y = jax.jacfwd(given, 1)(later, moved, slopes[0])
-    by_slope = jax.vmap(lambda slope: jax.jacfwd(given, 2)(later, moved, slope))(slopes)
-    value = given(later, moved, slopes[0])
+    all_at = small(lambda *now: (given(*now), *jax.jacfwd(given, (1, 2))(*now)), t, y, y)
+    values, by_ys, by_slope = jax.vmap(lambda slope: all_at(later, moved, slope))(slopes)
+    value, by_y = values[0], by_ys[0]
     finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
     absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
     return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite

@@ -54,7 +54,7 @@ class Search:
         kinds = [_shape(x) for x in leaves]
         closed = jax.make_jaxpr(flat)(kinds, time, state, state)
         jaxpr, count = closed.jaxpr, len(closed.consts)
-        consts = [None if _is_traced(x) else jnp.asarray(x) for x in closed.consts]
+        consts = [None if _is_traced(x) else x for x in closed.consts]
         self._kinds = [_shape(x) for x in closed.consts], kinds, time, state
         self._consts, self._mass = consts, mass
         self.is_traced = any(x is None for x in consts)  # what the functions close over
@@ -67,10 +67,14 @@ class Search:
 
     def at(self, tree: Any, t: Array, y: Array, known: Structure | None = None) -> Structure:
         """The structure with these numbers, near a state; the known one, where that fits."""
-        _, kinds, time, _ = self._kinds
-        leaves = _either((x for x in jtu.tree_leaves(tree) if self._is_number(x)), kinds)
-        consts, t = _either(self._consts, self._kinds[0]), jnp.asarray(t, time.dtype)
-        return _computed(lambda: self._found(consts, leaves, t, y, known))
+        closed, kinds, time, _ = self._kinds
+        leaves = [x for x in jtu.tree_leaves(tree) if self._is_number(x)]
+
+        def found() -> Structure:
+            numbers = _either(self._consts, closed), _either(leaves, kinds)
+            return self._found(*numbers, jnp.asarray(t, time.dtype), y, known)
+
+        return _computed(found)
 
     def general(self, tree: Any) -> Structure:
         """The structure with numbers in general position, except for Python's floats."""
@@ -130,7 +134,7 @@ def general_numbers(kinds: Any, size: float) -> Any:
 
     def of(kind: Any, end: int) -> Array:
         if not jnp.issubdtype(kind.dtype, jnp.inexact):
-            return jnp.ones(kind.shape, kind.dtype)
+            return jnp.asarray(np.ones(kind.shape, kind.dtype))
         values = pattern[end - np.prod(kind.shape, dtype=int) : end].reshape(kind.shape)
         is_complex = jnp.issubdtype(kind.dtype, jnp.complexfloating)
         return jnp.asarray(values * (1 + 0.5j) if is_complex else values, kind.dtype)
@@ -138,9 +142,10 @@ def general_numbers(kinds: Any, size: float) -> Any:
     return treedef.unflatten(map(of, leaves, ends.tolist()))
 
 
-def _another(x: Array) -> Array:
+def _another(x: Any) -> Any:
+    x = np.asarray(x)  # for which nothing is compiled
     if jnp.issubdtype(x.dtype, jnp.inexact):
-        return 1.5 * x + 1
+        return np.asarray(1.5 * x + 1, x.dtype)
     return ~x if x.dtype == bool else x + 1
 
 

@@ -17,9 +17,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, Real
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import (
-    Along,
     Constraint,
     FirstIntegral,
+    LieDerivative,
     calling_fn,
     check_manifold,
     check_vector_field,
@@ -243,7 +243,7 @@ def _relative_sizes(
 
     def excess(vector: Array) -> Array:
         """The derivative along the flow, minus the rate."""
-        along = Along(entry.fn, vector_field)(t, unravel(vector, y), args)
+        along = LieDerivative(entry.fn, vector_field)(t, unravel(vector, y), args)
         return ravel(along).astype(dtype) - rate
 
     def terms_at(vector: Array, jacobian: Jacobian) -> Array:

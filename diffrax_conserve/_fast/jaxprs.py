@@ -58,3 +58,9 @@ def jaxprs_inside(eqn: Any) -> list[jex.ClosedJaxpr]:
     is_jaxpr = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731
     found = filter(is_jaxpr, jtu.tree_leaves(eqn.params, is_leaf=is_jaxpr))
     return [closed_jaxpr(x) for x in found]
+
+
+def num_equations(closed: jex.ClosedJaxpr) -> int:
+    """With those of the programs inside."""
+    eqns = closed.jaxpr.eqns
+    return len(eqns) + sum(num_equations(x) for eqn in eqns for x in jaxprs_inside(eqn))

@@ -11,11 +11,17 @@ the *places* of its elements in that list. A primitive that only moves elements 
 which costs nothing at run time. An elementwise primitive, a reduction, or a product of matrices
 appends new scalars to the list. Any other primitive stays in arrays in its place: its operands are
 stacked, and its results taken apart.
+
+In scalars one sees what an operation on arrays hides. An operation on the same places is the same
+number, so it is in the list once. Operations on known numbers, such as indices, are computed at
+once, a sum with zero and a product with one are no operations, and what no result needs is left
+out. A derivative of a derivative, as JAX makes it, consists mostly of these (A. Griewank and
+A. Walther, *Evaluating Derivatives*, SIAM 2008).
 """
 
 import functools as ft
 import itertools as it
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -23,18 +29,14 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.custom_batching
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._constants import OPERATIONS
-from .jaxprs import closed_jaxpr, outputs, walk
-
-# An array as a tuple of its elements.
-Scalars = tuple[Any, ...]
+from .._constants import OPERATIONS, TRIED
+from .jaxprs import closed_jaxpr, num_equations, outputs, walk
 
 
 def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
@@ -43,53 +45,76 @@ def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     XLA tends to repeat the whole computation for each element of the result, so the limit is
     divided by their number.
     """
-    out = jax.eval_shape(fn, y)
-    size = max(1, sum(x.size for x in jtu.tree_leaves(out)))
-    written = in_scalars(fn, y, limit=OPERATIONS // size, differentiated=True)
-    if written is None:
-        return fn(y)
-    return jtu.tree_map(joined, out, written(jtu.tree_map(components, y)))
+    limit = lambda size, _: OPERATIONS // max(1, size)  # noqa: E731
+    return (written(fn, (y,), limit, differentiated=True) or fn)(y)
 
 
-def in_scalars(
-    fn: Callable[..., Any],
-    *like: Any,
-    limit: int = OPERATIONS,
-    differentiated: bool = False,
-) -> Callable[..., Any] | None:
+def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[Array]]:
+    """`fn`, a function of arrays like these, as a small program, whose derivatives are small too;
+    `fn` itself if that is not possible, or has more operations than `fn` in arrays. A pendulum has
+    30 where it has 193 in arrays, but with 30 unknowns of a partial differential equation it
+    compiled three times as long.
+
+    A product with the number zero is zero here, also where the other factor is infinite, as in all
+    derivatives by JAX.
+    """
+    limit = lambda _, in_arrays: min(OPERATIONS, in_arrays)  # noqa: E731
+    return written(fn, like, limit, differentiated=True, zeros=True) or fn
+
+
+def in_scalars(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements.
 
-    It is `None` if `fn` is too large, has an effect or uses random keys. With `differentiated` it
-    has the derivative of `fn`, even if a function inside has a derivative rule of its own: then
-    such a function stays as it is. Without it the function is looked into, and its rule is lost.
+    It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
+    a derivative rule of its own is looked into, and its rule is lost.
     """
+    return written(fn, like, lambda *_: OPERATIONS, arrays=False)
+
+
+def written(
+    fn: Callable[..., Any],
+    like: Any,
+    limit: Callable[[int, int], int],
+    *,
+    arrays: bool = True,
+    differentiated: bool = False,
+    zeros: bool = False,
+) -> Callable[..., Any] | None:
+    """`fn` computed in scalars, if it has at most as many operations as `limit` says for the number
+    of elements of the result and that of operations in arrays. It takes and returns `arrays`, or
+    tuples of their elements."""
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
-    if sum(map(prod, shapes)) > limit:
+    if sum(map(prod, shapes)) > OPERATIONS:
         return None
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)
-
-    def write_out(*scalars: Any) -> list[Array]:
-        rest = iter(scalars)
-        given = [tuple(it.islice(rest, prod(shape))) for shape in shapes]
-        return _WriteOut(limit, differentiated)(closed, shapes, given)
-
-    # Tracing `write_out` once gives a jaxpr of scalars. It can be evaluated without rewriting
-    # again.
-    flat = [jax.ShapeDtypeStruct((), x.dtype) for x in leaves for _ in range(x.size)]
+    limited = limit(sum(x.size for x in outs), num_equations(closed))
+    program = _Program(limited, differentiated, zeros)
+    given = [[program.given() for _ in range(1 if arrays else prod(x))] for x in shapes]
     try:
-        evaluate = jex.jaxpr_as_fun(jax.make_jaxpr(write_out)(*flat))
+        inputs = [
+            program.taken_apart(i[0], x) if arrays else np.array(i, int).reshape(x)
+            for i, x in zip(given, shapes, strict=True)
+        ]
+        found = [*zip(program.results(closed, inputs), outs, strict=True)]
+        rows = [[program.array(i, x.dtype)] if arrays else i.ravel().tolist() for i, x in found]
+        evaluate = program.evaluation([i for row in rows for i in row])
     except _NotWrittenOut:
         return None
 
-    def written(*args: Any) -> Any:
+    def evaluated(*args: Any) -> Any:
         given = treedef.flatten_up_to(args)
-        rest = iter(evaluate(*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))))
-        results = (tuple(it.islice(rest, x.size)) if x.ndim else next(rest) for x in outs)
-        return out_treedef.unflatten(results)
+        rest = iter(evaluate([*it.chain(*(x if isinstance(x, tuple) else (x,) for x in given))]))
+        parts = (
+            tuple(jnp.asarray(next(rest), x.dtype) for _ in row)
+            for row, x in zip(rows, outs, strict=True)
+        )
+        return out_treedef.unflatten(
+            x if like.ndim and not arrays else x[0] for x, like in zip(parts, outs, strict=True)
+        )
 
-    return written
+    return evaluated
 
 
 def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
@@ -158,12 +183,12 @@ rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xo
 """
 _ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 _REDUCTIONS = {
-    "reduce_sum": lax.add,
-    "reduce_prod": lax.mul,
-    "reduce_max": lax.max,
-    "reduce_min": lax.min,
-    "reduce_and": lax.bitwise_and,
-    "reduce_or": lax.bitwise_or,
+    "reduce_sum": ("add", lax.add),
+    "reduce_prod": ("mul", lax.mul),
+    "reduce_max": ("max", lax.max),
+    "reduce_min": ("min", lax.min),
+    "reduce_and": ("and", lax.bitwise_and),
+    "reduce_or": ("or", lax.bitwise_or),
 }
 # The parameters of a product of matrices that we can treat. A requested precision may be ignored,
 # because the sums of products are computed in the type of the state.
@@ -193,6 +218,34 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     return out[tuple(kept)]
 
 
+def _slices(
+    shape: Sequence[int], indices: np.ndarray, numbers: Any, moved: Sequence[int]
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Which elements of an array of this shape a gather or scatter moves, as indices with the shape
+    of what is moved; and whether its slices are inside of the array. If not, they are moved there.
+
+    What is moved has the axes of the indices but the last, and in the places `offsets` those of a
+    slice. `starts` are the axes along which the last axis of the indices counts.
+    """
+    offsets, collapsed, starts, batching, of_indices = numbers
+    along = {d: axis for axis, d in zip(of_indices, batching, strict=True)}
+    kept = [d for d in range(len(shape)) if d not in (*collapsed, *batching)]
+    windows = dict(zip(kept, offsets, strict=True))
+    others = [axis for axis in range(len(moved)) if axis not in offsets]
+    positions = np.meshgrid(*map(np.arange, moved), indexing="ij", sparse=True)
+    at, inside = [], np.ones([1] * len(moved), bool)
+    for d, n in enumerate(shape):
+        start = np.zeros([1] * len(moved), int)
+        if d in starts:
+            start = np.expand_dims(indices[..., starts.index(d)].astype(int), offsets)
+        elif d in along:
+            start = positions[others[along[d]]]
+        last = n - (moved[windows[d]] if d in windows else 1)
+        inside = inside & (start >= 0) & (start <= last)
+        at.append(np.clip(start, 0, last) + (positions[windows[d]] if d in windows else 0))
+    return tuple(np.broadcast_to(x, moved) for x in at), np.broadcast_to(inside, moved)
+
+
 # The primitives that only move elements, as functions that move their places by numpy. JAX itself
 # could do that too, but it would compile each of them for each shape, which takes 15 to 50 ms.
 _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
@@ -211,8 +264,7 @@ _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
 }
 # The primitives that move elements by indices. The operands from the first number to before the
-# last are the indices. The rules for them are intricate, so we let JAX itself move the places. That
-# is possible if the indices are known when the function is rewritten.
+# last are the indices. We can move the places if the indices are known.
 _BY_INDICES = {
     "dynamic_slice": (1, None),
     "dynamic_update_slice": (2, None),
@@ -220,16 +272,26 @@ _BY_INDICES = {
     "scatter": (1, 2),
     "scatter-add": (1, 2),
 }
-# What JAX does to indices before it uses them, for example to replace -1 by the last place. These
-# are computed by numpy, so that the indices remain known.
-_ON_INDICES: dict[str, Callable[..., np.ndarray]] = {
+# What is computed at once for known numbers. Indices need all of it: JAX replaces -1 by the last
+# place before it uses them.
+_KNOWN: dict[str, Callable[..., Any]] = {
+    "abs": np.abs,
     "add": np.add,
-    "convert_element_type": lambda x, new_dtype, **_: x.astype(new_dtype),
+    "and": np.bitwise_and,
+    "convert_element_type": lambda x: x,
+    "eq": np.equal,
+    "ge": np.greater_equal,
+    "gt": np.greater,
+    "le": np.less_equal,
     "lt": np.less,
     "max": np.maximum,
     "min": np.minimum,
     "mul": np.multiply,
-    "select_n": lambda which, *cases: np.choose(which, cases),
+    "ne": np.not_equal,
+    "neg": np.negative,
+    "not": np.bitwise_not,
+    "or": np.bitwise_or,
+    "select_n": lambda which, *cases: cases[int(which)],
     "sub": np.subtract,
 }
 
@@ -251,23 +313,50 @@ _INSTEAD: dict[str, Callable[..., Any]] = {
 }
 
 
-class _WriteOut:
-    """Evaluates a jaxpr with each array replaced by an array of places in a list of scalars."""
+class _Program:
+    """A list of operations, each on results of earlier ones, in which none stands twice."""
 
-    def __init__(self, limit: int, differentiated: bool):
-        self.limit, self.differentiated = limit, differentiated
-        self.scalars: list[Any] = []
+    def __init__(self, limit: int, differentiated: bool, zeros: bool):
+        self.limit, self.differentiated, self.zeros = limit, differentiated, zeros
         self.num_operations = 0
+        # At each place: a number, an operation with the places of its operands, or `None` for what
+        # is given.
+        self.entries: list[Any] = []
+        self.places: dict[Any, int] = {}  # of operations and numbers
+        self.negated: dict[int, int] = {}  # the place of `x` by that of `-x`
         # The arrays that were taken apart, by the place of their first element. If one is needed as
         # a whole again, it need not be stacked.
-        self.arrays: dict[int, Array] = {}
+        self.wholes: dict[int, tuple[int, _Places]] = {}
 
-    def __call__(
-        self, closed: Any, shapes: list[tuple[int, ...]], inputs: Iterable[Scalars]
-    ) -> list[Array]:
-        places = [self._add(x, shape) for x, shape in zip(inputs, shapes, strict=True)]
-        outputs = walk(closed, places, self._constant, self._equation)
-        return [jnp.asarray(self.scalars[i]) for x in outputs for i in x.flat]
+    def given(self) -> int:
+        self.entries.append(None)
+        return len(self.entries) - 1
+
+    def results(self, closed: Any, inputs: list[_Places]) -> list[_Places]:
+        return walk(closed, inputs, self._constant, self._equation)
+
+    def evaluation(self, results: list[int]) -> Callable[[list[Any]], list[Any]]:
+        """The results as a function of what is given."""
+        needed, rest = set(), [*results]
+        while rest:
+            i = rest.pop()
+            if i not in needed and isinstance(self.entries[i], tuple):
+                needed.add(i)
+                rest += self.entries[i][1]
+        if len(needed) > self.limit:
+            raise _NotWrittenOut
+        entries, order = self.entries, sorted(needed)
+
+        def evaluate(given: list[Any]) -> list[Any]:
+            values = given + entries[len(given) :]
+            for i in order:
+                fn, row = entries[i]
+                values[i] = fn(*(values[j] for j in row))
+            return [values[i] for i in results]
+
+        return evaluate
+
+    # ---- Equations ----
 
     def _equation(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         """The places of the results of an equation, by the rule for its kind of primitive."""
@@ -281,6 +370,7 @@ class _WriteOut:
             for key, value in params.items()
             if value is not None and key not in ("sharding", "out_sharding")
         }
+        dtype = eqn.outvars[0].aval.dtype if eqn.outvars else None
         if name in _MOVES:
             moved = _MOVES[name](*inputs, **given)
             return moved if isinstance(moved, list) else [moved]
@@ -290,38 +380,43 @@ class _WriteOut:
             indices = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
             return [self._constant(_broadcast(indices, params["shape"], (params["dimension"],)))]
         if name in _ELEMENTWISE:
-            known = self._known_integers(inputs) if name in _ON_INDICES else None
-            if known is not None:
-                computed = _ON_INDICES[name](*known, **given)
-                return [self._constant(computed.astype(eqn.outvars[0].aval.dtype))]
-            fn = _INSTEAD.get(name, ft.partial(eqn.primitive.bind, **params))
-            return [self._elementwise(fn, inputs)]
+            if name == "copy" or (
+                name == "convert_element_type" and dtype == eqn.invars[0].aval.dtype
+            ):
+                return inputs
+            fn = ft.partial(eqn.primitive.bind, **params)
+            fn = fn if self.zeros else _INSTEAD.get(name, fn)
+            return [self._elementwise(name, fn, inputs, dtype, tuple(sorted(given.items())))]
         if name in _REDUCTIONS and given.keys() == {"axes"} and inputs[0].size:
-            return [self._reduce(_REDUCTIONS[name], inputs[0], params["axes"])]
+            both, fn = _REDUCTIONS[name]
+            return [self._reduce(both, fn, inputs[0], params["axes"], dtype)]
         types = {var.aval.dtype for var in (*eqn.invars, *eqn.outvars)}
         if name == "dot_general" and given.keys() <= _DOT and len(types) == 1:
-            return [self._dot(inputs, params["dimension_numbers"])]
+            return [self._dot(inputs, params["dimension_numbers"], dtype)]
         if name in _CALLS or (name in _CALLS_WITH_A_RULE and not self.differentiated):
-            inner = params.get("call_jaxpr", params.get("jaxpr"))
-            return walk(closed_jaxpr(inner), inputs, self._constant, self._equation)
-        return self._in_arrays(eqn, inputs)
+            return self.results(closed_jaxpr(params.get("call_jaxpr", params.get("jaxpr"))), inputs)
+        return self._as_it_is(eqn, inputs)
 
-    def _elementwise(self, fn: Callable[..., Array], inputs: list[_Places]) -> _Places:
+    def _elementwise(
+        self, name: str, fn: Any, inputs: list[_Places], dtype: Any, params: Any = ()
+    ) -> _Places:
         inputs = [*np.broadcast_arrays(*inputs)]
         self._count(inputs[0].size)
-        rows = zip(*(places.flat for places in inputs), strict=True)
-        return self._add((fn(*(self.scalars[i] for i in row)) for row in rows), inputs[0].shape)
+        rows = zip(*(places.ravel().tolist() for places in inputs), strict=True)
+        out = [self._scalar(name, fn, row, dtype, params) for row in rows]
+        return np.array(out, int).reshape(inputs[0].shape)
 
     def _reduce(
-        self, fn: Callable[[Array, Array], Array], places: _Places, axes: tuple[int, ...]
+        self, name: str, fn: Any, places: _Places, axes: tuple[int, ...], dtype: Any
     ) -> _Places:
         self._count(places.size)
         places = np.moveaxis(places, axes, range(-len(axes), 0))
         shape = places.shape[: places.ndim - len(axes)]
-        rows = places.reshape(prod(shape), -1)
-        return self._add((ft.reduce(fn, [self.scalars[i] for i in row]) for row in rows), shape)
+        rows = places.reshape(prod(shape), -1).tolist()
+        both = lambda a, b: self._scalar(name, fn, (a, b), dtype)  # noqa: E731
+        return np.array([ft.reduce(both, row) for row in rows], int).reshape(shape)
 
-    def _dot(self, inputs: list[_Places], dimensions: Any) -> _Places:
+    def _dot(self, inputs: list[_Places], dimensions: Any, dtype: Any) -> _Places:
         """A product of arrays, as products of their elements that are summed. The axes of both are
         brought into the order batch, free, contracted, and the free ones are spread out."""
         contracted, batch = dimensions
@@ -335,96 +430,180 @@ class _WriteOut:
         middle = first + free[0]
         a = a.reshape(*a.shape[:middle], *[1] * free[1], *a.shape[middle:])
         b = b.reshape(*b.shape[:first], *[1] * free[0], *b.shape[first:])
-        product = self._elementwise(lax.mul, [a, b])
-        return self._reduce(lax.add, product, tuple(range(product.ndim - last, product.ndim)))
+        product = self._elementwise("mul", lax.mul, [a, b], dtype)
+        axes = tuple(range(product.ndim - last, product.ndim))
+        return self._reduce("add", lax.add, product, axes, dtype)
 
     def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
         first, last = _BY_INDICES[name]
-        indices = self._known_integers(inputs[first:last])
-        if indices is None:
-            return self._in_arrays(eqn, inputs)
-
-        def moved(*others: np.ndarray, **given: Any) -> np.ndarray:
-            """What the primitive does to numbers in the place of the other operands."""
-            xs = [*others[:first], *indices, *others[first:]]
-            with jax.ensure_compile_time_eval():
-                return np.asarray(eqn.primitive.bind(*xs, **(params | given)))
-
-        if name == "scatter-add":
-            # To find out which update is added to which elements, we let JAX add a one in its place
-            # to zeros.
-            dtype, updates = eqn.outvars[0].aval.dtype, inputs[2]
-            self._count(updates.size)
-            nothing, out = np.zeros(operand.shape, dtype), operand.copy()
-            for one, place in zip(np.eye(updates.size, dtype=dtype), updates.flat, strict=True):
-                for at in zip(*np.nonzero(moved(nothing, one.reshape(updates.shape))), strict=True):
-                    (out[at],) = self._add(
-                        [lax.add(self.scalars[out[at]], self.scalars[place])], (1,)
-                    )
+        found, dtype = [self._integers(x) for x in inputs[first:last]], eqn.outvars[0].aval.dtype
+        indices = [x for x in found if x is not None]
+        if len(indices) < len(found):
+            return self._as_it_is(eqn, inputs)
+        dynamic, takes = name.startswith("dynamic"), name in ("gather", "dynamic_slice")
+        axes = tuple(range(operand.ndim))
+        numbers = (axes, (), axes, (), ()) if dynamic else params["dimension_numbers"]
+        updates = inputs[1 if dynamic else 2] if not takes else operand
+        moved = eqn.outvars[0].aval.shape if takes else updates.shape
+        starts = np.stack(indices, -1) if dynamic else indices[0]
+        at, inside = _slices(operand.shape, starts, numbers, moved)
+        outside = params.get("mode") == lax.GatherScatterMode.FILL_OR_DROP and not np.all(inside)
+        if takes and not outside:
+            return [operand[at]]
+        if takes:
+            filling = params["fill_value"]
+            if filling is None and not jnp.issubdtype(dtype, jnp.inexact):
+                return self._as_it_is(eqn, inputs)
+            filling = np.asarray(np.nan if filling is None else filling, dtype)
+            return [np.where(inside, operand[at], self._constant(filling))]
+        out, counted = operand.copy(), inside | (not outside)
+        at, updates = tuple(x[counted] for x in at), updates[counted]
+        if name != "scatter-add":
+            out[at] = updates
             return [out]
-        places = [x.astype(np.int32) for x in (*inputs[:first], *inputs[first:][len(indices) :])]
-        if name != "gather":
-            return [moved(*places)]
-        # Where an index is outside of the operand, a gather returns a filling value, which has no
-        # place yet. We mark it by -1, and let JAX tell the value.
-        out = moved(*places, fill_value=-1)
-        if np.any(out < 0):
-            filled = moved(np.zeros(operand.shape, eqn.outvars[0].aval.dtype))
-            out = np.where(out < 0, self._constant(filled), out)
+        self._count(updates.size)
+        for *one, place in zip(*at, updates.tolist(), strict=True):
+            both = int(out[tuple(one)]), place
+            out[tuple(one)] = self._scalar("add", lax.add, both, dtype)
         return [out]
 
-    def _in_arrays(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
+    def _as_it_is(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         """A primitive for which there is no rule here: its inputs are stacked to arrays, and its
         outputs are taken apart."""
         self._count(sum(prod(var.aval.shape) for var in (*eqn.invars, *eqn.outvars)))
-        given = [self._array(x, var.aval.dtype) for x, var in zip(inputs, eqn.invars, strict=True)]
-        return [self._taken_apart(x) for x in outputs(eqn, *given)]
+        row = tuple(self.array(x, v.aval.dtype) for x, v in zip(inputs, eqn.invars, strict=True))
+        called = self._operation(id(eqn), lambda *xs: outputs(eqn, *xs), row)
+        out = []
+        for k, var in enumerate(eqn.outvars):
+            one = self._operation("output", lambda xs, k=k: xs[k], (called,), k)
+            out.append(self.taken_apart(one, var.aval.shape))
+        return out
 
-    def _array(self, places: _Places, dtype: Any) -> Any:
-        """The array of these elements. If they are those of an array that was taken apart, in the
-        same order, it is that array."""
-        whole = self.arrays.get(places.flat[0]) if places.size else None
-        if whole is not None and np.array_equal(
-            np.arange(whole.size), places.ravel() - places.flat[0]
-        ):
-            return whole.reshape(places.shape)
-        elements = [self.scalars[i] for i in places.flat]
-        if any(isinstance(x, jax.core.Tracer) for x in elements):
-            return jnp.stack(elements).reshape(places.shape)
-        return np.array(elements, dtype).reshape(places.shape)
+    # ---- Arrays and their elements ----
 
-    def _taken_apart(self, x: Array) -> _Places:
-        self.arrays[len(self.scalars)] = x
-        return self._add(components(jnp.atleast_1d(x)), x.shape)
+    def taken_apart(self, whole: int, shape: tuple[int, ...]) -> _Places:
+        """The places of the elements of an array whose own place is given."""
+        if not shape:
+            return np.array(whole)
+        flat = self._operation("elements", components, (whole,))
+        each = [
+            self._operation("element", lambda x, k=k: x[k], (flat,), k) for k in range(prod(shape))
+        ]
+        places = np.array(each, int).reshape(shape)
+        if each:
+            self.wholes[each[0]] = whole, places
+        return places
 
-    def _known_integers(self, inputs: list[_Places]) -> list[np.ndarray] | None:
-        """The values of integer or boolean arrays, as indices are; `None` if they are not known."""
-        if any(
-            isinstance(x := self.scalars[i], jax.core.Tracer) or x.dtype.kind not in "iub"
-            for places in inputs
-            for i in places.flat
-        ):
-            return None
-        return [np.array([self.scalars[i] for i in x.flat]).reshape(x.shape) for x in inputs]
+    def array(self, places: _Places, dtype: Any) -> int:
+        """The place of the array of these elements. If they are those of an array that was taken
+        apart, in the same order, it is that array."""
+        shape = places.shape
+        if not shape:
+            return int(places)
+        row = tuple(places.ravel().tolist())
+        whole, those = self.wholes.get(row[0], (0, None)) if row else (0, None)
+        if those is not None and row == tuple(those.ravel().tolist()):
+            if shape == those.shape:
+                return whole
+            return self._operation("reshape", lambda x: x.reshape(shape), (whole,), shape)
+
+        def stacked(*scalars: Any) -> Any:
+            if any(isinstance(x, jax.core.Tracer) for x in scalars):
+                return jnp.stack(scalars).reshape(shape)
+            return np.array(scalars, dtype).reshape(shape)
+
+        return self._operation("array", stacked, row, (shape, dtype))
 
     def _constant(self, x: Any) -> _Places:
         self._count(np.size(x))
         if _is_key(x):
             raise _NotWrittenOut
         if isinstance(x, jax.core.Tracer):
-            return self._taken_apart(x)
-        return self._add(np.asarray(x).flat, np.shape(x))
+            return self.taken_apart(self._operation(id(x), lambda: x, ()), x.shape)
+        x = np.asarray(x)
+        numbers = [*map(self._number, x.flat)]
+        return np.array(numbers, int).reshape(x.shape)
 
-    def _add(self, scalars: Iterable[Any], shape: tuple[int, ...]) -> _Places:
-        """Appends scalars to the list, and returns their places in an array of this shape."""
-        first = len(self.scalars)
-        self.scalars.extend(scalars)
-        return np.arange(first, len(self.scalars)).reshape(shape)
+    def _integers(self, places: _Places) -> np.ndarray | None:
+        """The values of an array of integers or booleans, as indices are; `None` if they are not
+        known."""
+        numbers = [self.entries[i] for i in places.flat]
+        known = all(isinstance(x, np.generic) and x.dtype.kind in "iub" for x in numbers)
+        return np.array(numbers).reshape(places.shape) if known else None
+
+    # ---- Scalars ----
+
+    def _number(self, x: Any) -> int:
+        key = x.dtype, x.tobytes()
+        if key not in self.places:
+            self.places[key] = len(self.entries)
+            self.entries.append(x)
+        return self.places[key]
+
+    def _operation(self, name: Any, fn: Any, row: tuple[int, ...], params: Any = ()) -> int:
+        key = name, params, row
+        if key not in self.places:
+            self.places[key] = len(self.entries)
+            self.entries.append((fn, row))
+        return self.places[key]
+
+    def _scalar(
+        self, name: str, fn: Any, row: tuple[int, ...], dtype: Any, params: Any = ()
+    ) -> int:
+        """The place of the result of an operation on scalars."""
+        name = "add" if name == "add_any" else name
+        known = [x if isinstance(x := self.entries[i], np.generic) else None for i in row]
+        if name in _KNOWN and all(x is not None for x in known):
+            with np.errstate(all="ignore"):
+                return self._number(np.asarray(_KNOWN[name](*known)).astype(dtype)[()])
+        simpler = self._simpler(name, row, known, dtype)
+        if simpler is not None:
+            return simpler
+        if name in ("add", "mul"):
+            row = tuple(sorted(row))
+        place = self._operation(name, fn, row, params)
+        if name == "neg":
+            self.negated[place] = row[0]
+        return place
+
+    def _simpler(self, name: str, row: Any, known: list[Any], dtype: Any) -> int | None:
+        """The place of a result that needs no operation, or a simpler one."""
+        zero, one, minus = ([x is not None and x == v for x in known] for v in (0, 1, -1))
+        apply = lambda name, *row: self._scalar(name, getattr(lax, name), row, dtype)  # noqa: E731
+        opposite = [self.negated.get(i) for i in row]
+        match name:
+            case "neg":
+                return opposite[0]
+            case "select_n" if known[0] is not None or len(set(row[1:])) == 1:
+                return row[1 + int(known[0] or 0)]
+            case "div" if one[1] or (zero[0] and self.zeros):
+                return row[0]
+            case "sub" if zero[1]:
+                return row[0]
+            case "sub" if zero[0]:
+                return apply("neg", row[1])
+            case "sub" if opposite[1] is not None:
+                return apply("add", row[0], opposite[1])
+            case "add":
+                for i, j in ((0, 1), (1, 0)):
+                    if zero[i]:
+                        return row[j]
+                    if opposite[i] is not None:
+                        return apply("sub", row[j], opposite[i])
+            case "mul":
+                for i, j in ((0, 1), (1, 0)):
+                    if one[i] or (zero[i] and self.zeros):
+                        return row[j if one[i] else i]
+                    if minus[i] and dtype.kind in "fc":
+                        return apply("neg", row[j])
+                    if opposite[i] is not None:
+                        return apply("neg", apply("mul", opposite[i], row[j]))
+        return None
 
     def _count(self, operations: int) -> None:
         self.num_operations += operations
-        if self.num_operations > self.limit:
+        if self.num_operations > (TRIED * OPERATIONS if self.zeros else self.limit):
             raise _NotWrittenOut
 
 

@@ -5,8 +5,8 @@ They differ in what a step does, so a step is a function of the unknowns and of 
 loop around it is written once, in `iterate`.
 
 - `simplified_newton` is for candidates as near as the local error of a solver's step (Hairer,
-  Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ` is
-  on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
+  Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
+  is on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
   gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration

@@ -23,7 +23,6 @@ from typing import Any
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy as jsp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -103,13 +102,28 @@ def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Flo
     """
     heights, rows = unit_rows(matrix[n:, :n])
     widths, along = unit_rows(matrix[:n, n:].T)
-    factors = jsp.linalg.lu_factor(matrix[:n, :n] + gram_matrix(rows.T, rows.T))
-    along = jsp.linalg.lu_solve(factors, along.T).T
+    factors = lu_factors(matrix[:n, :n] + gram_matrix(rows.T, rows.T))
+    along = lu_solution(factors, along.T).T
     second = b[n:] / heights
-    first = jsp.linalg.lu_solve(factors, b[:n] + rmatvec(rows, second))
+    first = lu_solution(factors, b[:n] + rmatvec(rows, second))
     wrong = matvec(rows, first) - second
     multiplier = solve(gram_matrix(rows, along), wrong, least=least_pivot(rows))
     return jnp.concatenate([first - rmatvec(along, multiplier), multiplier / widths])
+
+
+def lu_factors(matrix: Float[Array, "m m"]) -> tuple[Array, Array]:
+    """`L` and `U` by LAPACK, and the permutation of the rows. `jax.scipy.linalg` keeps the pivots
+    instead, and each of its solves finds the permutation again, by a loop."""
+    factors, _, permutation = lax.linalg.lu(matrix)
+    return factors, permutation
+
+
+def lu_solution(factors: tuple[Array, Array], b: Array) -> Array:
+    """The solution for a vector, or for the columns of a matrix."""
+    both, permutation = factors
+    x = jnp.reshape(b, (len(b), -1)).at[permutation].get(mode="promise_in_bounds")
+    x = lax.linalg.triangular_solve(both, x, left_side=True, lower=True, unit_diagonal=True)
+    return lax.linalg.triangular_solve(both, x, left_side=True).reshape(b.shape)
 
 
 class Factors(eqx.Module):
@@ -126,7 +140,7 @@ class Factors(eqx.Module):
     def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         x = (b * self.unit).astype(self.factors[0].dtype)
         if _is_large(b):
-            x = jsp.linalg.lu_solve(self.factors, x)
+            x = lu_solution(self.factors, x)
         else:
             below, above = self.factors
             x = rmatvec(above.T, rmatvec(below.T, x))
@@ -148,7 +162,7 @@ def factorise(gram: Any, *, least: float | Array | None = None) -> Solve:
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
     added = eps**ADDED_POWER * len(matrix) ** 0.5 if least is None else least
-    return Factors(jsp.linalg.lu_factor(matrix.astype(dtype) + added * one), unit)
+    return Factors(lu_factors(matrix.astype(dtype) + added * one), unit)
 
 
 def _is_large(gram: Any) -> bool:
