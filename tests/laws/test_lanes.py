@@ -90,11 +90,6 @@ CASES = {
 }
 ADAPTIVE_ONLY = {"Radau", "projected Radau", "DAE of index 1", "DAE of index 3"}
 FIXED_ONLY = {"ImplicitMidpoint", "SymmetricProjection", "RATTLE", "RK4", "PINN"}
-REVERSE, FORWARD, DIRECT = (
-    dfx.RecursiveCheckpointAdjoint(),
-    dfx.ForwardMode(),
-    dfx.DirectAdjoint(),
-)
 # The tolerances, or steps, of the lanes. The last lane fails.
 LANES = {"adaptive": (1e-2, 1e-4, 1e-6, 1e-6), "fixed": (1 / 2, 1 / 4, 1 / 8, 1 / 8)}
 OFF = jnp.array([0.0, 0.0, 0.0, jnp.nan])
@@ -145,34 +140,44 @@ def derivatives(case, steps, adjoint, size, off):
     return saved, found, okay
 
 
-def every_case(adjoint, always, period):
-    """The law for one adjoint; by default `always`, and some of the other cases."""
+def cases(always, period):
+    """Parametrises a law by all cases; by default it runs on `always` and on some of the others."""
     pairs = [(case, "adaptive") for case in CASES if case not in FIXED_ONLY]
     pairs += [(case, "fixed") for case in CASES if case not in ADAPTIVE_ONLY]
     by_default = {always, *pairs[len(pairs) % period :: period]}
-    params = [
-        pytest.param(*pair, id="-".join(pair), marks=() if pair in by_default else pytest.mark.slow)
-        for pair in pairs
-    ]
-
-    @pytest.mark.parametrize(("case", "steps"), params)
-    def test(case, steps):
-        lanes = eqx.filter_jit(jax.vmap(lambda *x: derivatives(case, steps, adjoint, *x)))
-        sizes = jnp.asarray(LANES[steps])
-        saved, found, (okay, count) = lanes(sizes, OFF)
-        assert okay.tolist() == [True, True, True, case == "plain" and steps == "fixed"]
-        assert count[0] < count[2], "The lanes take unlike numbers of steps."
-        for i in range(3):
-            # The same program, in all of whose lanes is this one.
-            expected = lanes(jnp.full(4, sizes[i]), jnp.zeros(4))[:2]
-            for a, b in zip(*map(jax.tree.leaves, ((saved, found), expected)), strict=True):
-                assert np.all(np.isfinite(b[0]))
-                limit = 1e-9 * np.max(np.abs(b[0]), initial=1e-3)
-                np.testing.assert_allclose(a[i], b[0], rtol=0, atol=limit)
-
-    return test
+    marks = {True: (), False: pytest.mark.slow}
+    return pytest.mark.parametrize(
+        ("case", "steps"),
+        [pytest.param(*x, id="-".join(x), marks=marks[x in by_default]) for x in pairs],
+    )
 
 
-test_reverse = every_case(REVERSE, ("Dopri5", "fixed"), 9)
-test_forward = every_case(FORWARD, ("RATTLE", "fixed"), 17)
-test_direct = every_case(DIRECT, ("Radau", "adaptive"), 23)
+def check(case, steps, adjoint):
+    lanes = eqx.filter_jit(jax.vmap(lambda *x: derivatives(case, steps, adjoint, *x)))
+    sizes = jnp.asarray(LANES[steps])
+    saved, found, (okay, count) = lanes(sizes, OFF)
+    # The only solver that does not notice a start that is not finite.
+    assert okay.tolist() == [True, True, True, case == "plain" and steps == "fixed"]
+    assert count[0] < count[2], "The lanes take unlike numbers of steps."
+    for i in range(3):
+        # The same program, in all of whose lanes is this one.
+        expected = lanes(jnp.full(4, sizes[i]), jnp.zeros(4))[:2]
+        for a, b in zip(*map(jax.tree.leaves, ((saved, found), expected)), strict=True):
+            assert np.all(np.isfinite(b[0]))
+            limit = 1e-9 * np.max(np.abs(b[0]), initial=1e-3)
+            np.testing.assert_allclose(a[i], b[0], rtol=0, atol=limit)
+
+
+@cases(("Dopri5", "fixed"), 18)
+def test_in_reverse_mode(case, steps):
+    check(case, steps, dfx.RecursiveCheckpointAdjoint())
+
+
+@cases(("RATTLE", "fixed"), 23)
+def test_in_forward_mode(case, steps):
+    check(case, steps, dfx.ForwardMode())
+
+
+@cases(("constraint", "fixed"), 100)
+def test_in_both_modes(case, steps):
+    check(case, steps, dfx.DirectAdjoint())
