@@ -49,8 +49,7 @@ def test_a_table_is_that_of_the_results(name, monkeypatch):
 def test_the_results_are_what_the_pages_show(name):
     module = benchmark(name)
     results = module.read_results()
-    files = module.PAGES if name == "report" else [module.PAGE]
-    pages = [page.read_text(encoding="utf-8") for page in files]
+    pages = [page.read_text(encoding="utf-8") for page in module.PAGES]
     assert [page for page in pages if module.filled(page, results) != page] == []
     for table in module.tables(results):
         assert any(f"<!-- begin: {table} -->" in page for page in pages)

@@ -121,6 +121,8 @@ MODULES = ["diffrax_conserve"] + [
 
 def found(path):
     """What is called `path` here, or `None`."""
+    if path in MODULES:
+        return importlib.import_module(path)
     module = max((m for m in MODULES if path.startswith(f"{m}.")), key=len)
     try:
         return operator.attrgetter(path.removeprefix(f"{module}."))(importlib.import_module(module))

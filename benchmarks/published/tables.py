@@ -1,7 +1,7 @@
-"""The tables of the page `docs/published.md`, from the results.
+"""The tables of `docs/published.md` and `docs/appendix/published.md`, from the results.
 
 python benchmarks/published/tables.py           # prints what is won and lost
-python benchmarks/published/tables.py --write   # puts all tables between their two markers
+python benchmarks/published/tables.py --write   # puts each table between its two markers
 """
 
 import argparse
@@ -22,7 +22,8 @@ import sundials
 import sympflow
 from matplotlib.figure import Figure
 
-PAGE = common.measuring.RESULTS.parents[1] / "docs" / "published.md"
+DOCS = common.measuring.RESULTS.parents[1] / "docs"
+PAGES = [DOCS / "published.md", DOCS / "appendix" / "published.md"]
 # In the order of the page.
 ROWS = (
     *(sundials, homproj_paper, heyoka_page, discrete_gradient, julia_energy, mechanisms),
@@ -79,7 +80,7 @@ def machine(results):
 
 
 def tables(results):
-    """By the name in the markers of the page."""
+    """By the name in the markers of the pages."""
     return {
         "summary": summary(results),
         "machine": machine(results),
@@ -131,18 +132,19 @@ def figure(results):
         ax.set_xlim((1e3, 5e4) if cost == "evaluations" else None)
         ax.xaxis.set_minor_formatter("")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=8)
-    drawn.savefig(PAGE.parent / "images" / "published.svg", metadata={"Date": None})
+    drawn.savefig(DOCS / "images" / "published.svg", metadata={"Date": None})
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--write", action="store_true", help="the tables of the page")
+    parser.add_argument("--write", action="store_true", help="the tables of the pages")
     options = parser.parse_args(argv)
     results = read_results()
     print("\n".join([*summary(results), *verdict_table(results)]))
     if options.write:
-        PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), results), encoding="utf-8")
-        with mpl.rc_context(fname=PAGE.parent / "figures.mplstyle"):
+        for page in PAGES:
+            page.write_text(filled(page.read_text(encoding="utf-8"), results), encoding="utf-8")
+        with mpl.rc_context(fname=DOCS / "figures.mplstyle"):
             figure(results)
 
 
