@@ -20,8 +20,8 @@ MAX_STEPS = 50
 # the gradients at each state.
 FROZEN_STEPS = 6
 # A correction that does not help is shortened to this share of itself. A half needs twice as many
-# evaluations where it is far too long, and a much smaller share gives away corrections that would
-# do.
+# evaluations where it is far too long, and a much smaller share rejects corrections that would have
+# worked.
 BACKTRACKING_FACTOR = 1 / 4
 # Up to this many constraints the elimination is written out, element by element, so that XLA fuses
 # it with what is around it. A call of LAPACK would take most of the time of a small projection.
@@ -32,17 +32,15 @@ WRITTEN_OUT = 4
 # of all multipliers, in the ratio of roundoff to what is added. With 16 units of roundoff one in
 # five projections on the seven integrals of an orbit, of which five are independent, does not
 # converge.
-ADDED_POWER = 3 / 4
-# So many solves, all but the first for what is left of the right side, remove from a solution what
-# the addition has changed in it.
-SOLVES = 3
+REGULARISATION_POWER = 3 / 4
+# So many steps of iterative refinement remove from a solution what the addition has changed in it.
+NUM_REFINEMENTS = 2
 # Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 AT_BOUND = 1e-10
-# The nearest point from far away is sought for at most this many unknowns and constraints together,
-# because each step solves a dense system of that size. A sparse system of at most this size is
-# factored as a dense matrix if it would have to be solved by iteration.
-NEAREST = 512
+# Up to this many unknowns and constraints together a dense system is solved in each step: that of
+# the nearest point from far away, and a sparse one that would else be solved by iteration.
+MAX_DENSE_SYSTEM = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
@@ -54,9 +52,12 @@ TRIED = 8
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).
 LEAST_SPARSE = 33
-# A row is dense if it has more than this many times the elements of the median row (a bond has 6
-# elements, an energy all of them). A Jacobian with more dense rows than this is treated as dense,
-# because each costs one reverse pass and a solve of the sparse system. A block with more rows than
-# this is replaced by an iteration, because it is eliminated element by element, so that compile
-# time grows with its size.
-FEW = 16
+# A row is dense if it has more than this many times the elements of the median row: a bond has 6
+# elements, an energy all of them.
+DENSE_ROW_RATIO = 16
+# A Jacobian with more dense rows than this is treated as dense, because each costs one reverse pass
+# and a solve of the sparse system.
+MAX_DENSE_ROWS = 16
+# A block with more rows than this is replaced by an iteration: it is eliminated element by element,
+# so that compile time grows with its size.
+MAX_BLOCK = 16

@@ -31,7 +31,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
-from .newton import MOST, algebraic_newton, at_rest_near, divided
+from .newton import MAX_NEWTON_STEPS, algebraic_newton, at_rest_near, divided
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
 from .search import Search, any_traced, lifted, tree_key
@@ -179,7 +179,7 @@ class DAE(Hashable):
                 )
             solver = dataclasses.replace(solver, equations=_Stages(self))
         manifold = {"equations": Constraint(_Constraints(self))}
-        return ManifoldProjection(solver, manifold, projection=_Return(dae=self))
+        return ManifoldProjection(solver, manifold, projection=ConstraintProjection(dae=self))
 
     def consistent(
         self,
@@ -550,7 +550,7 @@ def _flags(fixed: Any, y: Y) -> np.ndarray:
 
 
 @final
-class _Return(AbstractProjection):
+class ConstraintProjection(AbstractProjection):
     """The way back to the constraints. With index 1 it keeps all that the equations differentiate,
     as the solution does: the state moves in the directions in which `F` has no slopes, and the
     unknowns there are solved for. With a higher index unknowns without slopes are free, and the
@@ -597,7 +597,7 @@ def _consistent(
         manifold = {"equations": Constraint(_Constraints(dae, asked))}
         cancellation = cancellation_scale(manifold, t, y, args)[2]
         metric = unravel(jnp.where(free, units, 0) ** -2, y)
-        projection = SimplifiedNewton(metric=metric, max_steps=MOST)
+        projection = SimplifiedNewton(metric=metric, max_steps=MAX_NEWTON_STEPS)
         vector = ravel(y)
         problem = problem_of(manifold, none, t, y, args, cancellation)
         found, info = projection.solve(adapted(problem, projection, vector), vector)

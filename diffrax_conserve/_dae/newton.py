@@ -17,7 +17,7 @@ from .._numerics.roundoff import cancellation_terms
 # Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
 # lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
-MOST = 500
+MAX_NEWTON_STEPS = 500
 
 
 def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -124,5 +124,7 @@ def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> S
         return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(False)
-    (z, _, settled), at_rest, num_iterations, _ = iterate(advance, start, max_steps=MOST)
-    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, num_iterations, settled)
+    (z, _, settled), at_rest, num_iterations, _ = iterate(
+        advance, start, max_steps=MAX_NEWTON_STEPS
+    )
+    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, settled)

@@ -25,7 +25,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import ADDED_POWER
+from .._constants import REGULARISATION_POWER
 from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import without_pattern
@@ -240,7 +240,7 @@ class Reduction:
         if structure.apart:
             return ~jnp.any(left)
         along, _ = self.freely_moved(t, y)
-        least = float(jnp.finfo(y.dtype).eps) ** ADDED_POWER
+        least = float(jnp.finfo(y.dtype).eps) ** REGULARISATION_POWER
         return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
 
     def all_slopes(self, t: Array, y: Array) -> Array:
@@ -377,7 +377,7 @@ def _extended(matrix: np.ndarray, round: Round) -> Round:
         inner = matrix[np.ix_(rows, columns)]
         matrix = matrix - matrix[:, columns] @ np.linalg.solve(inner, matrix[rows])
     matrix[rows], matrix[:, columns] = 0, 0
-    least = float(jnp.finfo(jnp.result_type(float)).eps) ** ADDED_POWER
+    least = float(jnp.finfo(jnp.result_type(float)).eps) ** REGULARISATION_POWER
     while np.max(np.abs(matrix), initial=0) > least:
         i, j = np.unravel_index(np.argmax(np.abs(matrix)), matrix.shape)
         matrix = matrix - np.outer(matrix[:, j], matrix[i]) / matrix[i, j]

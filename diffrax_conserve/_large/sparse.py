@@ -32,7 +32,14 @@ import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
 
-from .._constants import ADDED_POWER, FEW, LEAST_SPARSE, NEAREST
+from .._constants import (
+    DENSE_ROW_RATIO,
+    LEAST_SPARSE,
+    MAX_BLOCK,
+    MAX_DENSE_ROWS,
+    MAX_DENSE_SYSTEM,
+    REGULARISATION_POWER,
+)
 from .._fast.jaxprs import jaxprs_inside
 from .asdex_import import asdex, reason
 
@@ -98,7 +105,7 @@ class Pattern:
         _, labels = sp.csgraph.connected_components(graph, directed=False)
         sizes = np.bincount(labels)
         block = int(sizes.max())
-        if block <= FEW:
+        if block <= MAX_BLOCK:
             by_label = np.argsort(labels, kind="stable")
             starts = np.cumsum(sizes) - sizes
             order = np.full(len(sizes) * block, self.size)
@@ -112,7 +119,7 @@ class Pattern:
         a, b = graph.nonzero()
         widths = [int(np.max(np.abs(np.argsort(x)[a] - np.argsort(x)[b]))) for x in orders]
         best = int(np.argmin(widths))
-        if widths[best] > FEW:
+        if widths[best] > MAX_BLOCK:
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
@@ -218,7 +225,7 @@ def pattern_of(
         )
     # An iteration does not cope with constraints that depend on each other, as the rigid bodies of
     # an over-constrained mechanism have them, and the factors of a dense matrix do.
-    if pattern is not None and pattern.iterative and m + n <= NEAREST:
+    if pattern is not None and pattern.iterative and m + n <= MAX_DENSE_SYSTEM:
         return None
     return pattern
 
@@ -267,8 +274,8 @@ def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
     """The pattern, if few rows are dense and at most a quarter of the elements of the others can
     differ from zero."""
     counts = np.concatenate([np.bincount(r, minlength=size) for size, (r, _) in found])
-    dense = counts > FEW * max(1, np.median(counts))
-    if np.sum(dense) > FEW or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
+    dense = counts > DENSE_ROW_RATIO * max(1, np.median(counts))
+    if np.sum(dense) > MAX_DENSE_ROWS or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
         return None
     return Pattern(shape, found, dense)
 
@@ -403,7 +410,7 @@ class BlockGram(eqx.Module):
         last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
-        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** ADDED_POWER
+        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** REGULARISATION_POWER
         # A diagonal element is zero for padding, and for a constraint without a gradient. With a
         # one in its place the multiplier of such a row is its right side.
         unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)

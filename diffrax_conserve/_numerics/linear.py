@@ -27,7 +27,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import ADDED_POWER, ROUNDOFF, SOLVES, WRITTEN_OUT
+from .._constants import NUM_REFINEMENTS, REGULARISATION_POWER, ROUNDOFF, WRITTEN_OUT
 from .._large.sparse import BlockGram, SparseRows
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -161,7 +161,7 @@ def factorise(gram: Any, *, least: float | Array | None = None) -> Solve:
         return Factors((below, above.T), unit)
     dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
     eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
-    added = eps**ADDED_POWER * len(matrix) ** 0.5 if least is None else least
+    added = eps**REGULARISATION_POWER * len(matrix) ** 0.5 if least is None else least
     return Factors(lu_factors(matrix.astype(dtype) + added * one), unit)
 
 
@@ -175,7 +175,7 @@ def iterative_refinement(
     """The solution of `product(x) = b` by iterative refinement, from a `solve` that is inaccurate,
     because something was added to the matrix."""
     x = solve(b)
-    for _ in range(SOLVES - 1):
+    for _ in range(NUM_REFINEMENTS):
         x = x + solve(b - product(x))
     return x
 

@@ -21,7 +21,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._constants import ADDED_POWER
+from .._constants import REGULARISATION_POWER
 from .._custom_types import Args, RealScalarLike, Y
 from .._large.sparse import SparseRows
 from .._options import check_function, check_number
@@ -184,7 +184,7 @@ class Preferring(AbstractFactor):
 
 def _outside(dtype: Any) -> float:
     """`δ` of `Preferring`."""
-    return float(jnp.finfo(dtype).eps) ** (ADDED_POWER / 2)
+    return float(jnp.finfo(dtype).eps) ** (REGULARISATION_POWER / 2)
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:

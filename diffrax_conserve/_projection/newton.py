@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import NEAREST, ROUNDOFF
+from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
 from .._numerics.implicit import MultiplierSystem, nan_tangent_unless, root, solution
 from .._numerics.iterate import Solved, damped_newton
 from .._numerics.linear import gram_matrix, least_pivot, matvec, solve, solve_kkt, unit_rows
@@ -74,7 +74,7 @@ class Newton(AbstractNewton):
             )
         bounds = self.bounds(problem.like)
         given = _Given(problem.dense(), candidate, bounds)
-        if candidate.size + problem.magnitude.size > NEAREST:
+        if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
             first = _some_point(problem, given, self.max_steps)
             y, count = given.clip(first.y), first.num_iterations
             y = nan_tangent_unless(y, False)
