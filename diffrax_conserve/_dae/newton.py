@@ -124,7 +124,5 @@ def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> S
         return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(False)
-    (z, _, settled), at_rest, num_iterations, _ = iterate(
-        advance, start, max_steps=MAX_NEWTON_STEPS
-    )
+    (z, _, settled), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
     return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, settled)
