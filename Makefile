@@ -155,7 +155,7 @@ examples: $(TEST) ## execute the code blocks of the README, the first pages and 
 
 COSTS := scaling balance dae stiff
 TRAININGS := zoo paper chemistry worth
-STUDIES := long_run metric verdict planets
+STUDIES := long_run verdict
 PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms \
   positive_chemistry sympflow pinn_issues
 
