@@ -109,7 +109,7 @@ def do_not_project_the_interpolant(package):
 
 
 def call_nan_a_success(package):
-    @package.around("Equations.level")
+    @package.around("Problem.level")
     def _(level, self, *values):
         return level(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
 
@@ -200,7 +200,7 @@ def measure_corrections_in_the_numbers_of_the_state(package):
 
 
 def give_each_component_of_a_vector_its_own_unit(package):
-    package.replace("largest_of_vector", lambda x, like: x)
+    package.replace("largest_of_quantity", lambda x, like: x)
 
 
 def keep_the_frozen_directions(package):
@@ -302,7 +302,7 @@ def take_the_derivative_at_an_upper_bound_from_outside(package):
 
 def name_an_element_in_the_place_of_its_entry(package):
     wrong = SimpleNamespace(**{**vars(np), "repeat": lambda _, sizes: np.arange(sum(sizes))})
-    package.in_module_of("Target", "np", wrong)
+    package.in_module_of("Problem", "np", wrong)
 
 
 def project_a_saved_state_to_the_manifold_at_the_end_of_its_step(package):
@@ -320,10 +320,10 @@ def integrate_rates_forwards_in_a_solve_backwards(package):
 
 
 def forget_how_the_state_changed_in_the_last_step(package):
-    @package.around("State.next")
-    def _(following, self, **fields):
-        later = fields["preferred"]
-        return following(self, **fields | {"preferred": later if later is None else 0 * later})
+    @package.around("ManifoldProjection._target")
+    def _(made, *given):
+        target, units, preferred = made(*given)
+        return target, units, jax.tree.map(jnp.zeros_like, preferred)
 
 
 def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):

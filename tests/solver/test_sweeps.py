@@ -126,7 +126,8 @@ def test_it_knows_how_the_vector_field_passes_an_error_on(rate):
     y1, estimate = run(0)
     error = jnp.exp(rate) - y1
     np.testing.assert_allclose(estimate, error, rtol=0.05)
-    assert not 0.6 < (run(1)[0] - y1) / error < 1.6
+    by_sweep = (run(1)[0] - y1) / error
+    assert by_sweep <= 0.6 or by_sweep >= 1.6
 
 
 @some_of("order, corrections", [(2, 0), (0, 2)], period=2)
@@ -172,6 +173,5 @@ def test_steps_longer_than_the_longest_are_rejected():
     """Not an error: the controller tries a smaller one."""
     sol = adaptive(unchecked(SHIPPED), jnp.asarray(1e-1))
     assert sol.stats["num_rejected_steps"] > 0
-    lengths = jnp.diff(jnp.where(jnp.isfinite(sol.ts), sol.ts, jnp.nan), prepend=0.0)
-    assert jnp.nanmax(lengths) <= 0.25 + 1e-6
-    assert jnp.nanmax(lengths) > 0.04
+    lengths = np.diff(sol.ts[: int(sol.stats["num_accepted_steps"])], prepend=0.0)
+    assert 0.04 < np.max(lengths) <= 0.25 + 1e-6
