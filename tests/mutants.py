@@ -52,12 +52,15 @@ class Package:
         self.patch = patch
 
     def find(self, name: str) -> Any:
-        """The one function or class of that name that is defined in the package."""
+        """The one function or class of that name that is defined in the package; that of the core
+        where `learned` has one too, as with `Problem`."""
         found = {
             id(value): value
             for module in self.modules
             if getattr(value := vars(module).get(name), "__module__", None) == module.__name__
         }
+        core = {k: v for k, v in found.items() if ".learned." not in v.__module__}
+        found = core or found
         if len(found) != 1:
             raise LookupError(f"{PACKAGE} defines {len(found)} functions or classes named {name}")
         return next(iter(found.values()))
