@@ -8,7 +8,8 @@ million turns, in float64 and in float32. The steps are solved in parts of at mo
 time zero: in float32 diffrax jumps to the end of a solve from up to 1e-5 of its length away. The
 conserved values are always those at the start of the first part. Drifts are computed from saved
 states in long double, relative to these values. The table has the largest in each decade, of ten
-states in each part. A projected drift of more than 4 units of roundoff is an error.
+states in each part. A projected drift of more than 16 units of
+roundoff, the tolerance of a projection, is an error.
 """
 
 import dataclasses
@@ -103,8 +104,8 @@ def main():
     print(table(rows))
     for row in rows:
         drift = np.array([*row["drift"].values()]) / np.finfo(row["dtype"]).eps
-        if not (np.all(drift < 4) if row["solver"] == "projected" else np.all(drift > 20)):
-            raise SystemExit(f"{row['solver']}, {row['dtype']}: the drift is not that of the page")
+        if not (np.all(drift < 16) if row["solver"] == "projected" else np.all(drift > 20)):
+            raise SystemExit(f"{row['solver']}, {row['dtype']}: the drift is not as the page says")
 
 
 if __name__ == "__main__":
