@@ -146,6 +146,11 @@ def largest(tree):
     return float(np.max([np.max(np.abs(x)) for x in jax.tree.leaves(tree)]))
 
 
+def printed(record):
+    """What `print` shows, without the widths of its columns."""
+    return " ".join(str(record).split())
+
+
 def final(sol):
     return jax.tree.map(lambda y: y[-1], sol.ys)
 

@@ -115,10 +115,6 @@ test_mistakes_are_named = refused(
     *((lambda x=x: wrap(x), ValueError, "nothing to conserve") for x in ((), [], {}, None)),
     (lambda: run(FirstIntegral(lambda t, y, args: ())), ValueError, "no array"),
     (lambda: run(SPHERE, projection=Simplified), TypeError, "which is not a projection"),
-    *(
-        (lambda x=x: wrap(SPHERE, projection=x, every=2), ValueError, "has bounds")
-        for x in (Simplified(lower=0.0), dfc.Staged(("g", Simplified(lower=0.0))))
-    ),
     (lambda: dfc.ManifoldProjection(rigid_body, ENERGY), TypeError, "not a diffrax solver"),
     (lambda: dfc.ManifoldProjection(dfx.Tsit5, ENERGY), TypeError, "Pass an instance"),
     (lambda: dfc.ManifoldProjection(IMPLICIT, ENERGY), ValueError, "VeryChord"),

@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from metric import unit
 from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
@@ -50,6 +49,11 @@ class Problem(NamedTuple):
 
 
 PROBLEMS: dict[str, Problem] = {}
+
+
+def unit(key):
+    x = jr.normal(key, (3,))
+    return x / jnp.linalg.norm(x)
 
 
 def problem(solver, t1, **more):

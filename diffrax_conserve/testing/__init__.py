@@ -10,12 +10,8 @@ from ._conserved import assert_conserved as assert_conserved
 from ._conserved import assert_on_manifold as assert_on_manifold
 from ._gradients import assert_gradients as assert_gradients
 from ._order import assert_order as assert_order
-from ._quadratic import QuadraticSystem as QuadraticSystem
-from ._quadratic import quadratic_systems as quadratic_systems
 from ._states import catalogue_systems as catalogue_systems
 from ._states import states as states
 from ._states import step_sizes as step_sizes
 from ._states import system_states as system_states
 from ._states import times as times
-from ._structures import Restructuring as Restructuring
-from ._structures import restructurings as restructurings

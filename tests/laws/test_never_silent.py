@@ -188,7 +188,7 @@ def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name, repeated
     assert np.all(off[solved] < 1e-5)
     assert np.mean(solved) >= (1 if name == "newton" else 0.9)
     error = np.linalg.norm(found - expected, axis=-1) / np.linalg.norm(expected, axis=-1)
-    assert not np.any(error > 1e-3)
+    assert np.all((error <= 1e-3) | (np.isnan(error) & ((name == "newton") | ~solved)))
     assert np.all(error[e > 1e-3] <= 1e-4)
     assert name == "newton" or repeated > 1 or np.all(error[e < 1e-5] <= 1e-7)
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 
 import diffrax_conserve as dfc
-import diffrax_conserve.testing as dct
 
 from ..problems import (
     EXPONENTIAL,
@@ -24,6 +23,7 @@ from ..problems import (
     largest,
     solve,
 )
+from ..structures import packings
 from ..thinned import some_of
 
 SYSTEMS = ["rigid-body", "kepler", "point-vortices", "conservative-lorenz", "double-pendulum"]
@@ -63,7 +63,7 @@ ORBIT = dfc.systems.Kepler()
 
 @pytest.mark.slow
 @settings(max_examples=2)
-@given(packing=dct.restructurings(ORBIT.y0))
+@given(packing=packings(ORBIT.y0))
 def test_any_pytree_is_a_state(packing):
     """Of integrals too: in other containers the solve is the same, in a metric that does not see
     them."""

@@ -88,23 +88,6 @@ def test_leaving_the_domain_fails_at_a_time(errors_raise):
 
 
 @pytest.mark.slow
-def test_too_large_an_error_fails_with_fixed_steps_and_is_rejected_with_adaptive_ones():
-    solver = unchecked(BARE, outside="fail", max_error=3e-4)
-    assert "is above `max_error`" in message(solve(solver, throw=False))
-    counts = unchecked(BARE, max_error=3e-4)
-    for length, outside in ((0.5, 10), (0.25, 0)):  # errors of 1e-3 √2 times it
-        sol = solve(counts, dt0=length, saveat=STATE)
-        assert dfc.learned.steps_outside(sol).number == outside
-    loose = dfx.PIDController(rtol=1.0, atol=1.0)
-    sol = solve(solver, stepsize_controller=loose, saveat=STATE)
-    assert sol.result == dfx.RESULTS.successful
-    assert sol.stats["num_rejected_steps"] > 0
-    assert sol.stats["num_accepted_steps"] > 14  # each at most 0.3 long
-    found = dfc.learned.steps_outside(sol)
-    assert found.number == 0
-
-
-@pytest.mark.slow
 def test_another_solver_takes_all_steps_outside_and_none_inside():
     solver = dfx.Dopri5()
     sol = solve(unchecked(KNOWS, outside=solver), saveat=STATE)
@@ -127,7 +110,7 @@ def test_a_solver_without_an_error_estimate_is_not_believed_by_a_controller():
 
 
 Box = dfc.learned.Box
-NO_DOMAIN = r"it has no `domain`.*Box.around.*or pass `max_error`"
+NO_DOMAIN = "it has no `domain`.*Box.around"
 
 
 test_mistakes_are_named = refused(
@@ -137,7 +120,6 @@ test_mistakes_are_named = refused(
     (lambda: Box.around(1j * jnp.ones((3, 2))), TypeError, "real"),
     (lambda: unchecked(Still(), outside="fail"), ValueError, NO_DOMAIN),
     (lambda: unchecked(Still(), outside=dfx.Tsit5()), ValueError, NO_DOMAIN),
-    (lambda: unchecked(KNOWS, max_error=0.0), ValueError, "must be positive"),
     (lambda: unchecked(KNOWS, outside=dfx.SemiImplicitEuler()), ValueError, "several terms"),
     (lambda: unchecked(KNOWS, outside=dfx.Kvaerno5()), ValueError, "takes its tolerances from"),
     (lambda: unchecked(KNOWS, outside="refuse"), TypeError, "`outside` is 'refuse', but"),

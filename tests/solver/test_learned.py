@@ -170,7 +170,6 @@ def test_roundoff_in_the_times_is_not_refused():
 test_arguments_that_are_refused = refused(
     (lambda: unchecked(lambda y0, h: y0), TypeError, None),
     (lambda: dfc.PINNSolver(network("deeponet")), TypeError, None),
-    (lambda: FLOW(nodes=1), ValueError, "`nodes` is 1, but must be"),
     (lambda: FLOW(corrections=-1), ValueError, "`corrections` is -1"),
     (
         lambda: problems.solve(lambda t, y, args: y, FOLLOW(), (LORENZ.y0, LORENZ.y0)),

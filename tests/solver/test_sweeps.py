@@ -51,7 +51,7 @@ def test_the_order_is_that_of_the_flow_map_and_the_sweeps_up_to_the_nodes():
     assert unchecked(Still()).order(TERM) is None
     assert unchecked(Fourth()).order(TERM) == 4
     assert unchecked(Fourth(), corrections=3).order(TERM) == 7
-    assert unchecked(Fourth(), corrections=9, nodes=6).order(TERM) == 6
+    assert unchecked(Fourth(), corrections=9).order(TERM) == 12
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_derivatives():
     term = dfx.ODETerm(lambda t, y, args: args * LORENZ.vector_field(t, y, None))
 
     def f(weights, y0, args):
-        solver = unchecked(Sine(weights), nodes=4, corrections=2)
+        solver = unchecked(Sine(weights), corrections=2)
         return step(solver, y0, term=term, args=args)[0]
 
     dct.assert_gradients(f, jnp.array([0.3, -1.0, 0.5]), LORENZ.y0, jnp.array(0.9), rtol=1e-6)
@@ -120,19 +120,20 @@ def test_it_knows_how_the_vector_field_passes_an_error_on(rate):
     network = Wrong(jnp.array(rate))
 
     def run(corrections):
-        solver = unchecked(network, nodes=16, corrections=corrections)
+        solver = unchecked(network, corrections=corrections)
         return step(solver, jnp.array(1.0), 1.0, term=LINEAR, args=jnp.array(rate))
 
     y1, estimate = run(0)
     error = jnp.exp(rate) - y1
     np.testing.assert_allclose(estimate, error, rtol=0.05)
-    assert not 0.6 < (run(1)[0] - y1) / error < 1.6
+    by_sweep = (run(1)[0] - y1) / error
+    assert by_sweep <= 0.6 or by_sweep >= 1.6
 
 
 @some_of("order, corrections", [(2, 0), (0, 2)], period=2)
 def test_it_falls_with_the_step_as_claimed(order, corrections):
     network, options = Wrong(-1.0, order, 0.5), dict(term=LINEAR, args=jnp.array(-1.0))
-    solver = unchecked(network, corrections=corrections, nodes=8)
+    solver = unchecked(network, corrections=corrections)
     steps = jnp.array([0.02, 0.04])
     small, large = jax.vmap(lambda h: step(solver, jnp.array(1.0), h, **options)[1])(steps)
     slope = jnp.log2(jnp.abs(large / small))
@@ -172,6 +173,5 @@ def test_steps_longer_than_the_longest_are_rejected():
     """Not an error: the controller tries a smaller one."""
     sol = adaptive(unchecked(SHIPPED), jnp.asarray(1e-1))
     assert sol.stats["num_rejected_steps"] > 0
-    lengths = jnp.diff(jnp.where(jnp.isfinite(sol.ts), sol.ts, jnp.nan), prepend=0.0)
-    assert jnp.nanmax(lengths) <= 0.25 + 1e-6
-    assert jnp.nanmax(lengths) > 0.04
+    lengths = np.diff(sol.ts[: int(sol.stats["num_accepted_steps"])], prepend=0.0)
+    assert 0.04 < np.max(lengths) <= 0.25 + 1e-6

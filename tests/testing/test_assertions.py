@@ -176,8 +176,6 @@ test_mistakes_are_named = refused(
     (lambda: dct.states(np.zeros(3), magnitude=0.0), ValueError, "`magnitude`"),
     (lambda: dct.step_sizes(-0.1), ValueError, "smallest"),
     (lambda: dct.times(0.0, np.inf), ValueError, "finite"),
-    (lambda: dct.restructurings((KEPLER.y0[0], np.zeros(2, "f4"))), ValueError, "dtypes"),
-    (lambda: dct.quadratic_systems(2, integrals=2), ValueError, "1 or 2 integrals"),
 )
 
 
@@ -212,50 +210,8 @@ def test_step_sizes_and_times(step, ts):
     assert np.all((ts >= -1) & (ts <= 2))
 
 
-@given(packing=dct.restructurings(KEPLER.y0, max_depth=3))
-def test_restructurings_keep_the_numbers(packing):
-    z = packing.pack(KEPLER.y0)
-    assert sum(np.size(x) for x in jax.tree.leaves(z)) == 4
-    back = packing.unpack(z)
-    assert all(np.array_equal(a, b) for a, b in zip(back, KEPLER.y0, strict=True))
-    assert packing.manifold(KEPLER.manifold)["energy"].fn(0.0, z, None) == pytest.approx(-0.5)
-    slope = packing.unpack(packing.vector_field(KEPLER.vector_field)(0.0, z, None))
-    assert np.array_equal(slope[0], KEPLER.y0[1])
-    balance = dfc.FirstIntegral(KEPLER.energy, rate=lambda t, y, args: t + y[0][0])
-    assert packing.manifold(balance).rate(2.0, z, None) == 2.0 + KEPLER.y0[0][0]
-    assert repr(packing).startswith("Restructuring(")
-
-
-def test_restructurings_vary_and_shrink_to_one_vector():
+def test_systems_shrink_to_the_first_of_the_catalogue():
     assert simplest(dct.catalogue_systems()).name == dfc.systems.names()[0]
-    strategy = dct.restructurings(KEPLER.y0)
-    assert simplest(strategy).pack(KEPLER.y0).shape == (4,)
-    nested = simplest(strategy, lambda p: isinstance(p.pack(KEPLER.y0), dict))
-    assert len(jax.tree.leaves(nested.pack(KEPLER.y0))) == 2
-    assert "{'a': f64[" in repr(nested)
-
-
-@pytest.mark.parametrize(("dimension", "integrals"), [(2, 1), (5, 2)])
-def test_quadratic_systems_conserve_their_integrals(dimension, integrals):
-    @jax.jit
-    def slope(system):
-        f = system.vector_field(0.0, jnp.asarray(system.y0), None)
-        rates = jax.jvp(lambda y: system.quadratic(0.0, y, None), (system.y0,), (f,))[1]
-        return rates, f
-
-    moving = []
-
-    @given(system=dct.quadratic_systems(dimension, integrals=integrals))
-    def run(system):
-        rates, f = slope(system)
-        assert rates.shape == (integrals,)
-        assert np.max(np.abs(rates)) <= 1e-12 * (1 + np.max(np.abs(f)))
-        assert np.all(np.linalg.eigvalsh(system.forms) > 0)
-        moving.append(bool(np.max(np.abs(f)) > 1e-3))
-        assert "forms=[[[" in repr(system)
-
-    run()
-    assert any(moving)
 
 
 def test_without_hypothesis_the_extra_is_named(monkeypatch):

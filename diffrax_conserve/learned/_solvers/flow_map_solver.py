@@ -14,12 +14,14 @@ from jaxtyping import Array
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._projection.options import option
-from .._networks.flat import tree_max
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import Refused, check_learned_terms, check_output, refused_from_start, with_result
 from .policies import Policy, StepResult, StepsOutside, as_policy, check_policy, outcome, step_of
 from .sweeps import Increment, correct, estimate, increment
+
+# The points of a step for sweeps and dense output.
+_NODES = 12
 
 
 class _State(NamedTuple):
@@ -35,7 +37,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
     controller (pass it `dtmax=flow_map.max_step`) and fails with fixed steps, as does a solve
     backwards in time.
 
-    With `corrections=k` the flow map only predicts. Its path $u$ at the `nodes` Chebyshev points of
+    With `corrections=k` the flow map only predicts. Its path $u$ at 12 Chebyshev points of
     the step is corrected by `k` Picard sweeps with the vector field of the term,
 
     $$u \leftarrow y_n + h \int f(t, u, args),$$
@@ -48,7 +50,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
     fixed steps it is not computed. Smaller steps reduce the error of a solve with sweeps, or with a
     flow map of order 1 or more.
 
-    Dense output is the polynomial through the (corrected) states at the `nodes` points, which are
+    Dense output is the polynomial through the (corrected) states at these points, which are
     computed only if something needs them. Derivatives are those of the computed solution.
 
     !!! example
@@ -72,10 +74,8 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
     """
 
     flow_map: AbstractFlowMap = eqx.field(converter=as_flow_map)
-    nodes: int = option(12, static=True)
     corrections: int = option(0, static=True)
     outside: Policy = option("count", converter=as_policy)
-    max_error: RealScalarLike | None = option(None)
     check_field: bool = option(True, static=True)
 
     evaluates_vector_field: ClassVar[bool] = False
@@ -83,10 +83,11 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
     interpolation_cls: ClassVar[Callable[..., ChebyshevInterpolation]] = ChebyshevInterpolation
 
     def __check_init__(self):
-        for name, value, least in (("nodes", self.nodes, 2), ("corrections", self.corrections, 0)):
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"`{name}` is {value!r}, but must be an integer from {least} on.")
-        check_policy(self.outside, self.max_error, self._has_domain)
+        if not isinstance(self.corrections, int) or self.corrections < 0:
+            raise ValueError(
+                f"`corrections` is {self.corrections!r}, but must be an integer from 0 on."
+            )
+        check_policy(self.outside, self._has_domain)
 
     @property
     def _has_domain(self) -> bool:
@@ -106,7 +107,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         """The power of the step size in the error of one step after this many sweeps."""
         power = self.flow_map.order + 1 + sweeps
         # The error of the collocation polynomial has this power.
-        return min(power, self.nodes + 1) if sweeps else power
+        return min(power, _NODES + 1) if sweeps else power
 
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
@@ -117,8 +118,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         refused = refused_from_start(
             self.flow_map, known, terms, t0, t1, y0, args, self.check_field
         )
-        counts = self._has_domain or self.max_error is not None
-        return _State(refused, StepsOutside.zero(t0) if counts else None)
+        return _State(refused, StepsOutside.zero(t0) if self._has_domain else None)
 
     def step(
         self,
@@ -138,10 +138,9 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
             inside = flow_map.inside(y0, *known, h)
             if (box := args_domain_of(flow_map)) is not None:
                 inside &= box.contains(*known)
-            accurate = jnp.asarray(self.max_error is None or tree_max(step.error) <= self.max_error)
-            counted = counted.add(t0, inside & accurate)
-            by = lambda solver: step_of(solver, self.nodes, terms, t0, t1, y0, args)  # noqa: E731
-            step = outcome(self.outside, step, inside, accurate, by)
+            counted = counted.add(t0, inside)
+            by = lambda solver: step_of(solver, _NODES, terms, t0, t1, y0, args)  # noqa: E731
+            step = outcome(self.outside, step, inside, by)
         step = with_result(step, refused, h, t1, flow_map.max_step)
         dense_info = dict(coefficients=step.coefficients)
         return step.y1, step.error, dense_info, _State(refused, counted), step.result
@@ -155,7 +154,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         def state(fraction: Array) -> Array:
             return ravel_pytree(self.flow_map(y0, *known, fraction * h))[0].astype(start.dtype)
 
-        rows = jax.vmap(state)(fractions(self.nodes, h.dtype)[1:])
+        rows = jax.vmap(state)(fractions(_NODES, h.dtype)[1:])
         path = jnp.concatenate([start[None], rows])
         if self.corrections == 0:
             y1 = self.flow_map(y0, *known, h)
@@ -172,13 +171,11 @@ DeepONetSolver.__init__.__doc__ = r"""**Arguments:**
 
 - `flow_map`: a [`diffrax_conserve.learned.AbstractFlowMap`][] such as
     [`diffrax_conserve.DeepONet`][], or a Module `(y0, h) -> y` with an attribute `max_step`.
-- `nodes`: the number of Chebyshev points for sweeps and dense output.
 - `corrections`: the number $k$ of correction sweeps.
 - `outside`: what is done with steps that start outside `flow_map.domain`, or with `args` outside
     its `args_domain`. `"count"`: they are counted, for
     [`diffrax_conserve.learned.steps_outside`][], the default; `"fail"`: the solve fails at the
     first; a diffrax solver takes them itself (in a batch of lanes both compute every step).
-- `max_error`: a step with a larger estimated error of a component counts as outside too.
 - `check_field`: whether to fail if the vector field at the initial state differs from the slope of
     the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order` at least 1). A
     learned slope may differ by 75 %, and by more where the field changes much within `max_step`, as
@@ -190,6 +187,3 @@ DeepONetSolver.__init__.__doc__ = r"""**Arguments:**
 `outside` needs a domain. A solve backwards in time or of another equation, a step that is too long
 and a state that is not finite end with a failed [`result`][diffrax.RESULTS].
 """
-
-# Pickles of earlier versions know it by this name.
-FlowMapSolver = DeepONetSolver

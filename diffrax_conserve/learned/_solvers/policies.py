@@ -12,18 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
-from ..._options import check_number, found_in
+from ..._options import found_in
 from ..._solver.diffrax_private import member, register
 from .chebyshev import series
 
-_WHEN = "`diffrax_conserve.learned.steps_outside` tells at which time."
 _OUTSIDE = register(
-    f"a step starts outside the domain of the flow map. {_WHEN} Train the flow map on states from "
-    "there, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
-)
-_INACCURATE = register(
-    f"the estimated error of a step is above `max_error`. {_WHEN} Take shorter steps, correct them "
-    "by `corrections=...`, or let a classical solver take such steps, by `outside=diffrax.Tsit5()`."
+    "a step starts outside the domain of the flow map. `diffrax_conserve.learned.steps_outside` "
+    "tells at which time. Train the flow map on states from there, or let a classical solver take "
+    "such steps, by `outside=diffrax.Tsit5()`."
 )
 
 
@@ -62,7 +58,7 @@ class _Count(eqx.Module):
 
 @final
 class _Fail(eqx.Module):
-    """Fails at the first such step, an inaccurate one after an adaptive controller rejected it."""
+    """Fails at the first such step."""
 
     def __repr__(self) -> str:
         return "'fail'"
@@ -87,25 +83,21 @@ def outcome(
     policy: Policy,
     step: StepResult,
     inside: Array,
-    accurate: Array,
     take: Callable[[dfx.AbstractSolver], StepResult],
 ) -> StepResult:
     """The result of a step, given that of the flow map, and `take`, the same step by a solver."""
     if isinstance(policy, _Count):
         return step
     if isinstance(policy, _Fail):
-        index = jnp.where(inside, _INACCURATE, _OUTSIDE)
-        result = dfx.RESULTS.where(inside & accurate, step.result, member(index))
-        # The error is infinite only for an inaccurate step: a smaller step may be more accurate,
-        # but it starts at the same state.
-        error = jtu.tree_map(lambda e: jnp.where(accurate, e, jnp.inf), step.error)
-        return StepResult(step.y1, error, step.coefficients, result)
+        # The error stays finite: a smaller step starts at the same state.
+        result = dfx.RESULTS.where(inside, step.result, member(_OUTSIDE))
+        return StepResult(step.y1, step.error, step.coefficients, result)
 
     def other() -> StepResult:
         like = lambda a, b: jnp.asarray(a, jnp.result_type(b))  # noqa: E731
         return jtu.tree_map(like, take(policy), step)
 
-    return lax.cond(inside & accurate, lambda: jtu.tree_map(jnp.asarray, step), other)
+    return lax.cond(inside, lambda: jtu.tree_map(jnp.asarray, step), other)
 
 
 def step_of(
@@ -127,13 +119,12 @@ def step_of(
     return StepResult(y1, error, coefficients, result)
 
 
-def check_policy(policy: Policy, max_error: Any, has_domain: bool) -> None:
-    check_number("max_error", max_error, above=0.0)
-    if max_error is None and not has_domain and not isinstance(policy, _Count):
+def check_policy(policy: Policy, has_domain: bool) -> None:
+    if not has_domain and not isinstance(policy, _Count):
         raise ValueError(
             f"`outside` is {policy!r}, but the flow map cannot tell: it has no `domain`. "
             "Give it `diffrax_conserve.learned.Box.around(states)`, with the states that it was "
-            "trained on, or pass `max_error`."
+            "trained on."
         )
     if getattr(policy, "term_structure", dfx.AbstractTerm) is not dfx.AbstractTerm:
         raise ValueError(
@@ -155,8 +146,7 @@ def steps_outside(sol: dfx.Solution) -> StepsOutside:
     **Arguments:**
 
     - `sol`: the solution of a [`diffrax_conserve.DeepONetSolver`][] whose flow map has a `domain`,
-        or that has a `max_error`, solved with `saveat=SaveAt(..., solver_state=True)`; or a batch
-        of them from `jax.vmap`.
+        solved with `saveat=SaveAt(..., solver_state=True)`; or a batch of them from `jax.vmap`.
 
     **Returns:**
 
@@ -178,5 +168,5 @@ def steps_outside(sol: dfx.Solution) -> StepsOutside:
         assert dfc.learned.steps_outside(sol).number == 0
         ```
     """
-    solver = "a `DeepONetSolver` whose flow map has a `domain`, or that has a `max_error`"
+    solver = "a `DeepONetSolver` whose flow map has a `domain`"
     return found_in(sol, StepsOutside, "steps_outside", solver)
