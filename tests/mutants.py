@@ -186,7 +186,7 @@ def decide_success_by_the_scale_at_the_candidate(package):
 
 
 def polish_along_nearly_parallel_gradients(package):
-    package.around("corrected")(lambda given, *x, least=None, **y: given(*x, **y))
+    package.around("row_space_correction")(lambda given, *x, least=None, **y: given(*x, **y))
 
 
 def divide_by_every_pivot_in_derivatives(package):
@@ -211,11 +211,11 @@ def give_each_component_of_a_vector_its_own_unit(package):
 
 
 def keep_the_frozen_directions(package):
-    package.in_module_of("nearby", "FROZEN_STEPS", 100)
+    package.in_module_of("simplified_newton", "FROZEN_STEPS", 100)
 
 
 def leave_what_was_added_to_the_diagonal(package):
-    package.replace("refined", lambda solve, product, b: solve(b))
+    package.replace("iterative_refinement", lambda solve, product, b: solve(b))
 
 
 def divide_by_the_roundoff_of_a_pivot(package):

@@ -177,7 +177,6 @@ WRAP, TANGENT = ft.partial(wrap, ENERGY), ft.partial(dfc.tangent, rigid_body, EN
         (Simplified, "upper", {"q": np.nan}, ValueError),
         (Simplified, "metric", "mass", TypeError),
         (ft.partial(dfc.ClosedForm, print), "rtol", "a", TypeError),
-        *((WRAP, "every", wrong, error) for wrong, error in NO_COUNTS),
         (WRAP, "max_correction", 0.0, ValueError),
         (WRAP, "max_correction", "x", TypeError),
         (ft.partial(FirstIntegral, jnp.sum), "value", [1.0, 1j], TypeError),
