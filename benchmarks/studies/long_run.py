@@ -8,8 +8,8 @@ million turns, in float64 and in float32. The steps are solved in parts of at mo
 time zero: in float32 diffrax jumps to the end of a solve from up to 1e-5 of its length away. The
 conserved values are always those at the start of the first part. Drifts are computed from saved
 states in long double, relative to these values. The table has the largest in each decade, of ten
-states in each part. A projected drift of more than 16 units of
-roundoff, the tolerance of a projection, is an error.
+states in each part. A projected drift of more than 16 units of roundoff, the tolerance of a
+projection, is an error.
 """
 
 import dataclasses
