@@ -177,7 +177,8 @@ class DAE(Hashable):
                     "`wrap` makes a projected solver of one that is not: pass "
                     "`diffrax_conserve.Radau()` itself."
                 )
-            solver = dataclasses.replace(solver, equations=_Stages(self))
+            unset, stages = lambda x: x is None, _Stages(self)
+            solver = eqx.tree_at(lambda radau: radau.equations, solver, stages, is_leaf=unset)
         manifold = {"equations": Constraint(_Constraints(self))}
         return ManifoldProjection(solver, manifold, projection=ConstraintProjection(dae=self))
 

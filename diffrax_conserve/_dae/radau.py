@@ -92,7 +92,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
 
     root_finder: Any = option(dfx.with_stepsize_controller_tols(dfx.VeryChord)())
     root_find_max_steps: int = option(10, static=True)  # pyright: ignore
-    equations: Any = eqx.field(default=None, kw_only=True)
+    # Of a `DAE`, which sets them: `F(t, y, y', args) = 0`, in the time of the vector field.
+    equations: Any = eqx.field(default=None, init=False)
 
     term_structure: ClassVar = dfx.ODETerm
 
@@ -238,7 +239,6 @@ Radau.__init__.__doc__ = """**Arguments:**
     default they are those of the step size controller, which must be adaptive then.
 - `root_find_max_steps`: the largest number of iterations. If they are not enough, a shorter step is
     tried.
-- `equations`: of a `DAE`, which passes them: `F(t, y, y', args) = 0`, in the time of the user.
 """
 
 
