@@ -177,8 +177,7 @@ class DAE(Hashable):
                     "`wrap` makes a projected solver of one that is not: pass "
                     "`diffrax_conserve.Radau()` itself."
                 )
-            unset, stages = lambda x: x is None, _Stages(self)
-            solver = eqx.tree_at(lambda radau: radau.equations, solver, stages, is_leaf=unset)
+            solver = dataclasses.replace(solver, _equations=_Stages(self))
         manifold = {"equations": Constraint(_Constraints(self))}
         return ManifoldProjection(solver, manifold, projection=ConstraintProjection(dae=self))
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, final
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -93,7 +92,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     root_finder: Any = option(dfx.with_stepsize_controller_tols(dfx.VeryChord)())
     root_find_max_steps: int = option(10, static=True)  # pyright: ignore
     # Of a `DAE`, which sets them: `F(t, y, y', args) = 0`, in the time of the vector field.
-    equations: Any = eqx.field(default=None, init=False)
+    _equations: Any = option(None)
 
     term_structure: ClassVar = dfx.ODETerm
 
@@ -120,8 +119,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> _Last:
-        if self.equations is not None:
-            self.equations.check(vector_fields(terms))
+        if self._equations is not None:
+            self._equations.check(vector_fields(terms))
         check_state(y0, kind=jnp.inexact)
         y = ravel(y0)
         return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
@@ -224,11 +223,11 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         direction = time_direction(terms, t0)
 
         def residual(t: Array, y: Array, slope: Array) -> Array:
-            if self.equations is None:
+            if self._equations is None:
                 k = ravel(terms.vf(t, unravel(y, y0), args)).astype(y.dtype)
                 return slope - direction.astype(y.dtype) * k
             rate = unravel(direction.astype(y.dtype) * slope, y0)
-            return ravel(self.equations(direction * t, unravel(y, y0), rate, args)).astype(y.dtype)
+            return ravel(self._equations(direction * t, unravel(y, y0), rate, args)).astype(y.dtype)
 
         return residual
 
