@@ -1,7 +1,7 @@
 """The solves of `compare`: with every list of entries and every metric, and the reference.
 
 To compile a solve takes seconds, so few programs make all of them. An entry that is left out is
-zero in the place of its function, which is then kept by doing nothing; which ones are left out, and
+zero in the place of its function, which is conserved trivially; which ones are left out, and
 the weights of a metric, are numbers that a compiled program is given.
 """
 

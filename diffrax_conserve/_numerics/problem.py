@@ -7,7 +7,7 @@ as zero. The roundoff of a residual is proportional to the size of the terms tha
 *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
 in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
 no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
-measures them, and they are added as the *hidden* part of the scale. And a component that has moved
+measures them, and they are added as the *cancellation* of the scale. And a component that has moved
 by `c_k` is known to roundoff of `c_k` only, which matters where the component itself vanishes, as
 on `q[0] = 0`. So in the step of a solve its size counts as `|y_k| + c_k`, with its change in the
 step.

@@ -1,8 +1,8 @@
 """Networks, their training and their files, and the options of the solvers that step with them."""
 
 from . import paper as paper
-from ._compare import Comparison as Comparison
-from ._compare import compare as compare
+from ._flow_map_benchmark import Comparison as Comparison
+from ._flow_map_benchmark import compare as compare
 from ._networks.domain import Box as Box
 from ._networks.domain import Frame as Frame
 from ._networks.flow_map import AbstractFlowMap as AbstractFlowMap

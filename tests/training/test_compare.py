@@ -9,14 +9,14 @@ import pytest
 import scipy.linalg
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._compare import Comparison
+from diffrax_conserve.learned._flow_map_benchmark import Comparison
 
 from ..learned import RADIUS, Rotation, Within
 from ..problems import oscillator, refused
 from ..thinned import some_of
 
 STEP, OFF = 0.5, 1e-3
-CLOCK = "diffrax_conserve.learned._compare._seconds"
+CLOCK = "diffrax_conserve.learned._flow_map_benchmark._seconds"
 STATES = np.random.default_rng(0).normal(size=(40, 2))
 
 
