@@ -95,9 +95,9 @@ class AlongLine(AbstractProjection):
                 "one integral, or pass `projection=SimplifiedNewton()`."
             )
         # The iteration moves along `S Uᵀ λ`, for a factor `S` and a row `U` that are given. With
-        # `S = diag(s)`, `s = |w|` and the row `w / s` this is `w λ`, with a dimensionless row. Where
-        # a component of `w` is zero, `s` must not be, because the derivative of the component is
-        # not, but so small that the component counts for nothing.
+        # `S = diag(s)`, `s = |w|` and the dimensionless row `w / s` this is `w λ`. Where a component
+        # of `w` is zero, `s` must not be, because the derivative of the component is not, but so
+        # small that the component counts for nothing.
         line = self._line(problem, candidate)
         least = float(jnp.finfo(line.dtype).tiny) ** 0.5
         s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
