@@ -95,7 +95,7 @@ class AlongLine(AbstractProjection):
                 "one integral, or pass `projection=SimplifiedNewton()`."
             )
         # The iteration moves along `S Uᵀ λ`, for a factor `S` and a row `U` that are given. With
-        # `S = diag(s)`, `s = |w|` and the dimensionless row `w / s` this is `w λ`. Where a component
+        # `S = diag(s)`, `s = |w|` and the dimensionless row `w / s` this is `w λ`. Where an element
         # of `w` is zero, `s` must not be, because the derivative of the component is not, but so
         # small that the component counts for nothing.
         line = self._line(problem, candidate)
