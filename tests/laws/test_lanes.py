@@ -143,7 +143,7 @@ def derivatives(case, steps, adjoint, size, off):
 
 
 def cases(by_default):
-    """Parametrises a law by all cases, of which one is not slow: each compiles for half a minute."""
+    """Parametrises a law by all cases, of which one is not slow: each takes half a minute."""
     pairs = [(case, "adaptive") for case in CASES if case not in FIXED_ONLY]
     pairs += [(case, "fixed") for case in CASES if case not in ADAPTIVE_ONLY]
     marks = {True: (), False: pytest.mark.slow}
