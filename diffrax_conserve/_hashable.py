@@ -13,7 +13,8 @@ class Hashable(eqx.Module):
 
     Two are equal if their structures and leaves are. Arrays are compared by their values, which
     tracers do not have: these are compared by identity. The comparison is that of numpy, so that
-    it has a truth value while JAX traces a function too.
+    it has a truth value while JAX traces a function too. As for any key, what is held must not be
+    changed in place afterwards.
     """
 
     def __hash__(self) -> int:

@@ -6,13 +6,16 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
+from jaxtyping import Array, Float
 
 from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved
 from .._options import check_counts
 from .._projection.options import option
-from .._tree import tree_stop_gradient
+from .._tree import ravel, tree_stop_gradient, unravel
 
 
 @final
@@ -82,24 +85,32 @@ class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
         slope = lambda y: terms.vf_prod(middle, y, args, control)  # noqa: E731
         units = tree_stop_gradient(jtu.tree_map(_size, y0, k0))
 
-        def increment(x: Y) -> Y:
-            return jtu.tree_map(lambda x, unit: x * unit, x, units)
+        def increment(x: Float[Array, " n"]) -> Y:
+            return jtu.tree_map(lambda x, unit: x * unit, unravel(x, y0), units)
 
-        def relation(x: Y, _: Any) -> Y:
+        def relation(x: Float[Array, " n"], _: Any = None) -> Float[Array, " n"]:
             k = increment(x)
             y = jtu.tree_map(lambda y, k: y + k / 2, y0, k)
             new = slope(y)
-            return jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units)
+            return ravel(jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units))
 
-        eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(units))).eps)
+        guess = ravel(jtu.tree_map(lambda k, unit: k / unit, k0, units))
+        eps = float(jnp.finfo(guess.dtype).eps)
         finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
-        guess = jtu.tree_map(lambda k, unit: k / unit, k0, units)
-        solved = optx.root_find(
-            relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
-        )
-        y1 = jtu.tree_map(lambda y, k: y + k, y0, increment(solved.value))
+
+        def newton(guess: Float[Array, " n"]) -> Solved:
+            found = optx.root_find(
+                relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
+            )
+            ok = found.result == optx.RESULTS.successful
+            return Solved(found.value, ok, found.stats["num_steps"], found.result)
+
+        # The derivative is not that of `root_find`: its linear solver refuses NaN, so that one lane
+        # of a batch that has failed would be an error of all.
+        solved = root(relation, newton, guess, jnp.linalg.solve)
+        y1 = jtu.tree_map(lambda y, k: y + k, y0, increment(solved.y))
         k1 = terms.vf_prod(t1, y1, args, control)
-        result = dfx.RESULTS.promote(solved.result)
+        result = dfx.RESULTS.promote(solved.more)
         return y1, None, dict(y0=y0, y1=y1, k0=k0, k1=k1), None, result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
