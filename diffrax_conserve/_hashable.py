@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.core
 import jax.tree_util as jtu
 import numpy as np
@@ -28,8 +29,13 @@ class Hashable(eqx.Module):
         return structure == other_structure and all(map(_same_leaf, ours, others))
 
 
+def is_array(x: Any) -> bool:
+    """Whether `x` is an array of JAX or of numpy, and not a number of Python."""
+    return isinstance(x, jax.Array | np.ndarray | np.generic)
+
+
 def _hash_of_leaf(leaf: Any) -> int:
-    if eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.generic):
+    if is_array(leaf):
         return hash((leaf.shape, np.dtype(leaf.dtype)))
     try:
         return hash(leaf)
@@ -42,7 +48,7 @@ def _same_leaf(a: Any, b: Any) -> bool:
         return True
     if isinstance(a, jax.core.Tracer) or isinstance(b, jax.core.Tracer):
         return False
-    arrays = [eqx.is_array(x) or isinstance(x, np.ndarray | np.generic) for x in (a, b)]
+    arrays = [is_array(x) for x in (a, b)]
     if any(arrays):
         return all(arrays) and a.dtype == b.dtype and np.array_equal(a, b)
     return bool(a == b)

@@ -18,6 +18,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from .._hashable import is_array
 from .._tree import without_pattern
 from .reduction import Implicit, Numbers, Singular, Structure, find_structure
 
@@ -42,7 +43,7 @@ class Search:
         *,
         floats: bool,
     ):
-        self._is_number = lambda x: _is_array(x) or (floats and isinstance(x, float | complex))
+        self._is_number = lambda x: is_array(x) or (floats and isinstance(x, float | complex))
         numbers, others = eqx.partition(tree, self._is_number)
         leaves, treedef = jtu.tree_flatten(numbers)
 
@@ -79,7 +80,7 @@ class Search:
     def general(self, tree: Any) -> Structure:
         """The structure with numbers in general position, except for Python's floats."""
         leaves = [x for x in jtu.tree_leaves(tree) if self._is_number(x)]
-        leaves = [None if _is_array(x) else x for x in leaves]
+        leaves = [None if is_array(x) else x for x in leaves]
 
         def found() -> Structure:
             first = None
@@ -101,10 +102,6 @@ class Search:
         numbers = [*consts, *leaves]
         others = [_another(x) for x in numbers]
         return find_structure(self._given, numbers, others, t, y, self._mass, known)
-
-
-def _is_array(x: Any) -> bool:
-    return isinstance(x, jax.Array | np.ndarray | np.generic)
 
 
 def _is_traced(x: Any) -> bool:
@@ -167,7 +164,7 @@ def lifted(tree: Any) -> Any:
     """The tree with arrays in the place of Python's floats."""
 
     def lift(x: Any) -> Any:
-        is_float = isinstance(x, float | complex) and not _is_array(x)
+        is_float = isinstance(x, float | complex) and not is_array(x)
         return np.asarray(x, jnp.result_type(type(x))) if is_float else x
 
     return jtu.tree_map(lift, tree)
