@@ -71,21 +71,21 @@ def cancellation_scale(
             sizes.append(jax.eval_shape(fn, vector).size)
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
-        to_metric = []
+        measured = []
         for (name, _), fn in entries:
             with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
-                to_metric.append(cancellation_terms(fn, vector))
-        value, jacobian, cancellation = (jnp.concatenate(x) for x in zip(*to_metric, strict=True))
+                measured.append(cancellation_terms(fn, vector))
+        value, jacobian, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
     else:
         # The roundoff of an entry with many elements is not measured, because that would cost a
         # reverse pass for each.
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
         few = [size < LEAST_SPARSE for size in sizes]
-        to_metric = [
+        measured = [
             cancellation_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
             for fn, size, one in zip(functions, sizes, few, strict=True)
         ]
-        cancellation = jnp.concatenate(to_metric)
+        cancellation = jnp.concatenate(measured)
     shown = jnp.abs(value) + gradient_scale(jacobian, jnp.abs(vector))
     return value, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
 

@@ -414,8 +414,8 @@ def changes_along(path: Path, step: Step) -> Float[Array, "k n"]:
     after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
     that they are orthogonal to each `c` with `c · f = 0`."""
     shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
-    matvec = (step.t0 + share * (step.t1 - step.t0) for share in shares)
-    return jnp.stack([path(t) - step.y0 for t in matvec])
+    times = (step.t0 + share * (step.t1 - step.t0) for share in shares)
+    return jnp.stack([path(t) - step.y0 for t in times])
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**

@@ -166,9 +166,9 @@ def test_dense_output_meets_the_state_after_a_jump_of_the_force():
 
 def test_masses_that_are_traced_call_nothing_on_the_host(errors_raise):
     def step(masses):
-        solver, matvec = dfc.RATTLE(dfc.Constraint(rods), masses), (0.0, 0.1)
-        state = solver.init(TERMS, *matvec, chain(3), None)
-        return solver.step(TERMS, *matvec, chain(3), None, state, False)[0]
+        solver, times = dfc.RATTLE(dfc.Constraint(rods), masses), (0.0, 0.1)
+        state = solver.init(TERMS, *times, chain(3), None)
+        return solver.step(TERMS, *times, chain(3), None, state, False)[0]
 
     assert "callback" not in str(jax.make_jaxpr(step)(MASSES))
 

@@ -84,9 +84,9 @@ def body(t, w, args):
     return jnp.where(t > end, jnp.nan, unit) * rigid_body(t, w / unit, None)
 
 
-def turned(solver, y0, *matvec, unit=1.0, end=jnp.inf):
+def turned(solver, y0, *times, unit=1.0, end=jnp.inf):
     """By one program for each solver."""
-    return solve(body, solver, y0, *matvec, args=jnp.array([unit, end]))
+    return solve(body, solver, y0, *times, args=jnp.array([unit, end]))
 
 
 def test_second_order_against_another_solver():
@@ -108,8 +108,8 @@ def test_saved_times_lie_on_the_manifold_and_dense_output_ends_at_the_states():
         options |= dict(adjoint=dfx.ForwardMode())
         sol = dfx.diffeqsolve(dfx.ODETerm(rigid_body), BODY, 1.0, 0.0, -0.1, y0, **options)
         (_, ts), (saved, ys) = sol.ts, sol.ys
-        matvec = jnp.concatenate([jnp.array([0.55 - 1e-4, 0.55 + 1e-4, 1.0]), ts[:10]])
-        return saved, ys[:10], jax.vmap(sol.evaluate)(matvec)
+        times = jnp.concatenate([jnp.array([0.55 - 1e-4, 0.55 + 1e-4, 1.0]), ts[:10]])
+        return saved, ys[:10], jax.vmap(sol.evaluate)(times)
 
     saved, ys, (before, after, start, *at_steps) = map(np.asarray, found(W0))
     for entry in RIGID_BODY.values():

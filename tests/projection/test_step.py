@@ -165,8 +165,8 @@ def test_a_projection_sees_the_step_of_every_candidate():
     t1 = -1.0
     solver = dfc.ManifoldProjection(dfx.Bosh3(), ENERGY, projection=Seen())
     saveat = dfx.SaveAt(ts=jnp.linspace(0, t1, 23), dense=True)
-    matvec = {"t1": t1, "dt0": -0.1, "saveat": saveat}
-    states = jax.jit(lambda: (sol := solve(solver, **matvec), sol.evaluate(0.33 * t1)))
+    times = {"t1": t1, "dt0": -0.1, "saveat": saveat}
+    states = jax.jit(lambda: (sol := solve(solver, **times), sol.evaluate(0.33 * t1)))
     sol, between = states()
     assert sol.result == dfx.RESULTS.successful
     assert jnp.all(jnp.isfinite(sol.ys))
