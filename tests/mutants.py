@@ -186,11 +186,13 @@ def decide_success_by_the_scale_at_the_candidate(package):
 
 
 def polish_along_nearly_parallel_gradients(package):
-    package.around("row_space_correction")(lambda given, *x, least=None, **y: given(*x, **y))
+    package.around("FewGram.row_space_correction")(
+        lambda given, *x, least=None, **y: given(*x, **y)
+    )
 
 
 def divide_by_every_pivot_in_derivatives(package):
-    package.replace("least_pivot", lambda rows: 0.0)
+    package.replace("AbstractRows.least_pivot", lambda rows: 0.0)
 
 
 def return_a_state_that_was_not_projected_as_nan(package):

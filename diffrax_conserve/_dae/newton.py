@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
 from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
 from .._numerics.linear import lu_factors, lu_solution
-from .._numerics.problem import gradient_scale
 from .._numerics.roundoff import cancellation_terms
+from .._numerics.rows import DenseRows
 
 # Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
@@ -66,7 +66,8 @@ def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) 
     def at_roundoff() -> Bool[Array, ""]:
         g, jacobian, hidden = cancellation_terms(residual, z)
         limit = ROUNDOFF * float(jnp.finfo(z.dtype).eps)
-        return jnp.all(jnp.abs(g) <= limit * (gradient_scale(jacobian, jnp.abs(z)) + hidden))
+        scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
+        return jnp.all(jnp.abs(g) <= limit * scale)
 
     unsure = at_rest & ~settled
     found = at_rest & (

@@ -30,8 +30,9 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
-from .._numerics.problem import Jacobian, gradient_scale, problem_of, relative
+from .._numerics.problem import problem_of, relative
 from .._numerics.roundoff import cancellation_terms
+from .._numerics.rows import AbstractRows
 from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
 from .._tree import key_of, ravel, unravel, without_pattern
@@ -246,11 +247,11 @@ def _relative_sizes(
         along = LieDerivative(entry.fn, vector_field)(t, unravel(vector, y), args)
         return ravel(along).astype(dtype) - rate
 
-    def terms_at(vector: Array, jacobian: Jacobian) -> Array:
+    def terms_at(vector: Array, jacobian: AbstractRows) -> Array:
         """The sum of the sizes of its terms."""
         state = unravel(vector, y)
         slope = ravel(slope_of(vector_field, t, state, args))
-        return gradient_scale(jacobian, jnp.abs(slope)) + jnp.abs(partial) + jnp.abs(rate)
+        return jacobian.absolute_matvec(jnp.abs(slope)) + jnp.abs(partial) + jnp.abs(rate)
 
     terms = terms_at(vector, jacobian)
     # If each term of the derivative is zero, its sum tells nothing, as at an equilibrium. Only if
@@ -276,7 +277,7 @@ def _relative_sizes(
     return (
         defect,
         violation,
-        ~jnp.any(gradient_scale(jacobian, jnp.ones_like(vector))) & jnp.all(partial == 0),
+        ~jnp.any(jacobian.absolute_matvec(jnp.ones_like(vector))) & jnp.all(partial == 0),
         idle,
     )
 

@@ -21,7 +21,7 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
-from .._numerics.problem import gradient_scale, measure, relative
+from .._numerics.problem import measure, relative
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_solution
 from .._tree import ravel, tree_add, tree_shapes, tree_sub
@@ -141,7 +141,7 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         # here anew, and may be a bit smaller than where the solve measured it.
         g = ravel(residual(t, y))
         _, jacobian, hidden = cancellation_scale(manifold, t, y, args)
-        scale = numbers + gradient_scale(jacobian, jnp.abs(ravel(y))) + hidden
+        scale = numbers + jacobian.absolute_matvec(jnp.abs(ravel(y))) + hidden
         limit = 2 * ROUNDOFF * float(jnp.finfo(g.dtype).eps) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 

@@ -27,6 +27,7 @@ import jax.core
 import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 import scipy.sparse as sp
 from jax.scipy.sparse.linalg import bicgstab
@@ -41,6 +42,8 @@ from .._constants import (
     REGULARISATION_POWER,
 )
 from .._fast.jaxprs import jaxprs_inside
+from .._numerics.linear import Solve
+from .._numerics.rows import AbstractGram, AbstractRows
 from .asdex_import import asdex, reason
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
@@ -280,7 +283,7 @@ def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
     return Pattern(shape, found, dense)
 
 
-class SparseRows(eqx.Module):
+class SparseRows(AbstractRows):
     """The rows `U` of a Jacobian, or of another matrix with its pattern.
 
     - `colours`: for each colour the sum of its sparse rows. As these share no component, each
@@ -310,34 +313,35 @@ class SparseRows(eqx.Module):
     def __len__(self) -> int:
         return self.pattern.size
 
-    def times_columns(self, x: Float[Array, " n"]) -> "SparseRows":
-        """`U diag(x)`."""
+    def scale_columns(self, x: Float[Array, " n"]) -> "SparseRows":
         return SparseRows(self.colours * x[self.pattern.active], self.dense * x, self.pattern)
 
-    def scaled(self) -> tuple[Float[Array, " m"], "SparseRows"]:
-        """The largest element of each row, or one if all are zero, and the rows divided by it."""
+    def largest(self) -> Float[Array, " m"]:
         largest = jnp.max(jnp.abs(_take(self.colours, self.pattern.elements)), axis=2)
-        sizes = self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
-        sizes = jnp.where(sizes > 0, sizes, 1)
+        return self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
+
+    def divide_rows(self, sizes: Float[Array, " m"]) -> "SparseRows":
         owned = self.pattern.owners < len(self)
         size = jnp.where(owned, _take(sizes, self.pattern.owners), 1)
         dense = self.dense / sizes[self.pattern.dense_rows, None]
-        return sizes, SparseRows(self.colours / size, dense, self.pattern)
+        return SparseRows(self.colours / size, dense, self.pattern)
+
+    def apply(self, linear: Callable[[Array], Array], n: int) -> "SparseRows":
+        """The function is taken as diagonal. If it is not, the Gram matrix is only approximate, and
+        an iteration with it converges more slowly, to the same result."""
+        return self.scale_columns(linear(jnp.ones(n, self.dtype)))
 
     def matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """`U x`."""
-        products = self.times_columns(x)
+        products = self.scale_columns(x)
         blocks = jnp.sum(_take(products.colours, self.pattern.elements), axis=2)
         return self.pattern.joined(blocks, jnp.sum(products.dense, axis=1))
 
     def rmatvec(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
-        """`Uᵀ λ`."""
         active = jnp.sum(_take(multiplier, self.pattern.owners) * self.colours, axis=0)
         dense = multiplier[self.pattern.dense_rows, None] * self.dense
         return jnp.sum(dense, axis=0).at[self.pattern.active].add(active)
 
     def gram(self, others: "SparseRows") -> "BlockGram":
-        """`U Vᵀ`."""
         pattern = self.pattern
         ours, theirs = (_take(x.colours, pattern.elements) for x in (self, others))
         diagonal = jnp.sum(ours[:, :, None] * theirs[:, None], axis=3)
@@ -369,8 +373,8 @@ class SparseRows(eqx.Module):
         )
 
 
-class BlockGram(eqx.Module):
-    """A Gram matrix `U Vᵀ` in blocks. It need not be symmetric, as `U` and `V` may differ.
+class BlockGram(AbstractGram):
+    """The Gram matrix of sparse rows, in blocks.
 
     - `diagonal`: the blocks on the diagonal.
     - `following`, `preceding`: the blocks that couple each block to the next, in its own rows and
@@ -393,7 +397,6 @@ class BlockGram(eqx.Module):
         return self.pattern.size
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
-        """`U Vᵀ x`."""
         if self.factors is not None:
             left, right = self.factors
             return left.matvec(right.rmatvec(x))
@@ -405,9 +408,10 @@ class BlockGram(eqx.Module):
         below = jnp.einsum("dij,ij->d", self.rows, blocks) + self.corner @ dense
         return self.pattern.joined(products, below)
 
-    def factorise(self) -> Callable[[Float[Array, " m"]], Float[Array, " m"]]:
-        """The solution of the system, as a function of its right side. Dense rows are eliminated
-        last, by their Schur complement `corner - rows sparse⁻¹ columns`."""
+    def factorise(self, *, least: float | Array | None = None) -> Solve:
+        """Dense rows are eliminated last, by their Schur complement
+        `corner - rows sparse⁻¹ columns`."""
+        del least
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
         added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** REGULARISATION_POWER
@@ -418,42 +422,51 @@ class BlockGram(eqx.Module):
         if self.factors is None:
             sparse = _reduced(diagonal, self.following, self.preceding)
         else:
-            sparse = self._iteration(diagonal)
-        number = len(self.corner)
-        if number == 0:
-            return lambda b: self.pattern.joined(sparse(self.pattern.taken_apart(b)[0]), b[:0])
+            sparse = jtu.Partial(_iterated, self, diagonal)
+        if not len(self.corner):
+            return jtu.Partial(ft.partial(_without_dense_rows, self.pattern), sparse)
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
         least = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
-        left, right = _halves((corner + added * jnp.diag(least))[None])
+        halves = _halves((corner + added * jnp.diag(least))[None])
+        solve = ft.partial(_with_dense_rows, self.pattern)
+        return jtu.Partial(solve, sparse, self.rows, eliminated, halves)
 
-        def solve(b: Float[Array, " m"]) -> Float[Array, " m"]:
-            blocks, dense = self.pattern.taken_apart(b)
-            blocks = sparse(blocks)
-            dense = dense - jnp.einsum("dij,ij->d", self.rows, blocks)
-            dense = right[0] @ (left[0] @ dense)
-            return self.pattern.joined(blocks - eliminated @ dense, dense)
 
-        return solve
+def _without_dense_rows(pattern: Pattern, sparse: Solve, b: Float[Array, " m"]) -> Array:
+    return pattern.joined(sparse(pattern.taken_apart(b)[0]), b[:0])
 
-    def _iteration(self, diagonal: Array) -> Callable[[Array], Array]:
-        """The solution by the stabilised biconjugate gradient method (H. A. van der Vorst, "Bi-
-        CGSTAB", *SIAM J. Sci. Stat. Comput.* 13 (1992), 631-644), because the matrix need not be
-        symmetric. The preconditioner is the diagonal."""
-        factors, zero = self.factors or (), jnp.zeros(len(self.corner), diagonal.dtype)
 
-        def product(left: SparseRows, right: SparseRows, x: Array) -> Array:
-            return self.pattern.taken_apart(
-                left.matvec(right.rmatvec(self.pattern.joined(x, zero)))
-            )[0]
+def _with_dense_rows(
+    pattern: Pattern,
+    sparse: Solve,
+    rows: Array,
+    eliminated: Array,
+    halves: tuple[Array, Array],
+    b: Float[Array, " m"],
+) -> Float[Array, " m"]:
+    blocks, dense = pattern.taken_apart(b)
+    blocks = sparse(blocks)
+    dense = dense - jnp.einsum("dij,ij->d", rows, blocks)
+    left, right = halves
+    dense = right[0] @ (left[0] @ dense)
+    return pattern.joined(blocks - eliminated @ dense, dense)
 
-        def solve(product: Callable[[Array], Array], b: Array) -> Array:
-            # The iterations of Newton's method correct what an inexact solution leaves, so this is
-            # less accurate than could be had.
-            tol = float(jnp.finfo(b.dtype).eps) ** (3 / 4)
-            return bicgstab(product, b, tol=tol, M=lambda x: x / diagonal[..., 0])[0]
 
-        return lambda b: lax.custom_linear_solve(ft.partial(product, *factors), b, solve, solve)
+def _iterated(gram: BlockGram, diagonal: Array, b: Array) -> Array:
+    """The solution by the stabilised biconjugate gradient method (H. A. van der Vorst, "Bi-CGSTAB",
+    *SIAM J. Sci. Stat. Comput.* 13 (1992), 631-644), because the matrix need not be symmetric. The
+    preconditioner is the diagonal."""
+    pattern, zero = gram.pattern, jnp.zeros(len(gram.corner), diagonal.dtype)
+
+    def solve(product: Callable[[Array], Array], b: Array) -> Array:
+        # The iterations of Newton's method correct what an inexact solution leaves, so this is less
+        # accurate than could be had.
+        tol = float(jnp.finfo(b.dtype).eps) ** (3 / 4)
+        return bicgstab(product, b, tol=tol, M=lambda x: x / diagonal[..., 0])[0]
+
+    product = lambda x: pattern.taken_apart(gram.matvec(pattern.joined(x, zero)))[0]  # noqa: E731
+    return lax.custom_linear_solve(product, b, solve, solve)
 
 
 def _take(x: Array, places: np.ndarray) -> Array:
@@ -495,9 +508,7 @@ def _halves(matrix: Float[Array, "blocks k k"]) -> tuple[Array, Array]:
     return left / jnp.diagonal(matrix, axis1=1, axis2=2)[:, :, None], right
 
 
-def _reduced(
-    diagonal: Array, following: Array | None, preceding: Array | None
-) -> Callable[[Float[Array, "blocks k"]], Float[Array, "blocks k"]]:
+def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) -> Solve:
     """The solution of a block tridiagonal system by cyclic reduction (G. H. Golub and C. F. Van
     Loan, *Matrix Computations*, Johns Hopkins 2013, 4.5), as a function of its right side.
 
@@ -505,48 +516,57 @@ def _reduced(
     of half the size for those with even numbers, and so on. `following[i]` couples row `i` to block
     `i + 1`, and `preceding[i]` couples row `i + 1` to block `i`; the last of both are zero.
     """
-
-    def before(x: Array) -> Array:
-        return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
-
-    def after(x: Array) -> Array:
-        return jnp.concatenate([x[1:], jnp.zeros_like(x[:1])])
-
     if following is None or preceding is None or len(diagonal) == 1:
-        left, right = _halves(diagonal)
-        return lambda b: _times(right, _times(left, b))
+        return jtu.Partial(_in_halves, *_halves(diagonal))
     if diagonal.shape[1] == 1:
-        lower, middle, upper = (
-            before(preceding).reshape(-1),
-            diagonal.reshape(-1),
-            following.reshape(-1),
-        )
-        return lambda b: lax.linalg.tridiagonal_solve(lower, middle, upper, b)
-
-    def even_and_odd(x: Array, fill: Array | float = 0.0) -> tuple[Array, Array]:
-        if len(x) % 2:
-            x = jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(fill, x.dtype), x[:1].shape)])
-        return x[0::2], x[1::2]
-
+        bands = (_before(preceding), diagonal, following)
+        return jtu.Partial(lax.linalg.tridiagonal_solve, *(x.reshape(-1) for x in bands))
     # If the number of blocks is odd, a block of ones is added, which is coupled to none.
-    middle, odd = even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
+    middle, odd = _even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
-    to_right, odd_right = even_and_odd(following)
+    to_right, odd_right = _even_and_odd(following)
     # These couple the odd block to the one before, and the next even block to the odd one.
-    odd_left, to_left = even_and_odd(preceding)
+    odd_left, to_left = _even_and_odd(preceding)
     left, right = _halves(odd)
-    from_right, from_left = _times(to_right, right), before(_times(to_left, right))
+    from_right, from_left = _times(to_right, right), _before(_times(to_left, right))
     odd_left, odd_right = _times(left, odd_left), _times(left, odd_right)
-    middle = middle - _times(from_right, odd_left) - _times(from_left, before(odd_right))
+    middle = middle - _times(from_right, odd_left) - _times(from_left, _before(odd_right))
     following = -_times(from_right, odd_right)
-    preceding = -after(_times(from_left, before(odd_left)))
+    preceding = -_after(_times(from_left, _before(odd_left)))
     coarse = _reduced(middle, following, preceding)
+    couplings = from_right, from_left, odd_left, odd_right
+    return jtu.Partial(_substituted, coarse, (left, right), couplings)
 
-    def solve(b: Array) -> Array:
-        even, rest = even_and_odd(b)
-        rest = _times(left, rest)
-        x = coarse(even - _times(from_right, rest) - _times(from_left, before(rest)))
-        rest = _times(right, rest - _times(odd_left, x) - _times(odd_right, after(x)))
-        return jnp.stack([x, rest], axis=1).reshape(-1, b.shape[1])[: len(b)]
 
-    return solve
+def _in_halves(left: Array, right: Array, b: Array) -> Array:
+    return _times(right, _times(left, b))
+
+
+def _substituted(
+    coarse: Solve,
+    halves: tuple[Array, Array],
+    couplings: tuple[Array, ...],
+    b: Float[Array, "blocks k"],
+) -> Float[Array, "blocks k"]:
+    """The solution of a level of the reduction, from that of the level of half the size."""
+    (left, right), (even, rest) = halves, _even_and_odd(b)
+    from_right, from_left, odd_left, odd_right = couplings
+    rest = _times(left, rest)
+    x = coarse(even - _times(from_right, rest) - _times(from_left, _before(rest)))
+    rest = _times(right, rest - _times(odd_left, x) - _times(odd_right, _after(x)))
+    return jnp.stack([x, rest], axis=1).reshape(-1, b.shape[1])[: len(b)]
+
+
+def _before(x: Array) -> Array:
+    """For each block the one before it, and zero for the first."""
+    return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+
+
+def _after(x: Array) -> Array:
+    return jnp.concatenate([x[1:], jnp.zeros_like(x[:1])])
+
+
+def _even_and_odd(x: Array, fill: Array | float = 0.0) -> tuple[Array, Array]:
+    if len(x) % 2:
+        x = jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(fill, x.dtype), x[:1].shape)])
+    return x[0::2], x[1::2]

@@ -24,27 +24,18 @@ from .._constants import MAX_STEPS, WRITTEN_OUT
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
 from .._interpolation import Packed
-from .._large.sparse import BlockGram, SparseRows
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, after_test, iterate, keep_done
-from .._numerics.linear import (
-    Factors,
-    Solve,
-    factorise,
-    gram_matrix,
-    iterative_refinement,
-    matvec,
-    rmatvec,
-    solve,
-)
+from .._numerics.linear import Solve, iterative_refinement
 from .._numerics.metric import Diagonal, spread
-from .._numerics.problem import Jacobian, Problem, gradient_scale, problem_of
+from .._numerics.problem import Problem, problem_of
+from .._numerics.rows import AbstractGram, AbstractRows, solve_dense
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
 from .._solver.failure import end_of_step, failure_cause, is_off_manifold
 from .._solver.state import initial_values
-from .._solver.terms import is_backsolve, is_ode, time_direction
+from .._solver.terms import in_field_time, is_backsolve, is_ode
 from .._time import nonzero_length
 from .._tree import ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -54,17 +45,12 @@ class _Linear(eqx.Module):
     """The constraints at one position.
 
     - `jacobian`: `G`.
-    - `factors`: those of `G M⁻¹ Gᵀ`, or, with many constraints, the blocks of that matrix. By it
-      both the velocities at this position and the positions of the next step are found.
+    - `solve`: the solution of a system with the matrix `G M⁻¹ Gᵀ`, as a function of its right
+      side. It gives both the velocities at this position and the positions of the next step.
     """
 
-    jacobian: Jacobian
-    factors: Factors | BlockGram
-
-    def solve(self) -> Solve:
-        """The solution of the system, as a function of its right side."""
-        fixed = lax.stop_gradient(self.factors)
-        return fixed.factorise() if isinstance(fixed, BlockGram) else fixed
+    jacobian: AbstractRows
+    solve: Solve
 
 
 class _State(eqx.Module):
@@ -184,7 +170,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         t = jnp.asarray(t, jnp.result_type(float, t))
         values = conserved_values(self.constraint, t, q, args)
         zeros = ravel(values).astype(ravel(q).dtype)
-        problem = self._problem(t, q, args, zeros, jnp.asarray(1, t.dtype))
+        problem = self._problem(t, q, args, zeros)
         drift, kick = terms[0].vf, terms[1].vf(t, q, args)
 
         def slope(t: Array, q: Y, v: Y) -> Values:
@@ -195,7 +181,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         wrong = jax.jvp(slope, start, along)[1]
         _, jacobian = problem.linearise(ravel(q))
         gram = self._gram(problem, jacobian, self._drift(terms, t, v, args), ravel(v))
-        return unflatten(solve(gram, -wrong), values)
+        return unflatten(gram.solve(-wrong), values)
 
     def init(
         self,
@@ -219,18 +205,18 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
                 f"The positions have the shapes {tree_shapes(q)}, the velocities "
                 f"{tree_shapes(v)}. `RATTLE` needs a state `(q, v)` of two parts that are alike."
             )
-        direction = time_direction(terms, t0)
-        _, cancellation = initial_values(self.constraint, t0 * direction, q, args)
-        problem = self._problem(t0, q, args, cancellation, direction)
+        terms, t0 = in_field_time(terms, t0)
+        _, cancellation = initial_values(self.constraint, t0, q, args)
+        problem = self._problem(t0, q, args, cancellation)
         drift = self._drift(terms, t0, v, args)
-        at, rate = self._linear(problem, t0, q, args, direction, drift, ravel(v))
+        at, rate = self._linear(problem, t0, q, args, drift, ravel(v))
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
         squares = jax.tree.map(jnp.square, problem.factor.scale_columns(at.jacobian))
-        lengths = jnp.sqrt(matvec(squares, jnp.ones_like(ravel(v))))
+        lengths = jnp.sqrt(squares.matvec(jnp.ones_like(ravel(v))))
         limit = lengths * problem.factor.length(drift(ravel(v))) + jnp.abs(rate)
-        moves = rate + matvec(at.jacobian, drift(ravel(v)))
+        moves = rate + at.jacobian.matvec(drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
         off = off | is_off_manifold(problem, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
@@ -249,9 +235,8 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
     ) -> tuple[Y, None, DenseInfo, _State, dfx.RESULTS]:
         state, (q0, v0) = solver_state, y0
         q, v, at = ravel(q0), ravel(v0), state.at
-        direction = time_direction(terms, t0)
-        h = (t1 - t0) * direction
-        per_step = direction / nonzero_length(t0, t1)
+        given_terms, (terms, t0, t1) = terms, in_field_time(terms, t0, t1)
+        h, per_step = t1 - t0, 1 / nonzero_length(t0, t1)
         middle = t0 + (t1 - t0) / 2
         drift = self._drift(terms, middle, v0, args)
         slope = lax.cond(
@@ -259,7 +244,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         )
         state = dataclasses.replace(state, slope=slope)  # dense output needs it too
 
-        problem = self._problem(t1, q0, args, state.cancellation, direction)
+        problem = self._problem(t1, q0, args, state.cancellation)
         kicked = _once(v + h / 2 * ravel(slope))
 
         # The unknown is `h² λ / 2`, which a multiplier `λ` contributes to the positions. Unlike `λ`
@@ -274,28 +259,26 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
             lambda x: problem.residual(position(x)),
             ft.partial(_shaken, problem, position, at, q, self.max_steps),
             state.multiplier * (h * h / 2),
-            solve,
+            solve_dense,
         )
         half, q1 = _once((halfway(displacement), position(displacement)))
         y1 = unravel(q1, q0)
         slope = terms[1].vf(t1, y1, args)
         kicked = _once(half + h / 2 * ravel(slope))
         drift = self._drift(terms, t1, v0, args)
-        at, rate = self._linear(problem, t1, y1, args, direction, drift, kicked)
+        at, rate = self._linear(problem, t1, y1, args, drift, kicked)
         v1, keeps = _on_tangent(problem, at, rate, drift, kicked)
 
         ok = found & keeps
         cause = failure_cause(ok, state.off, state.cancellation, jnp.concatenate([q1, v1]))
         (q1, v1), result = end_of_step(cause, (q1, v1), dfx.RESULTS.successful)
-        dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
+        dense_info = dict(y0=y0, step=Packed(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
         state = _State(at, slope, multiplier, state.cancellation, state.off)
         return (unravel(q1, q0), unravel(v1, v0)), None, dense_info, state, result
 
-    def _problem(
-        self, t: RealScalarLike, q: Y, args: Args, cancellation: Array, direction: Array
-    ) -> Problem:
-        values, t = jnp.zeros_like(cancellation), t * direction
+    def _problem(self, t: RealScalarLike, q: Y, args: Args, cancellation: Array) -> Problem:
+        values = jnp.zeros_like(cancellation)
         metric = Diagonal(lax.rsqrt(spread("masses", self.masses, q)))
         return problem_of(self.constraint, values, t, q, args, cancellation, factor=metric)
 
@@ -303,17 +286,13 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         """The function from velocities `v`, or momenta, to `q'`, both as vectors."""
         return lambda p: ravel(terms[0].vf(t, unravel(p, v), args))
 
-    def _gram(self, problem: Problem, jacobian: Jacobian, drift: Any, p: Array) -> Any:
+    def _gram(self, problem: Problem, jacobian: AbstractRows, drift: Any, p: Array) -> AbstractGram:
         """`G M⁻¹ Gᵀ`. With momenta the masses are in `drift`, which is linear: so its derivative is
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
         forces = problem.factor.scale_columns(problem.factor.scale_columns(jacobian))
-        if isinstance(jacobian, SparseRows):
-            speeds = jax.jvp(drift, (p,), (jnp.ones_like(p),))[1]
-            return jacobian.gram(forces.times_columns(speeds))
-        along = jax.vmap(lambda x: jax.jvp(drift, (p,), (x,))[1])(forces)
-        return gram_matrix(jacobian, along)
+        return jacobian.gram(forces.apply(lambda x: jax.jvp(drift, (p,), (x,))[1], p.size))
 
     def _linear(
         self,
@@ -321,18 +300,15 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         t: RealScalarLike,
         q: Y,
         args: Args,
-        direction: Array,
         drift: Any,
         p: Array,
     ) -> tuple[_Linear, Float[Array, " m"]]:
         """The constraints at a position, and their partial derivative `∂_t g`."""
         jacobian = _once(problem.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
-        t = t * direction
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
         gram = _once(lax.stop_gradient(self._gram(problem, jacobian, drift, p)))
-        factors: Any = gram if isinstance(gram, BlockGram) else _once(factorise(gram))
-        return _Linear(jacobian, factors), rate
+        return _Linear(jacobian, _once(gram.factorise())), rate
 
 
 RATTLE.__init__.__doc__ = r"""**Arguments:**
@@ -357,7 +333,7 @@ _once = lax.optimization_barrier
 
 def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
     """`M⁻¹ Gᵀ λ`."""
-    return problem.factor.scale_columns(problem.factor.scale_columns(rmatvec(rows, multiplier)))
+    return problem.factor.scale_gradient(problem.factor.scale_gradient(rows.rmatvec(multiplier)))
 
 
 def _shaken(
@@ -368,7 +344,7 @@ def _shaken(
     # The residuals are compared with their scales at the start of the step, for coordinates as
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
-    scale, solve = problem.scale(at.jacobian, sizes), at.solve()
+    scale, solve = problem.scale(at.jacobian, sizes), lax.stop_gradient(at.solve)
     _, moves = jax.linearize(position, guess)
 
     def change(g: Array) -> Array:
@@ -377,7 +353,7 @@ def _shaken(
         once more, for the change of the constraints that the solution causes: in that there is no
         contradiction. Up to four constraints have no such part."""
         x = solve(g)
-        return x if len(g) <= WRITTEN_OUT else solve(matvec(at.jacobian, moves(x)))
+        return x if len(g) <= WRITTEN_OUT else solve(at.jacobian.matvec(moves(x)))
 
     def advance(x: Array, counter: Array) -> tuple[Array, Array]:
         g = _once(problem.residual(_once(position(x))))
@@ -393,22 +369,22 @@ def _on_tangent(
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """The velocities nearest to `p` that keep the constraint, `∂_t g + G v = 0`, and whether they
     do so to roundoff. The multipliers solve a linear system, and have its derivative."""
-    solve = at.solve()
+    solve = lax.stop_gradient(at.solve)
 
     def product(x: Array) -> Array:
         """`G M⁻¹ Gᵀ x`, for momenta with the masses in `drift`, which is linear."""
         change = _impulse(problem, x, at.jacobian)
-        return matvec(at.jacobian, jax.jvp(drift, (p,), (change,))[1])
+        return at.jacobian.matvec(jax.jvp(drift, (p,), (change,))[1])
 
     def iterated(product: Any, b: Array) -> Array:
         return iterative_refinement(solve, product, b)
 
-    wrong = rate + matvec(at.jacobian, drift(p))
+    wrong = rate + at.jacobian.matvec(drift(p))
     x = lax.custom_linear_solve(product, -wrong, iterated, iterated, symmetric=True)
     v = p + _impulse(problem, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
     # velocities is that of the terms, and not of their sum.
     terms = _impulse(problem, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
     sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
-    limit = problem.tolerance(jnp.abs(rate) + gradient_scale(at.jacobian, sizes))
-    return v, jnp.all(jnp.abs(rate + matvec(at.jacobian, drift(v))) <= limit)
+    limit = problem.tolerance(jnp.abs(rate) + at.jacobian.absolute_matvec(sizes))
+    return v, jnp.all(jnp.abs(rate + at.jacobian.matvec(drift(v))) <= limit)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
@@ -18,7 +19,6 @@ from .._interpolation import Packed
 from .._manifold import check_manifold
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, after_test, any_lane, iterate, keep_done
-from .._numerics.linear import gram_matrix, matvec, rmatvec, scaled_rows, solve, solve_kkt
 from .._numerics.problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -27,13 +27,14 @@ from .._numerics.problem import (
     Problem,
     problem_of,
 )
+from .._numerics.rows import AbstractRows, solve_kkt
 from .._projection.base import adapted
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.failure import end_of_step, failure_cause, is_off_manifold
 from .._solver.state import initial_values
 from .._solver.statistics import ProjectionStatistics
-from .._solver.terms import check_nested, innermost, refuse_backsolve, time_direction
+from .._solver.terms import check_nested, in_field_time, innermost, refuse_backsolve
 from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -146,7 +147,7 @@ class SymmetricProjection(ForwardingSolver):
     ) -> _State:
         refuse_backsolve(terms, "SymmetricProjection")
         check_state(y0, kind=jnp.inexact)
-        t = t0 * time_direction(terms, t0)
+        _, t = in_field_time(terms, t0)
         values, cancellation = initial_values(self.manifold, t, y0, args)
         statistics = ProjectionStatistics.zero(self.manifold, values.dtype)
         inner = self.solver.init(terms, t0, t1, y0, args)
@@ -164,8 +165,9 @@ class SymmetricProjection(ForwardingSolver):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, _State, dfx.RESULTS]:
         del made_jump
-        state, vector, sign = solver_state, ravel(y0), time_direction(terms, t0)
-        start, end = (self._problem(t * sign, y0, args, state).dense() for t in (t0, t1))
+        state, vector = solver_state, ravel(y0)
+        _, *times = in_field_time(terms, t0, t1)
+        start, end = (self._problem(t, y0, args, state).dense() for t in times)
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
             # A symmetric method has no memory, so we discard the state of the wrapped solver. The
@@ -226,7 +228,7 @@ projection. Of other methods it cannot be told: try a solve forwards and backwar
 def _along(problem: Problem, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(problem.residual, y)
-    return problem.factor.to_state(problem.factor.scale_columns(vjp(multiplier)[0]))
+    return problem.factor.to_state(problem.factor.scale_gradient(vjp(multiplier)[0]))
 
 
 def _solved(
@@ -239,15 +241,15 @@ def _solved(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = scaled_rows(start.factor.scale_columns(start.linearise(y0)[1]))
-    gram0, eps = gram_matrix(first, first), float(jnp.finfo(y0.dtype).eps)
+    sizes, first = start.factor.scale_columns(start.linearise(y0)[1]).scaled()
+    gram0, eps = first.gram(first), float(jnp.finfo(y0.dtype).eps)
 
-    def stepped(multiplier: Array, rows: Array | None = None) -> _Unknowns:
+    def stepped(multiplier: Array, rows: AbstractRows | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to
         compute that end, so they are those of the last unknowns, or at the candidate."""
-        candidate, result = inner(y0 + start.factor.to_state(rmatvec(first, multiplier * sizes)))
+        candidate, result = inner(y0 + start.factor.to_state(first.rmatvec(multiplier * sizes)))
         rows = end.factor.scale_columns(end.linearise(candidate)[1]) if rows is None else rows
-        y = candidate + end.factor.to_state(rmatvec(rows, multiplier))
+        y = candidate + end.factor.to_state(rows.rmatvec(multiplier))
         return _Unknowns(y, multiplier, candidate, result)
 
     def advance(now: _Unknowns, counter: Array) -> tuple[_Unknowns, Array]:
@@ -255,7 +257,7 @@ def _solved(
         rows = end.factor.scale_columns(jacobian)
         level, wrong = end.level(g, end.scale(jacobian, now.y))
         # What the gradients at the end itself change in the equation for the state.
-        defect = now.candidate + end.factor.to_state(rmatvec(rows, now.multiplier)) - now.y
+        defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
         off = end.factor.length(defect) / (eps * end.factor.length(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)
         solved = jnp.where(
@@ -267,9 +269,9 @@ def _solved(
         counter = jnp.where(now.result == dfx.RESULTS.successful, counter, -1)
 
         def move() -> _Unknowns:
-            scaled = rows / sizes[:, None]
-            gram = gram0 + gram_matrix(scaled, scaled)
-            change = solve(gram, (wrong + matvec(jacobian, defect)) / sizes) / sizes
+            scaled = rows.divide_rows(sizes)
+            gram = jtu.tree_map(jnp.add, gram0, scaled.gram(scaled))
+            change = gram.solve((wrong + jacobian.matvec(defect)) / sizes) / sizes
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(counter > 0), move, lambda: now)

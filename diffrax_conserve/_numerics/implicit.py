@@ -21,16 +21,8 @@ from jaxtyping import Array, Float
 
 from .._tree import tree_tangents, unflatten
 from .iterate import Solved, simplified_newton
-from .linear import (
-    gram_matrix,
-    least_pivot,
-    matvec,
-    rmatvec,
-    row_space_correction,
-    solve,
-    unit_rows,
-)
-from .problem import Jacobian, Problem
+from .problem import Problem
+from .rows import AbstractRows
 
 
 class AbstractSystem(eqx.Module):
@@ -96,7 +88,7 @@ class MultiplierSystem(AbstractSystem):
 
     problem: Problem
     candidate: Float[Array, " n"]
-    directions: Jacobian | None = None
+    directions: AbstractRows | None = None
     fallback: Float[Array, " n"] | None = eqx.field(default=None, kw_only=True)
     iteration: Callable[..., Solved] = eqx.field(
         default=simplified_newton, static=True, kw_only=True
@@ -113,7 +105,7 @@ class MultiplierSystem(AbstractSystem):
             return self.candidate
         return jnp.where(ok, self.candidate, self.fallback)
 
-    def _along(self, start: Array) -> Jacobian:
+    def _along(self, start: Array) -> AbstractRows:
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
@@ -123,19 +115,19 @@ class MultiplierSystem(AbstractSystem):
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
-        sizes, rows = unit_rows(self._along(start))
+        sizes, rows = self._along(start).unit()
         change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
-        multiplier = solve(gram_matrix(rows, rows), matvec(rows, change), least=least_pivot(rows))
+        multiplier = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
         return solved.ok, multiplier / sizes
 
     def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
         start = self._start(ok)
         if self.directions is not None:
-            change = rmatvec(self.directions, multiplier)
+            change = self.directions.rmatvec(multiplier)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
             _, vjp = jax.vjp(self.problem.residual, start)
-            change = self.problem.factor.scale_columns(vjp(multiplier)[0])
+            change = self.problem.factor.scale_gradient(vjp(multiplier)[0])
         end = start + self.problem.factor.to_state(change)
         # The second equation at the end of the correction, so that its tangent contains the first.
         return end, self.problem.residual(end)
@@ -146,9 +138,9 @@ class MultiplierSystem(AbstractSystem):
         t_y, t_g = (-x for x in right)
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = unit_rows(problem.factor.scale_columns(problem.linearise(y)[1]))
-        along = unit_rows(self._along(start))[1]
-        change = row_space_correction(rows, along, t_g / heights, least=least_pivot(rows))
+        heights, rows = problem.factor.scale_columns(problem.linearise(y)[1]).unit()
+        along, least = self._along(start).unit()[1], rows.least_pivot()
+        change = rows.gram(along).row_space_correction(along, t_g / heights, least=least)
         return t_y - problem.factor.to_state(change)
 
 

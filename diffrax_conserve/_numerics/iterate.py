@@ -33,27 +33,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import AT_BOUND, BACKTRACKING_FACTOR, FROZEN_STEPS, ROUNDOFF, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
-from .._large.sparse import SparseRows
-from .linear import (
-    factorise,
-    gram_matrix,
-    in_order,
-    order_of,
-    rmatvec,
-    roundoff_pivot,
-    row_space_correction,
-    scaled_rows,
-    solve,
-)
+from .linear import in_order, order_of, roundoff_pivot
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
     NOT_FINITE,
     WITHIN_TOLERANCE,
-    Jacobian,
     Problem,
     relative,
 )
+from .rows import AbstractRows, DenseRows
 
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
@@ -164,7 +153,7 @@ def keep_done(counter: Array, moved: Any, y: Any) -> Any:
 def simplified_newton(
     problem: Problem,
     candidate: Float[Array, " n"],
-    directions: Float[Array, "m n"] | None = None,
+    directions: DenseRows | None = None,
     *,
     max_steps: int,
 ) -> Solved:
@@ -185,13 +174,16 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     dtype = problem.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
+    def scaled(jacobian: AbstractRows) -> Any:
+        return problem.factor.scale_columns(jacobian).scaled()
+
     def shared(y: Any) -> Any:
         """What the steps share: the order in which they eliminate the constraints, and in this
         order the directions, or the gradients at the candidate."""
-        rows = scaled_rows(problem.factor.scale_columns(problem.linearise(y)[1]))[1]
+        rows = scaled(problem.linearise(y)[1])[1]
         along = rows if directions is None else directions
-        order = order_of(gram_matrix(rows, along))
-        return order, in_order(order, along)
+        order = order_of(rows.gram(along).matrix)
+        return order, in_order(order, along.matrix)
 
     def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
         order, at_candidate = known
@@ -199,8 +191,8 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = seen if lanes else lax.optimization_barrier(seen)
         level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
-        rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
+        sizes, rows = scaled(jacobian)
+        rows, wrong = in_order(order, rows.matrix), in_order(order, wrong / sizes)
         fresh = directions is None and max_steps > FROZEN_STEPS
         # In each step the counter goes down by one, but before the last step, which polishes, the
         # test sets it to two. So we look at it before the test. Should the last step leave the
@@ -215,9 +207,9 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - problem.factor.to_state(
-            row_space_correction(rows, along, wrong, least=least, ordered=True)
-        )
+        rows, along = DenseRows(rows), DenseRows(along)
+        change = rows.gram(along).row_space_correction(along, wrong, least=least, ordered=True)
+        moved = y - problem.factor.to_state(change)
         return keep_done(counter, moved, y), counter
 
     if lanes:
@@ -241,15 +233,15 @@ def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) ->
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
     along = problem.factor.scale_columns(jacobian)
-    sizes, rows = scaled_rows(along)
-    solve = factorise(gram_matrix(rows, rows))
+    sizes, rows = along.scaled()
+    solve = rows.gram(rows).factorise()
     _, vjp = jax.vjp(problem.residual, candidate)
 
     def along_gradients(multiplier: Array) -> Array:
         """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
-        if isinstance(along, SparseRows):
-            return problem.factor.to_state(problem.factor.scale_columns(vjp(multiplier)[0]))
-        return problem.factor.to_state(rmatvec(along, multiplier))
+        if problem.pattern is not None:
+            return problem.factor.to_state(problem.factor.scale_gradient(vjp(multiplier)[0]))
+        return problem.factor.to_state(along.rmatvec(multiplier))
 
     def advance(y: Array, counter: Array) -> tuple[Array, Array]:
         level, wrong = problem.level(problem.residual(y), scale)
@@ -279,7 +271,7 @@ class _Descent(NamedTuple):
 def damped_newton(
     problem: Problem,
     start: Float[Array, " n"],
-    directions: Jacobian | None = None,
+    directions: AbstractRows | None = None,
     *,
     max_steps: int,
     polish: bool = False,
@@ -301,9 +293,10 @@ def damped_newton(
         scale = jnp.where(first, here, now.scale)
         residuals = jnp.abs(relative(g, scale))
         better = jnp.all(residuals <= now.largest)  # false if one is NaN
-        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
+        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
         along = rows if directions is None else directions
-        further = y - problem.factor.to_state(row_space_correction(rows, along, wrong / sizes))
+        change = rows.gram(along).row_space_correction(along, wrong / sizes)
+        further = y - problem.factor.to_state(change)
         shorter = now.best + BACKTRACKING_FACTOR * (y - now.best)
         best = jnp.where(better, y, now.best)
         largest = jnp.where(better, jnp.max(residuals), now.largest)
@@ -319,7 +312,7 @@ def damped_newton(
 
 
 def projected_newton(
-    problem: Problem, start: Float[Array, " n"], directions: Jacobian, *, max_steps: int
+    problem: Problem, start: Float[Array, " n"], directions: AbstractRows, *, max_steps: int
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
 
@@ -333,11 +326,11 @@ def projected_newton(
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         level, _ = problem.level(g, problem.scale(jacobian, z))
         counter = after_test(level, counter, polish=False)
-        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
+        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
-        multiplier = solve(gram_matrix(rows, directions), g / sizes)
-        change = problem.factor.to_state(rmatvec(directions, multiplier))
+        multiplier = rows.gram(directions).solve(g / sizes)
+        change = problem.factor.to_state(directions.rmatvec(multiplier))
         share = _share(problem, z, multiplier, change, counter > 0)
         return keep_done(counter, z - share * change, z), counter
 

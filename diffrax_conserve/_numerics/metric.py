@@ -23,9 +23,9 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._constants import REGULARISATION_POWER
 from .._custom_types import Args, RealScalarLike, Y
-from .._large.sparse import SparseRows
 from .._options import check_function, check_number
 from .._tree import ravel, real_view
+from .rows import AbstractRows, DenseRows
 
 
 class AbstractFactor(eqx.Module):
@@ -40,8 +40,12 @@ class AbstractFactor(eqx.Module):
     is_dense: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def scale_columns(self, rows: Any) -> Any:
-        """`rows S`, for the rows of a Jacobian or for one gradient."""
+    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        """`Sᵀ gradient`, for one gradient or for each row of a matrix."""
+
+    def scale_columns(self, rows: Any) -> AbstractRows:
+        """`rows S`, for the rows of a Jacobian."""
+        return DenseRows(self.scale_gradient(rows.matrix))
 
     @abc.abstractmethod
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -60,7 +64,10 @@ class AbstractFactor(eqx.Module):
 class Identity(AbstractFactor):
     """`S = 1`, which costs no product."""
 
-    def scale_columns(self, rows: Any) -> Any:
+    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        return gradient
+
+    def scale_columns(self, rows: Any) -> AbstractRows:
         return rows
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -77,10 +84,11 @@ class Diagonal(AbstractFactor):
 
     diagonal: Float[Array, " n"]
 
-    def scale_columns(self, rows: Any) -> Any:
-        if isinstance(rows, SparseRows):
-            return rows.times_columns(self.diagonal)
-        return rows * jnp.broadcast_to(self.diagonal, rows.shape)
+    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        return gradient * jnp.broadcast_to(self.diagonal, gradient.shape)
+
+    def scale_columns(self, rows: Any) -> AbstractRows:
+        return rows.scale_columns(self.diagonal)
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change * self.diagonal
@@ -105,9 +113,9 @@ class Matrices(AbstractFactor):
     starts: tuple[int, ...] = eqx.field(static=True)
     is_dense: ClassVar[bool] = True
 
-    def scale_columns(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
-        return self._in_parts(solve, self.elsewhere.scale_columns(rows))
+        return self._in_parts(solve, self.elsewhere.scale_gradient(gradient))
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
@@ -162,8 +170,8 @@ class Preferring(AbstractFactor):
 
         return cls(own, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
-    def scale_columns(self, rows: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-        return self._shared(self.own.scale_columns(rows), _outside(rows.dtype))
+    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+        return self._shared(self.own.scale_gradient(gradient), _outside(gradient.dtype))
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.own.to_state(self._shared(change, _outside(change.dtype)))

@@ -34,6 +34,7 @@ from .._manifold import evaluate, is_entry, named_entries
 from .._tree import key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
+from .rows import AbstractRows, DenseRows
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within; all are so small that only chance could make them smaller. They are ordered such that the
@@ -41,7 +42,6 @@ from .report import ProjectionInfo
 NOT_FINITE, ABOVE_TOLERANCE, WITHIN_TOLERANCE, AT_ROUNDOFF = -1, 0, 1, 2
 # The residuals of one entry of a manifold, as a function of the vector of the state.
 Residual = Callable[[Float[Array, " n"]], Float[Array, " k"]]
-Jacobian = Float[Array, "m n"] | SparseRows
 
 
 @final
@@ -115,7 +115,7 @@ class Problem(eqx.Module):
         return jnp.concatenate([part(y) for part in self.functions])
 
     @eqx.filter_jit  # traced once for all uses
-    def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], Jacobian]:
+    def linearise(self, y: Float[Array, " n"]) -> tuple[Float[Array, " m"], AbstractRows]:
         """`g(y)` and the constraint Jacobian `G(y)`.
 
         Each entry of the manifold is differentiated by itself. In one reverse pass over all of them
@@ -132,16 +132,16 @@ class Problem(eqx.Module):
                 rows.append(vjp(jnp.ones_like(value))[0][None])
             else:
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
-        return jnp.concatenate(values), jnp.concatenate(rows)
+        return jnp.concatenate(values), DenseRows(jnp.concatenate(rows))
 
     def dense(self) -> "Problem":
         """The same problem, with the Jacobian computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)
 
-    def scale(self, jacobian: Jacobian, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    def scale(self, jacobian: AbstractRows, y: Float[Array, " n"]) -> Float[Array, " m"]:
         size = jnp.abs(y if self.clip is None else self.clip(y))
         size = size if self.changes is None else size + self.changes
-        return self.magnitude + gradient_scale(jacobian, size)
+        return self.magnitude + jacobian.absolute_matvec(size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = float(jnp.finfo(scale.dtype).eps)
@@ -239,14 +239,6 @@ def step_length(
     """
     least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
     return factor.length(jnp.maximum(jnp.abs(end - start), least))
-
-
-def gradient_scale(jacobian: Jacobian, size: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`Σ_k size_k |∂g/∂y_k|` for each row of the Jacobian, the part of a scale that the gradient
-    shows, for components of this size."""
-    if isinstance(jacobian, SparseRows):
-        return jtu.tree_map(jnp.abs, jacobian).matvec(size)
-    return jnp.sum(jnp.abs(jacobian) * size[None], axis=1)
 
 
 def relative(residual: Any, scale: Any) -> Any:

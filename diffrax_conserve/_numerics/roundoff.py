@@ -32,7 +32,8 @@ from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import SparseRows, pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
-from .problem import Jacobian, functions_of, gradient_scale
+from .problem import functions_of
+from .rows import AbstractRows, DenseRows
 
 # The primitives of JAX that are sums, and sums of products.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})
@@ -54,7 +55,7 @@ _Measured = tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]
 
 def cancellation_scale(
     manifold: Manifold, t: RealScalarLike, y: Y, args: Args
-) -> tuple[Float[Array, " m"], Jacobian, Float[Array, " m"]]:
+) -> tuple[Float[Array, " m"], AbstractRows, Float[Array, " m"]]:
     """Values and Jacobian of the functions of a manifold, and the part of their scales that the
     gradients do not show.
 
@@ -75,7 +76,8 @@ def cancellation_scale(
         for (name, _), fn in entries:
             with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
                 measured.append(cancellation_terms(fn, vector))
-        value, jacobian, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
+        value, matrix, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
+        jacobian = DenseRows(matrix)
     else:
         # The roundoff of an entry with many elements is not measured, because that would cost a
         # reverse pass for each.
@@ -86,7 +88,7 @@ def cancellation_scale(
             for fn, size, one in zip(functions, sizes, few, strict=True)
         ]
         cancellation = jnp.concatenate(measured)
-    shown = jnp.abs(value) + gradient_scale(jacobian, jnp.abs(vector))
+    shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
     return value, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
 
 

@@ -13,6 +13,7 @@ from .._numerics.implicit import MultiplierSystem, solution
 from .._numerics.metric import Diagonal
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
+from .._numerics.rows import DenseRows
 from .base import AbstractProjection
 from .options import check_options, option
 
@@ -102,7 +103,7 @@ class AlongLine(AbstractProjection):
         least = float(jnp.finfo(line.dtype).tiny) ** 0.5
         s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
         along = dataclasses.replace(problem, factor=Diagonal(s))
-        row = (line / s)[None]
+        row = DenseRows((line / s)[None])
         y, ok, count, _ = solution(
             MultiplierSystem(along, candidate, row, max_steps=self.max_steps)
         )

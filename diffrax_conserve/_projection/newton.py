@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
 from .._numerics.implicit import MultiplierSystem, nan_tangent_unless, root, solution
 from .._numerics.iterate import Solved, damped_newton
-from .._numerics.linear import gram_matrix, least_pivot, matvec, solve, solve_kkt, unit_rows
 from .._numerics.metric import Identity
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
+from .._numerics.rows import solve_kkt
 from .._tree import tree_stop_gradient
 from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, Bounds, project_within
@@ -132,7 +132,7 @@ class _Conditions(eqx.Module):
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
-        gradient = problem.factor.scale_columns(vjp(multiplier / self.lengths)[0])
+        gradient = problem.factor.scale_gradient(vjp(multiplier / self.lengths)[0])
         return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
 
 
@@ -141,11 +141,11 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     problem, y = given.problem, given.clip(base)
     jacobian = problem.linearise(y)[1]
-    lengths, rows = unit_rows(problem.factor.scale_columns(jacobian))
+    lengths, rows = problem.factor.scale_columns(jacobian).unit()
     conditions = _Conditions(given, base, lengths)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
-    fits = solve(gram_matrix(rows, rows), matvec(rows, change), least=least_pivot(rows))
+    fits = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
     scale = problem.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 

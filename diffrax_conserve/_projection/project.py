@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, Manifold, RealScalarLike, State, Values, Y
 from .._manifold import check_manifold, conserved_values, has_value, named_entries
-from .._numerics.problem import Problem, gradient_scale, problem_of
+from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._tree import ravel, tree_stop_gradient, unravel
@@ -95,7 +95,7 @@ def _projected(
     value, jacobian, there = cancellation_scale(manifold, t, usable, args)
     # A projection may have tolerances of its own. If it reports a success, we believe it, unless
     # there is less than half of the roundoff that it assumed.
-    shown = jnp.abs(value) + gradient_scale(jacobian, jnp.abs(ravel(usable)))
+    shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(ravel(usable)))
     judged = problem(there)
     ok = tree_stop_gradient(judged).holds(lax.stop_gradient(y))
     ok = ok | info.ok & jnp.all(at_candidate <= 2 * (shown + there))

@@ -25,7 +25,6 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
-from .._numerics.linear import gram_matrix, row_space_correction, scaled_rows, solve
 from .._numerics.metric import factor_of, positive_weights
 from .._numerics.problem import problem_of
 from .._options import check_number
@@ -168,10 +167,10 @@ class TangentField(eqx.Module):
             sizes, and so is the right side."""
             vector, wrong = given
             _, jacobian = problem.linearise(vector)
-            sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
-            gram, right = gram_matrix(rows, rows), wrong / sizes
-            change = problem.factor.to_state(row_space_correction(rows, rows, right))
-            return change, solve(gram, right) / sizes
+            sizes, rows = problem.factor.scale_columns(jacobian).scaled()
+            gram, right = rows.gram(rows), wrong / sizes
+            change = problem.factor.to_state(gram.row_space_correction(rows, right))
+            return change, gram.solve(right) / sizes
 
         correction, multiplier = written_out(solved, (vector, wrong))
         return slope, unravel(correction, y), unflatten(multiplier, values)

@@ -39,6 +39,7 @@ from .terms import (
     check_direction,
     check_nested,
     check_projects_nothing,
+    in_field_time,
     innermost,
     is_ode,
     refuse_backsolve,
@@ -177,7 +178,7 @@ class ManifoldProjection(ForwardingSolver):
             "Name the wrapped solver for them, `BacksolveAdjoint(solver=inner)`, or use",
         )
         check_state(y0, kind=jnp.inexact)
-        t = t0 * time_direction(terms, t0)
+        _, t = in_field_time(terms, t0)
         values, cancellation = initial_values(self.manifold, t, y0, args)
         if self.keep_linear and values.size > 2 * _CHANGES:
             raise ValueError(

@@ -20,6 +20,15 @@ def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[A
     return jnp.asarray(directions[0] if directions else 1, jnp.result_type(t))
 
 
+def in_field_time(terms: PyTree[dfx.AbstractTerm], *times: RealScalarLike) -> tuple[Any, ...]:
+    """The terms and times in the time of the vector field, for whoever calls no solver: below this
+    no sign is needed."""
+    direction = time_direction(terms, times[0])
+    is_term = lambda x: isinstance(x, dfx.AbstractTerm)  # noqa: E731
+    bare = lambda x: x.term if isinstance(x, WrapTerm) else x  # noqa: E731
+    return jtu.tree_map(bare, terms, is_leaf=is_term), *(t * direction for t in times)
+
+
 def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
     """Whether this is the backward solve of a `diffrax.BacksolveAdjoint`."""
     return any(isinstance(x, AdjointTerm) for x in _nested(terms))

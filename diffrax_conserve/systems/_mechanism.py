@@ -17,8 +17,8 @@ from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
 from .._numerics.iterate import after_test, iterate, keep_done
-from .._numerics.linear import solve
 from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
+from .._numerics.rows import solve_dense
 from .._projection.closed_form import ClosedForm
 from ._base import real
 
@@ -211,14 +211,14 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
         met = jnp.all(jnp.abs(left) <= small * jnp.abs(target))
         counter = after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), counter)
         gram = jnp.sum(weights[:, None, :] * weights * state(multiplier), axis=2)
-        change = solve(gram, left)
+        change = solve_dense(gram, left)
         # An exponent changes by at most one in a step.
         longest = jnp.max(jnp.abs(jnp.sum(change[:, None] * weights, axis=0)), initial=1)
         return keep_done(counter, multiplier + change / longest, multiplier), counter
 
     # Errors of ten per cent decrease as 1e-1, 5e-3, 1e-5, 1e-10, roundoff.
     newton = lambda guess: iterate(advance, guess, max_steps=MAX_STEPS)  # noqa: E731
-    return state(root(missing, newton, jnp.zeros_like(target), solve).y)
+    return state(root(missing, newton, jnp.zeros_like(target), solve_dense).y)
 
 
 class _Tables(NamedTuple):

@@ -17,8 +17,6 @@ from jaxtyping import Array
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 from diffrax_conserve._large import asdex_import, sparse
-from diffrax_conserve._numerics.linear import gram_matrix, matvec, rmatvec
-from diffrax_conserve._numerics.linear import solve as gram_solve
 from diffrax_conserve._numerics.metric import Diagonal
 from diffrax_conserve._numerics.problem import Problem, problem_of
 
@@ -83,11 +81,11 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     @jax.jit
     def found() -> Any:
         a, b = rows(problem, y), rows(problem, beside)
-        solved = (gram_solve(gram_matrix(a, other), multiplier) for other in (a, b))
-        return matvec(a, x), rmatvec(a, multiplier), *solved
+        solved = (a.gram(other).solve(multiplier) for other in (a, b))
+        return a.matvec(x), a.rmatvec(multiplier), *solved
 
     dense = dataclasses.replace(problem, pattern=None)
-    a, b = (np.asarray(rows(dense, state), np.float64) for state in (y, beside))
+    a, b = (np.asarray(rows(dense, state).matrix, np.float64) for state in (y, beside))
     ahead, back, same, other = (np.asarray(z, np.float64) for z in found())
     eps = float(jnp.finfo(dtype).eps)
 
@@ -153,7 +151,7 @@ def test_functions_that_differ_in_an_inner_constant_have_their_own_pattern():
         dense = dataclasses.replace(problem, pattern=None)
         x, y = np.arange(NUM) * 1.0, np.linspace(1, 2, NUM)
         found, expected = (
-            jax.jit(lambda x, y, e=e: matvec(e.linearise(y)[1], x))(x, y) for e in (problem, dense)
+            jax.jit(lambda x, y, e=e: e.linearise(y)[1].matvec(x))(x, y) for e in (problem, dense)
         )
         assert problem.pattern is not None
         np.testing.assert_allclose(found, expected)

@@ -5,9 +5,9 @@ Their derivatives are those of what is computed, iteration by iteration, also fa
 
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..._numerics.linear import gram_matrix, rmatvec, solve
 from ..._numerics.problem import Problem, relative
 from .trainable import LayerSchedule
 
@@ -31,15 +31,16 @@ def iterated(
     before, rows = problem.linearise(candidate)
 
     def improve(multipliers: Array) -> Array:
-        y = candidate + rmatvec(rows, multipliers)
+        y = candidate + rows.rmatvec(multipliers)
         g, jacobian = problem.linearise(y)
         if radius is None:
-            return multipliers - solve(gram_matrix(rows, rows), g)
+            return multipliers - rows.gram(rows).solve(g)
         ratio = relative(g, problem.scale(jacobian, y))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
-        gram = gram_matrix(jacobian, rows)
-        change = solve(gram * (1 + damping * jnp.eye(g.size, dtype=dtype)), g)
-        step = rmatvec(rows, change)
+        damped = 1 + damping * jnp.eye(g.size, dtype=dtype)
+        gram = jtu.tree_map(lambda matrix: matrix * damped, jacobian.gram(rows))
+        change = gram.solve(g)
+        step = rows.rmatvec(change)
         return multipliers - lax.rsqrt(1 + jnp.sum(step * step) / radius**2) * change
 
     def iterate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
@@ -47,4 +48,4 @@ def iterated(
 
     zeros = jnp.zeros_like(before)
     (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
-    return candidate + rmatvec(rows, previous + s.astype(dtype) * (last - previous))
+    return candidate + rows.rmatvec(previous + s.astype(dtype) * (last - previous))

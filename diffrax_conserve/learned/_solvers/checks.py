@@ -19,7 +19,7 @@ from jaxtyping import Array, Int, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._solver.diffrax_private import member, register
-from ..._solver.terms import is_backsolve, time_direction
+from ..._solver.terms import in_field_time, is_backsolve
 from ..._tree import tree_all_finite, tree_shapes
 from .._networks.flow_map import AbstractFlowMap
 from .policies import StepResult
@@ -108,7 +108,8 @@ def refused_from_start(
         another = norm(slope - field) > allowed
         finite &= tree_all_finite((slope, field))
     refused = jnp.where(finite, jnp.where(another, _ANOTHER_FIELD, 0), _NOT_FINITE)
-    return jnp.where(h * time_direction(terms, h) >= 0, refused, _BACKWARDS)
+    _, h = in_field_time(terms, h)
+    return jnp.where(h >= 0, refused, _BACKWARDS)
 
 
 def with_result(

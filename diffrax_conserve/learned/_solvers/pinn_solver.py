@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._solver.diffrax_private import member, register
-from ..._solver.terms import time_direction
+from ..._solver.terms import in_field_time
 from ..._tree import tree_sub
 from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
@@ -77,7 +77,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
         del t1, args
         check_learned_terms(terms, "PINNSolver")
         check_output(self.pinn, (t0,), y0, "pinn")
-        time = jnp.asarray(t0) * time_direction(terms, t0)
+        _, time = in_field_time(terms, t0)
         state = self.pinn(time)
         tolerance = float(jnp.finfo(working_dtype(y0)).eps) ** 0.5
         size = jnp.maximum(self.pinn.scale, jnp.abs(flatten(state)))
@@ -95,7 +95,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, Refused, dfx.RESULTS]:
         del args, made_jump
-        start, end = (jnp.asarray(t) * time_direction(terms, t) for t in (t0, t1))
+        _, start, end = in_field_time(terms, t0, t1)
 
         def state(t: RealScalarLike) -> Y:
             return jtu.tree_map(lambda a, b: a.astype(jnp.result_type(b)), self.pinn(t), y0)

@@ -1,0 +1,327 @@
+"""The rows of a Jacobian, and their Gram matrices `U Vᵀ`, one row for each constraint.
+
+A projection needs few operations with them, which are two interfaces, `AbstractRows` and
+`AbstractGram`. Here are those of dense rows; sparse ones are in `_large.sparse`.
+
+Gram matrices are singular where constraints depend on each other, as when an integral is given
+twice. Their multipliers are then not determined, but what they move is, if the constraints do not
+contradict each other. There are three ways to solve such a system.
+
+- Up to four constraints are eliminated one after the other, written out in scalars, and next always
+  the one whose gradient is farthest from a combination of those before it. Once it is such a
+  combination, its pivot is roundoff. We give it the multiplier zero: if the others hold, it holds
+  too. Gradients that are only nearly parallel are all kept, because a correction needs the
+  direction in which they differ. A derivative does not, and would lose its digits in that
+  direction; see `implicit`. Nor, below double precision, does a step that only polishes; see
+  `iterate`.
+- More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a
+  derivative the share is the least pivot that counts: what is smaller has nearly no effect.
+- A sparse matrix is factored in blocks, with the same share in a derivative too.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, TypeVar, final
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._constants import REGULARISATION_POWER, WRITTEN_OUT
+from .linear import (
+    Solve,
+    forward_elimination,
+    iterative_refinement,
+    lu_factors,
+    lu_solution,
+)
+
+Rows = TypeVar("Rows", bound="AbstractRows")
+
+
+class AbstractRows(eqx.Module):
+    """The rows `U` of a Jacobian, or of one whose columns were scaled."""
+
+    @abc.abstractmethod
+    def __len__(self) -> int: ...
+
+    @abc.abstractmethod
+    def matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """`U x`."""
+
+    @abc.abstractmethod
+    def rmatvec(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
+        """`Uᵀ λ`."""
+
+    @abc.abstractmethod
+    def gram(self, others: Any) -> Any:
+        """`U Vᵀ`, an `AbstractGram`, for other rows of the same kind."""
+
+    @abc.abstractmethod
+    def scale_columns(self: Rows, x: Float[Array, " n"]) -> Rows:
+        """`U diag(x)`."""
+
+    @abc.abstractmethod
+    def divide_rows(self: Rows, sizes: Float[Array, " m"]) -> Rows:
+        """`diag(sizes)⁻¹ U`."""
+
+    @abc.abstractmethod
+    def largest(self) -> Float[Array, " m"]:
+        """The absolute value of the largest element of each row."""
+
+    @abc.abstractmethod
+    def apply(self: Rows, linear: Callable[[Array], Array], n: int) -> Rows:
+        """A linear function of `n` numbers, applied to each row."""
+
+    @property
+    def dtype(self) -> Any:
+        return jnp.result_type(*jtu.tree_leaves(self))
+
+    def absolute_matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """`|U| x`."""
+        return jtu.tree_map(jnp.abs, self).matvec(x)
+
+    def scaled(self: Rows) -> tuple[Float[Array, " m"], Rows]:
+        """The largest element of each row, or one if all are zero, and the rows divided by it.
+
+        The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
+        they do not in usual units, so there the sizes are one, which saves time.
+        """
+        if self.dtype == jnp.float64:
+            return jnp.ones(len(self)), self
+        sizes = self.largest()
+        sizes = jnp.where(sizes > 0, sizes, 1)
+        return sizes, self.divide_rows(sizes)
+
+    def unit(self: Rows) -> tuple[Float[Array, " m"], Rows]:
+        """Rows of the length one, so that their pivots are squares of sines, and what they were
+        divided by. Sparse rows are those of `scaled`, because their pivots are not looked at."""
+        return self.scaled()
+
+    def least_pivot(self) -> float:
+        """The least pivot of unit rows that counts in a derivative, `√ε`. As a pivot has an error
+        of about `ε`, half of the digits of what is divided by it are right."""
+        return float(jnp.finfo(self.dtype).eps) ** 0.5
+
+
+class AbstractGram(eqx.Module):
+    """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
+
+    In all methods `least` is the least pivot that counts, by default roundoff. Sparse matrices have
+    no other.
+    """
+
+    @abc.abstractmethod
+    def __len__(self) -> int: ...
+
+    @abc.abstractmethod
+    def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+        """`U Vᵀ x`."""
+
+    @abc.abstractmethod
+    def factorise(self, *, least: float | Array | None = None) -> Solve:
+        """`(U Vᵀ)⁻¹ b` as a function of `b`, which is a PyTree of the factors. What is added to the
+        diagonal of a large matrix is an error of the solution, which `solve` removes, and so do the
+        steps of an iteration."""
+
+    def solve(
+        self, b: Float[Array, " m"], *, least: float | Array | None = None
+    ) -> Float[Array, " m"]:
+        """`(U Vᵀ)⁻¹ b`."""
+        return iterative_refinement(self.factorise(least=least), self.matvec, b)
+
+    def row_space_correction(
+        self,
+        along: Any,
+        b: Float[Array, " m"],
+        *,
+        least: float | Array | None = None,
+        ordered: bool = False,
+    ) -> Float[Array, " n"]:
+        """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V`, here `along`, that changes `U x` by
+        `b`. Whether the rows are `ordered`: see `forward_elimination`."""
+        del ordered
+        return along.rmatvec(self.solve(b, least=least))
+
+
+@final
+class DenseRows(AbstractRows):
+    """Rows as a matrix."""
+
+    matrix: Float[Array, "m n"]
+
+    def __len__(self) -> int:
+        return len(self.matrix)
+
+    def matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        return _combination(x, self.matrix.T)
+
+    def rmatvec(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
+        return _combination(multiplier, self.matrix)
+
+    def gram(self, others: "DenseRows") -> "FewGram | DenseGram":
+        if len(self) > WRITTEN_OUT:
+            product = jnp.matmul(self.matrix, others.matrix.T, precision=lax.Precision.HIGHEST)
+            return DenseGram(product)
+        return FewGram(jnp.sum(self.matrix[:, None, :] * others.matrix[None], axis=2))
+
+    def scale_columns(self, x: Float[Array, " n"]) -> "DenseRows":
+        return DenseRows(self.matrix * jnp.broadcast_to(x, self.matrix.shape))
+
+    def divide_rows(self, sizes: Float[Array, " m"]) -> "DenseRows":
+        return DenseRows(self.matrix / sizes[:, None])
+
+    def largest(self) -> Float[Array, " m"]:
+        return jnp.max(jnp.abs(self.matrix), axis=1)
+
+    def apply(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
+        del n
+        return DenseRows(jax.vmap(linear)(self.matrix))
+
+    def absolute_matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        return jnp.sum(jnp.abs(self.matrix) * x[None], axis=1)
+
+    def unit(self) -> tuple[Float[Array, " m"], "DenseRows"]:
+        sizes, rows = self.scaled()
+        lengths = jnp.linalg.norm(rows.matrix, axis=1)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        return sizes * lengths, rows.divide_rows(lengths)
+
+
+@final
+class FewGram(AbstractGram):
+    """The Gram matrix of up to four rows."""
+
+    matrix: Float[Array, "m m"]
+
+    def __len__(self) -> int:
+        return len(self.matrix)
+
+    def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+        return _combination(x, self.matrix.T)
+
+    def factorise(self, *, least: float | Array | None = None) -> Solve:
+        del least
+        matrix, unit = _of_unit_diagonal(self.matrix)
+        one = jnp.eye(len(self), dtype=self.matrix.dtype)
+        above, below, _ = forward_elimination(matrix, one, one)
+        return _Inverses(below, above.T, unit)
+
+    def solve(
+        self, b: Float[Array, " m"], *, least: float | Array | None = None
+    ) -> Float[Array, " m"]:
+        one = DenseRows(jnp.eye(len(b), dtype=b.dtype))
+        return self.row_space_correction(one, b, least=least)
+
+    def row_space_correction(
+        self,
+        along: DenseRows,
+        b: Float[Array, " m"],
+        *,
+        least: float | Array | None = None,
+        ordered: bool = False,
+    ) -> Float[Array, " n"]:
+        """If gradients are nearly parallel, the multipliers `(U Vᵀ)⁻¹ b` are large and cancel in
+        the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
+        then they do not cancel. So we do not form the multipliers. With the factors `U Vᵀ = L R` we
+        compute `(R⁻ᵀ V)ᵀ (L⁻¹ b)`: the elimination takes the differences of nearly parallel rows
+        before anything is large."""
+        sides, right, _ = forward_elimination(
+            self.matrix, b, along.matrix, least=least, ordered=ordered
+        )
+        return _combination(right, sides)
+
+
+@final
+class DenseGram(AbstractGram):
+    """The Gram matrix of more rows."""
+
+    matrix: Float[Array, "m m"]
+
+    def __len__(self) -> int:
+        return len(self.matrix)
+
+    def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+        return _combination(x, self.matrix.T)
+
+    def factorise(self, *, least: float | Array | None = None) -> Solve:
+        matrix, unit = _of_unit_diagonal(self.matrix)
+        dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
+        eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
+        added = eps**REGULARISATION_POWER * len(matrix) ** 0.5 if least is None else least
+        return _Substitutions(lu_factors(matrix.astype(dtype) + added * one), unit)
+
+
+class _Inverses(eqx.Module):
+    """The inverses of the two factors of a small matrix, so that a solve is two products, which XLA
+    fuses with what is around them.
+
+    - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
+    """
+
+    below: Float[Array, "m m"]
+    above: Float[Array, "m m"]
+    unit: Float[Array, " m"]
+
+    def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        x = (b * self.unit).astype(self.below.dtype)
+        x = _combination(_combination(x, self.below.T), self.above.T)
+        return x.astype(b.dtype) * self.unit
+
+
+class _Substitutions(eqx.Module):
+    """The factors of a large matrix are LAPACK's, and a solve is two substitutions: to invert them
+    takes longer than the few solves of a step."""
+
+    factors: tuple[Array, Array]
+    unit: Float[Array, " m"]
+
+    def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        x = (b * self.unit).astype(self.factors[0].dtype)
+        return lu_solution(self.factors, x).astype(b.dtype) * self.unit
+
+
+def _of_unit_diagonal(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:
+    """The matrix with its rows and columns multiplied by units such that the diagonal is one, and
+    the units."""
+    diagonal = jnp.abs(jnp.diagonal(matrix))
+    unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    return matrix * unit[:, None] * unit, unit
+
+
+def _combination(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """`rowsᵀ x`. A short sum is written out, so that XLA fuses it with what is around it."""
+    if len(rows) > WRITTEN_OUT:
+        return jnp.matmul(x, rows, precision=lax.Precision.HIGHEST)
+    return jnp.sum(x[:, None] * rows, axis=0)
+
+
+def solve_dense(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`matrix⁻¹ b`."""
+    return (FewGram(matrix) if len(b) <= WRITTEN_OUT else DenseGram(matrix)).solve(b)
+
+
+def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
+    """`matrix⁻¹ b` for equations of `n` components of the state and of multipliers,
+    `A y + B λ = b₁` and `G y = b₂`, without the multipliers whose gradients are nearly parallel;
+    see `implicit`.
+
+    The state is eliminated first. The matrix `A` alone may be singular, so we add to the first
+    equations the second ones times the transpose of `G`, which does not change the solution. All
+    rows of `G` and columns of `B` are taken with the length one, so that nothing depends on the
+    units of the multipliers.
+    """
+    heights, rows = DenseRows(matrix[n:, :n]).unit()
+    widths, along = DenseRows(matrix[:n, n:].T).unit()
+    columns = DenseRows(rows.matrix.T)
+    factors = lu_factors(matrix[:n, :n] + columns.gram(columns).matrix)
+    along = DenseRows(lu_solution(factors, along.matrix.T).T)
+    second = b[n:] / heights
+    first = lu_solution(factors, b[:n] + rows.rmatvec(second))
+    wrong = rows.matvec(first) - second
+    multiplier = rows.gram(along).solve(wrong, least=rows.least_pivot())
+    return jnp.concatenate([first - along.rmatvec(multiplier), multiplier / widths])
