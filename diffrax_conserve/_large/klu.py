@@ -98,7 +98,7 @@ class Places:
     ) -> Shaped[Array, " n"]:
         """`A⁻¹ b`, of a matrix that is known to be regular, or has values that are NaN."""
         dtype = jnp.result_type(values, b)
-        if not self._has_full_rank:
+        if self._permutation is None:
             return jnp.full(b.shape, jnp.nan, dtype)
         values, b = values.astype(dtype), b.astype(dtype)
         return lax.custom_linear_solve(
@@ -116,7 +116,7 @@ class Places:
         element has a tiny imaginary part in general position: where real parts cancel exactly, the
         imaginary parts do not, and the pivot is tiny, but not zero. The real parts are the same.
         """
-        if not self._has_full_rank:
+        if self._permutation is None:
             return jnp.asarray(False)
         values = lax.stop_gradient(values)
         if jnp.iscomplexobj(values):
@@ -132,27 +132,35 @@ class Places:
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
         scaled = values / heights / widths + _TINY * 1j * shift
         x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))
-        return jnp.max(jnp.abs(x)) < 1 / (ROUNDOFF * float(jnp.finfo(values.dtype).eps))
+        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(values.dtype).eps)))
 
     def _klu(self, name: str, values: Array, b: Array) -> Array:
         """Calls KLU; `b` may have several columns. The primitives are bound themselves, because the
-        functions of klujax sort the places in each program anew."""
+        functions of klujax sort the places in each program anew. With a matrix that is not finite
+        KLU may find no pivot, so it gets a permutation instead."""
+        finite = jnp.all(jnp.isfinite(values))
+        values = jnp.where(finite, values, jnp.asarray(self._permutation, values.dtype))
         kind = "c128" if jnp.iscomplexobj(values) else "f64"
         call = getattr(klujax(), f"{name}_{kind}").bind
         where = jnp.asarray(self.rows), jnp.asarray(self.columns)
         columns = b.reshape(1, self.size, -1)
-        return call(*where, values[None], columns, self._symbol).reshape(b.shape)
+        x = call(*where, values[None], columns, self._symbol).reshape(b.shape)
+        return jnp.where(finite, x, jnp.nan)
 
     @property
     def _symbol(self) -> Array:
         return jnp.asarray(_analyzed(self).raw, jnp.uint64)
 
     @ft.cached_property
-    def _has_full_rank(self) -> bool:
-        """Whether numbers in general position make a regular matrix."""
+    def _permutation(self) -> np.ndarray | None:
+        """The values of a matrix that is a permutation; `None` if every matrix with these places is
+        singular."""
         ones = np.ones(len(self.numbers), np.int8)
         matrix = sp.csr_matrix((ones, (self.rows, self.columns)), (self.size, self.size))
-        return bool(np.all(sp.csgraph.maximum_bipartite_matching(matrix) >= 0))
+        columns = sp.csgraph.maximum_bipartite_matching(matrix, perm_type="column")
+        if np.any(columns < 0):
+            return None
+        return (columns[self.rows] == self.columns).astype(float)
 
     @ft.cached_property
     def _real_form(self) -> tuple["Places", np.ndarray]:
