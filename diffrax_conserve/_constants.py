@@ -10,8 +10,8 @@ ROUNDOFF = 16
 # about one unit each. An iteration can reduce it by chance only, so it is not corrected. Where the
 # user sets a tolerance, noise is the same share of it, an eighth.
 NOISE = 2
-# An iteration has at most this many steps, unless the user says otherwise. In a solve two are
-# usual. The rest is for steps of the solver that are much too long.
+# Newton's method makes at most this many iterations, unless the user says otherwise. In a solve two
+# are usual. More are needed after a step of the solver that is much too long.
 MAX_STEPS = 50
 # The directions of a correction are the gradients at the candidate for this many steps. Newton's
 # method converges quadratically, so a nearby candidate needs fewer. If these are not enough, the

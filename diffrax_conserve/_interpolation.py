@@ -51,12 +51,13 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     """A local interpolation whose values lie on a manifold.
 
     The interpolant `u` of the wrapped solver ends at the candidate `ŷ₁`. It is moved so that it
-    meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)`, and then projected as
-    a step is. If that fails, damped steps with fresh gradients are tried from the same state. An
-    attempt has failed too if its correction is longer than the step, and also longer than the way
-    from the start of the step. If both fail, the value is the moved interpolant itself, which is
-    off the manifold by the error of the interpolation. With bounds there is one attempt, and the
-    value is the nearest one within the bounds.
+    meets the projected states at both ends of the step, `u(θ) + θ (y₁ - ŷ₁)` after the share `θ` of
+    the step, and this state is projected like a candidate. If the projection fails, the damped
+    Newton method is tried from the same state. A projection has failed too if its correction is
+    longer than the step, and longer than the distance of the moved interpolant from the start of
+    the step. If both fail, the value is the moved interpolant itself, which is off the manifold by
+    the error of the interpolation. With bounds there is one attempt, and if it fails, the value is
+    the moved interpolant, clipped to the bounds.
 
     There is no extrapolation: a time outside the step is replaced by the nearer end.
 
@@ -64,8 +65,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     - `inner`: the interpolant `u` of the wrapped solver.
     - `direction`: -1 if the solver's time is the negative of that of the vector field, otherwise 1.
     - `shift`: the correction of the step, `y₁ - ŷ₁`.
-    - `limit`: the length of the step in the metric, which a correction may exceed only if the time
-      is farther than that from the start of the step.
+    - `limit`: the length of the step in the metric, which a correction may exceed only if the moved
+      interpolant is farther than this from the state at the start of the step.
     - `error`: the error estimate of the step, if the projection uses it.
     - `target`: what the projection of the step aimed at, without the balances of the step itself.
     """
@@ -123,7 +124,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # A condition that is the same for all lanes of a batch remains a branch, which is skipped
         # if no lane needs it.
         found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
-        # Its derivative is that of the interpolant.
+        # The derivative of the second attempt is that of the interpolant.
         nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
         return lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
 from .._tree import without_pattern
 from .asdex_import import asdex
-from .sparse import _constants, _content, _entries
+from .detection import constants_of, content_key, jacobian_places
 
 # A perturbation in the imaginary part of a real matrix. Its square is below the roundoff of any
 # element, so that it changes no real part.
@@ -239,11 +239,11 @@ def sparse_jacobian(fn: Callable[[Array], Array], x: Any) -> SparseJacobian | No
     """The places of the Jacobian of a function of a vector like `x`; `None` if they cannot be
     found. Constants of the function that JAX traces may have any values."""
     traced = jax.make_jaxpr(fn)(jax.ShapeDtypeStruct(x.shape, x.dtype))
-    key = str(traced.jaxpr), *map(_content, _constants(traced))
+    key = str(traced.jaxpr), *map(content_key, constants_of(traced))
     if key not in _KNOWN:
         with jax.ensure_compile_time_eval():
             try:
-                rows, columns = _entries(traced, x)
+                rows, columns = jacobian_places(traced, x)
             except NotImplementedError:  # an operation that asdex does not know
                 _KNOWN[key] = None
             else:

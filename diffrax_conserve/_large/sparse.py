@@ -12,19 +12,18 @@ when a solve is traced, and everything that depends on it is an array of integer
   by cyclic reduction: each step eliminates every other block, for all of them at once.
 - *Dense rows.* An energy or a momentum depends on all components. A few such rows beside the sparse
   ones are eliminated last, by their Schur complement.
-- Where the blocks would be too large, as in a membrane, the system is solved by iteration, if it
-  is too large for a dense matrix too.
+- Where the blocks would be too large, as in a membrane, and the system is too large for a dense
+  matrix too, it is solved by KLU, or by iteration where that is missing: on a GPU and in float32.
 """
 
 import functools as ft
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.core
-import jax.extend.core as jex
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -41,10 +40,11 @@ from .._constants import (
     MAX_DENSE_SYSTEM,
     REGULARISATION_POWER,
 )
-from .._fast.jaxprs import jaxprs_inside
 from .._numerics.linear import Solve
 from .._numerics.rows import AbstractGram, AbstractRows
 from .asdex_import import asdex, reason
+from .detection import constants_of, content_key, jacobian_places
+from .klu import Places, available
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
@@ -54,7 +54,7 @@ class Pattern:
     """The places of the elements of a sparse Jacobian. It is equal only to itself, because equal
     functions share one.
 
-    Places are integers, and arrays of them have a number past the end where there is nothing.
+    A place is an index. In an array of places an index past the end marks an empty place.
 
     - `size`, `num_columns`: the numbers of rows and of columns.
     - `colours`: for each entry of the manifold the colour of each row, and their number.
@@ -70,7 +70,7 @@ class Pattern:
       place of the element in an array shaped like `owners`.
     - `overlap`: the number of each component of a block among those of the next block; `None` if
       blocks are not coupled.
-    - `iterative`: whether the Gram matrix is too wide for blocks. Then each row is a block.
+    - `wide`: whether the Gram matrix is too wide for blocks. Then each row is a block.
     """
 
     def __init__(self, shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray):
@@ -86,7 +86,7 @@ class Pattern:
         self.owners = np.full((len(self.sparse_colours), width), self.size)
         self.owners[colour, columns - self.active.start] = rows
         order, block, coupled = self._ordered(rows, columns)
-        self.iterative = block == 0
+        self.wide = block == 0
         self.rows, self.places = self._placed(order, max(block, 1))
         stored = colour * width + columns - self.active.start
         self.elements, self.overlap = self._in_blocks(rows, columns, stored, coupled)
@@ -157,8 +157,35 @@ class Pattern:
         overlap[pairs // n, number] = np.where(pairs[after] == pairs + n, number[after], size)
         return elements, overlap
 
+    @ft.cached_property
+    def gram_places(self) -> tuple[Places, np.ndarray, np.ndarray, np.ndarray]:
+        """The places of the Gram matrix of the sparse rows; for each place the elements of both
+        rows in the components that they share, as places in an array shaped like `owners`; and the
+        places on the diagonal."""
+        colour, columns = np.nonzero(self.owners < self.size)
+        rows = self.places[self.owners[colour, columns]]
+        stored = colour * self.owners.shape[1] + columns
+        order = np.argsort(columns, kind="stable")
+        rows, columns, stored = rows[order], columns[order], stored[order]
+        # Each element is paired with all elements of its column.
+        counts = np.bincount(columns)
+        starts, number = (np.cumsum(counts) - counts)[columns], counts[columns]
+        first = np.repeat(np.arange(len(rows)), number)
+        rank = np.arange(len(first)) - np.repeat(np.cumsum(number) - number, number)
+        second = np.repeat(starts, number) + rank
+        places = Places(rows[first], rows[second], self.rows.size)
+        place = places.index(rows[first], rows[second])
+        order = np.argsort(place, kind="stable")
+        place, first, second = place[order], first[order], second[order]
+        shared = np.bincount(place)
+        rank = np.arange(len(place)) - (np.cumsum(shared) - shared)[place]
+        elements = np.full((2, len(shared), shared.max()), self.owners.size)
+        elements[:, place, rank] = stored[first], stored[second]
+        on_diagonal = places.index(*2 * [np.arange(self.rows.size)])
+        return places, elements[0], elements[1], on_diagonal
+
     def taken_apart(self, x: Float[Array, " m"]) -> tuple[Array, Array]:
-        """A number for each row as those for the rows of the blocks, and those for dense rows."""
+        """The elements of a vector for the rows in the blocks, and those for the dense rows."""
         return _take(x, self.rows), x[self.dense_rows]
 
     def joined(self, blocks: Array, dense: Array) -> Float[Array, " m"]:
@@ -209,12 +236,12 @@ def pattern_of(
         return None
     # Equal functions have equal jaxprs and equal constants.
     traced = [jax.make_jaxpr(part)(y) for part in parts]
-    keys = tuple((str(x.jaxpr), *map(_content, _constants(x))) for x in traced)
+    keys = tuple((str(x.jaxpr), *map(content_key, constants_of(x))) for x in traced)
     if keys not in _KNOWN:
         with jax.ensure_compile_time_eval():
             try:
-                found = [(size, _entries(x, y)) for size, x in zip(sizes, traced, strict=True)]
-                _KNOWN[keys] = _sparse((m, n), found)
+                found = [jacobian_places(x, y) for x in traced]
+                _KNOWN[keys] = _sparse((m, n), list(zip(sizes, found, strict=True)))
             except NotImplementedError:  # an operation that asdex does not know
                 _KNOWN[keys] = None
     pattern = _KNOWN[keys]
@@ -226,51 +253,15 @@ def pattern_of(
             "not take it from `args`.",
             stacklevel=2,
         )
-    # An iteration does not cope with constraints that depend on each other, as the rigid bodies of
-    # an over-constrained mechanism have them, and the factors of a dense matrix do.
-    if pattern is not None and pattern.iterative and m + n <= MAX_DENSE_SYSTEM:
+    # For constraints that depend on each other, as in an over-constrained mechanism, the factors of
+    # a dense matrix are more robust than sparse ones and than an iteration.
+    if pattern is not None and pattern.wide and m + n <= MAX_DENSE_SYSTEM:
         return None
     return pattern
 
 
 # The patterns that were found, by their functions. Detection takes seconds for large systems.
 _KNOWN: dict[Any, Pattern | None] = {}
-
-
-def _constants(closed: Any) -> Iterator[Any]:
-    """The arrays over which a jaxpr and those inside it close, which their text does not show."""
-    yield from closed.consts
-    for eqn in closed.jaxpr.eqns:
-        yield from (x.val for x in eqn.invars if isinstance(x, jex.Literal) and np.ndim(x.val))
-        for inside in jaxprs_inside(eqn):
-            yield from _constants(inside)
-
-
-def _content(x: Any) -> Any:
-    """A key for a constant of a function. The value of a tracer is not known, only its shape."""
-    if isinstance(x, jax.core.Tracer):
-        return x.shape, x.dtype
-    return np.shape(x), np.asarray(x).tobytes()
-
-
-def _entries(closed: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The rows and columns of the elements of a Jacobian that can differ from zero.
-
-    Constants of which the values are not known, because they are tracers, become arguments of the
-    function: the pattern is one for all their values.
-    """
-    unknown = [i for i, x in enumerate(closed.consts) if isinstance(x, jax.core.Tracer)]
-
-    def fn(y: Array, *others: Array) -> Array:
-        consts = list(closed.consts)
-        for i, x in zip(unknown, others, strict=True):
-            consts[i] = x
-        return jex.jaxpr_as_fun(jex.ClosedJaxpr(closed.jaxpr, consts))(y)[0]
-
-    like = [closed.consts[i] for i in unknown]
-    others = [np.zeros(x.shape, x.dtype) for x in like]
-    found = asdex().jacobian_sparsity(fn, np.zeros(y.shape, y.dtype), *others)
-    return np.asarray(found.rows), np.asarray(found.cols)
 
 
 def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
@@ -368,7 +359,7 @@ class SparseRows(AbstractRows):
             columns(others.dense),
             rows(self.dense),
             jnp.sum(self.dense[:, None] * others.dense[None], axis=2),
-            (self, others) if pattern.iterative else None,
+            (self, others) if pattern.wide else None,
             pattern,
         )
 
@@ -381,7 +372,7 @@ class BlockGram(AbstractGram):
       in those of the next; `None` if blocks are not coupled.
     - `columns`, `rows`, `corner`: the products of sparse rows with dense ones, of dense rows with
       sparse ones, and of dense rows.
-    - `factors`: `U` and `V` themselves, if the system is solved by iteration.
+    - `factors`: `U` and `V` themselves, if the matrix is too wide for blocks.
     """
 
     diagonal: Float[Array, "blocks block block"]
@@ -392,9 +383,6 @@ class BlockGram(AbstractGram):
     corner: Float[Array, "dense dense"]
     factors: tuple[SparseRows, SparseRows] | None
     pattern: Pattern = eqx.field(static=True)
-
-    def __len__(self) -> int:
-        return self.pattern.size
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
         if self.factors is not None:
@@ -421,36 +409,60 @@ class BlockGram(AbstractGram):
         diagonal = jnp.where(eye, unit, self.diagonal)
         if self.factors is None:
             sparse = _reduced(diagonal, self.following, self.preceding)
+        elif available(diagonal.dtype):
+            sparse = self._by_klu(diagonal)
         else:
             sparse = jtu.Partial(_iterated, self, diagonal)
         if not len(self.corner):
-            return jtu.Partial(ft.partial(_without_dense_rows, self.pattern), sparse)
+            return BlockFactors(sparse, None, self.pattern)
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
-        least = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
-        halves = _halves((corner + added * jnp.diag(least))[None])
-        solve = ft.partial(_with_dense_rows, self.pattern)
-        return jtu.Partial(solve, sparse, self.rows, eliminated, halves)
+        size = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
+        halves = _halves((corner + added * jnp.diag(size))[None])
+        return BlockFactors(sparse, (self.rows, eliminated, halves), self.pattern)
+
+    def _by_klu(self, diagonal: Array) -> Solve:
+        """The solution for sparse rows by KLU. A matrix that it cannot factor gives NaN."""
+        places, first, second, on_diagonal = self.pattern.gram_places
+        assert self.factors is not None
+        left, right = self.factors
+        values = jnp.sum(_take(left.colours, first) * _take(right.colours, second), axis=1)
+        values = values.at[on_diagonal].set(diagonal.reshape(-1))
+        values = jnp.where(places.is_regular(values), values, jnp.nan)
+        return KluFactors(values, places)
 
 
-def _without_dense_rows(pattern: Pattern, sparse: Solve, b: Float[Array, " m"]) -> Array:
-    return pattern.joined(sparse(pattern.taken_apart(b)[0]), b[:0])
+class KluFactors(eqx.Module):
+    """The elements of a sparse matrix, called with the right side of a system."""
+
+    values: Float[Array, " k"]
+    places: Places = eqx.field(static=True)
+
+    def __call__(self, b: Float[Array, "m 1"]) -> Float[Array, "m 1"]:
+        return self.places.solve_regular(self.values, b.reshape(-1)).reshape(b.shape)
 
 
-def _with_dense_rows(
-    pattern: Pattern,
-    sparse: Solve,
-    rows: Array,
-    eliminated: Array,
-    halves: tuple[Array, Array],
-    b: Float[Array, " m"],
-) -> Float[Array, " m"]:
-    blocks, dense = pattern.taken_apart(b)
-    blocks = sparse(blocks)
-    dense = dense - jnp.einsum("dij,ij->d", rows, blocks)
-    left, right = halves
-    dense = right[0] @ (left[0] @ dense)
-    return pattern.joined(blocks - eliminated @ dense, dense)
+class BlockFactors(eqx.Module):
+    """The factors of a Gram matrix of sparse rows, called with the right side of a system.
+
+    - `sparse`: the solution for the sparse rows alone, as a function of the right side.
+    - `last`: for dense rows their products with the sparse ones, these products times the inverse
+      of the sparse matrix, and the factors of the Schur complement.
+    """
+
+    sparse: Solve
+    last: tuple[Array, Array, tuple[Array, Array]] | None
+    pattern: Pattern = eqx.field(static=True)
+
+    def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        blocks, dense = self.pattern.taken_apart(b)
+        blocks = self.sparse(blocks)
+        if self.last is None:
+            return self.pattern.joined(blocks, dense)
+        rows, eliminated, (left, right) = self.last
+        dense = dense - jnp.einsum("dij,ij->d", rows, blocks)
+        dense = right[0] @ (left[0] @ dense)
+        return self.pattern.joined(blocks - eliminated @ dense, dense)
 
 
 def _iterated(gram: BlockGram, diagonal: Array, b: Array) -> Array:
@@ -512,16 +524,16 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     """The solution of a block tridiagonal system by cyclic reduction (G. H. Golub and C. F. Van
     Loan, *Matrix Computations*, Johns Hopkins 2013, 4.5), as a function of its right side.
 
-    The rows with odd numbers are eliminated, all at once, which leaves a block tridiagonal system
-    of half the size for those with even numbers, and so on. `following[i]` couples row `i` to block
-    `i + 1`, and `preceding[i]` couples row `i + 1` to block `i`; the last of both are zero.
+    The odd blocks are eliminated, all at once, which leaves a block tridiagonal system of half the
+    size for the even blocks, and so on. `following[i]` is the block in block row `i` and block
+    column `i + 1`, `preceding[i]` that in row `i + 1` and column `i`; the last of both are zero.
     """
     if following is None or preceding is None or len(diagonal) == 1:
         return jtu.Partial(_in_halves, *_halves(diagonal))
     if diagonal.shape[1] == 1:
         bands = (_before(preceding), diagonal, following)
         return jtu.Partial(lax.linalg.tridiagonal_solve, *(x.reshape(-1) for x in bands))
-    # If the number of blocks is odd, a block of ones is added, which is coupled to none.
+    # If the number of blocks is odd, an identity block is added, which is coupled to none.
     middle, odd = _even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
     to_right, odd_right = _even_and_odd(following)

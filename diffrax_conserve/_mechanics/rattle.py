@@ -4,9 +4,9 @@ A step kicks the velocities by half of the forces, moves the positions such that
 hold at the end (SHAKE), kicks the velocities again, and projects them to those that keep the
 constraints.
 
-The velocities at the end of a step belong to a linear system with the matrix `G M⁻¹ Gᵀ` there. The
-multipliers of the positions in the next step are found by an iteration for which the same matrix is
-good enough, because that is where the step starts. So the matrix is factored once in a step.
+The velocities at the end of a step follow from a linear system with the matrix `G M⁻¹ Gᵀ` there.
+The next step starts there, so the same matrix is good enough for the iteration that finds its
+multipliers of the positions. So the matrix is factored once in a step.
 """
 
 import dataclasses
@@ -56,9 +56,9 @@ class _Linear(eqx.Module):
 class _State(eqx.Module):
     """What the next step needs.
 
-    - `at`: the constraints at its start.
-    - `slope`: the force divided by the masses, at its start.
-    - `multiplier`: that of the last step, the first guess for the next.
+    - `at`: the constraints, linearised at its start.
+    - `slope`: the acceleration by the forces at its start, or with momenta the forces.
+    - `multiplier`: the multiplier of the last step, the guess for the next.
     - `cancellation`: the part of the scales that the gradients do not show.
     - `off`: whether the start of the solve was off the constraint, so that every step fails.
     """
@@ -212,7 +212,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         at, rate = self._linear(problem, t0, q, args, drift, ravel(v))
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
-        # and Schwarz that is the product of the lengths of a row of `G` and of `v`.
+        # and Schwarz `|∂_t g|` plus the length of a row of `G S` times the length of `S⁻¹ v`.
         squares = jax.tree.map(jnp.square, problem.factor.scale_columns(at.jacobian))
         lengths = jnp.sqrt(squares.matvec(jnp.ones_like(ravel(v))))
         limit = lengths * problem.factor.length(drift(ravel(v))) + jnp.abs(rate)
@@ -245,7 +245,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         state = dataclasses.replace(state, slope=slope)  # dense output needs it too
 
         problem = self._problem(t1, q0, args, state.cancellation)
-        kicked = _once(v + h / 2 * ravel(slope))
+        kicked = _barrier(v + h / 2 * ravel(slope))
 
         # The unknown is `h² λ / 2`, which a multiplier `λ` contributes to the positions. Unlike `λ`
         # itself it is well determined when the step is short.
@@ -257,14 +257,14 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
         displacement, found, _, _ = root(
             lambda x: problem.residual(position(x)),
-            ft.partial(_shaken, problem, position, at, q, self.max_steps),
+            ft.partial(_shake, problem, position, at, q, self.max_steps),
             state.multiplier * (h * h / 2),
             solve_dense,
         )
-        half, q1 = _once((halfway(displacement), position(displacement)))
+        half, q1 = _barrier((halfway(displacement), position(displacement)))
         y1 = unravel(q1, q0)
         slope = terms[1].vf(t1, y1, args)
-        kicked = _once(half + h / 2 * ravel(slope))
+        kicked = _barrier(half + h / 2 * ravel(slope))
         drift = self._drift(terms, t1, v0, args)
         at, rate = self._linear(problem, t1, y1, args, drift, kicked)
         v1, keeps = _on_tangent(problem, at, rate, drift, kicked)
@@ -304,11 +304,11 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         p: Array,
     ) -> tuple[_Linear, Float[Array, " m"]]:
         """The constraints at a position, and their partial derivative `∂_t g`."""
-        jacobian = _once(problem.linearise(ravel(q))[1])
+        jacobian = _barrier(problem.linearise(ravel(q))[1])
         fn = lambda t: ravel(evaluate(self.constraint, t, q, args))  # noqa: E731
         rate = jax.jvp(fn, (t,), (jnp.ones_like(t),))[1].astype(p.dtype)
-        gram = _once(lax.stop_gradient(self._gram(problem, jacobian, drift, p)))
-        return _Linear(jacobian, _once(gram.factorise())), rate
+        gram = _barrier(lax.stop_gradient(self._gram(problem, jacobian, drift, p)))
+        return _Linear(jacobian, _barrier(gram.factorise())), rate
 
 
 RATTLE.__init__.__doc__ = r"""**Arguments:**
@@ -328,7 +328,7 @@ broadcast, the state is no pair of positions and velocities that are alike, or a
 
 
 # Without a barrier XLA would evaluate an expression once for each use of it.
-_once = lax.optimization_barrier
+_barrier = lax.optimization_barrier
 
 
 def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
@@ -336,11 +336,11 @@ def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n
     return problem.factor.scale_gradient(problem.factor.scale_gradient(rows.rmatvec(multiplier)))
 
 
-def _shaken(
+def _shake(
     problem: Problem, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
 ) -> Solved:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
-    step: a step of the iteration evaluates the constraint and nothing else."""
+    step of the solver: an iteration evaluates the constraint and nothing else."""
     # The residuals are compared with their scales at the start of the step, for coordinates as
     # large as at either end.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
@@ -348,15 +348,16 @@ def _shaken(
     _, moves = jax.linearize(position, guess)
 
     def change(g: Array) -> Array:
-        """Off the manifold constraints that depend on each other contradict each other a little.
-        Then the solution has a large part that moves nothing, but whose roundoff does. So we solve
-        once more, for the change of the constraints that the solution causes: in that there is no
-        contradiction. Up to four constraints have no such part."""
+        """Off the manifold, constraints that depend on each other contradict each other a little.
+        Then the solution has a large part in the null space of `Gᵀ`, which moves nothing, but whose
+        roundoff does. So we solve once more, with the change of the constraints that the solution
+        causes as the right side, which has no contradiction. For up to four constraints the
+        solution has no such part."""
         x = solve(g)
         return x if len(g) <= WRITTEN_OUT else solve(at.jacobian.matvec(moves(x)))
 
     def advance(x: Array, counter: Array) -> tuple[Array, Array]:
-        g = _once(problem.residual(_once(position(x))))
+        g = _barrier(problem.residual(_barrier(position(x))))
         level, _ = problem.level(g, scale)
         counter = after_test(level, counter)
         return keep_done(counter, x - change(g), x), counter

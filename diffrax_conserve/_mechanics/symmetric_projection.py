@@ -256,7 +256,7 @@ def _solved(
         g, jacobian = end.linearise(now.y)
         rows = end.factor.scale_columns(jacobian)
         level, wrong = end.level(g, end.scale(jacobian, now.y))
-        # What the gradients at the end itself change in the equation for the state.
+        # The residual of the equation for the state, with the gradients at that state.
         defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
         off = end.factor.length(defect) / (eps * end.factor.length(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)

@@ -77,9 +77,10 @@ class MultiplierSystem(AbstractSystem):
     the step of a solve it is of no use there: the candidate moves nearly along the manifold by
     itself. So a constraint whose gradient has an angle to the span of the others with a squared
     sine of at most `√ε` takes no part in the derivative, or little if there are more than four; see
-    `linear`. The derivative then has the accuracy of the wrapped solver in that direction. After
-    more than `FROZEN_STEPS` steps the directions were those at several states; the derivative is by
-    those at the candidate all the same, which differ by the size of the correction.
+    `rows`. The derivative then has the accuracy of the wrapped solver in that direction. After more
+    than `FROZEN_STEPS` iterations the corrections were along the gradients at several states. The
+    derivative uses the gradients at the candidate all the same, which differ from them by terms of
+    the size of the correction.
 
     The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
     times a tangent that is not finite would be NaN. So where nothing was found we differentiate at
@@ -138,9 +139,9 @@ class MultiplierSystem(AbstractSystem):
         t_y, t_g = (-x for x in right)
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        heights, rows = problem.factor.scale_columns(problem.linearise(y)[1]).unit()
+        row_norms, rows = problem.factor.scale_columns(problem.linearise(y)[1]).unit()
         along, least = self._along(start).unit()[1], rows.least_pivot()
-        change = rows.gram(along).row_space_correction(along, t_g / heights, least=least)
+        change = rows.gram(along).row_space_correction(along, t_g / row_norms, least=least)
         return t_y - problem.factor.to_state(change)
 
 
@@ -192,8 +193,8 @@ def root(
 ) -> Solved:
     """The root of `residual` that `iterate(guess)` finds, for unknowns that are an array or a
     PyTree of them. Its derivative is by the theorem, with `solve(matrix, vector)` for linear
-    systems, whose matrix is `jacobian(residual)(unknowns)`, flat. The arrays over which the functions close, such as parameters, have their derivatives
-    too."""
+    systems, where the matrix is `jacobian(residual)(unknowns)` with flat unknowns. The arrays over
+    which the functions close, such as parameters, have their derivatives too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
     return solution(SquareSystem(residual, iterate, guess, solve, jacobian))
 

@@ -1,16 +1,16 @@
-"""The iterations that lead to the manifold: one loop, and what a step of it may do.
+"""The iterations that lead to the manifold: one loop, and the steps that it can make.
 
-All are Newton's method, for equations that have at least as many unknowns as there are equations.
-They differ in what a step does, so a step is a function of the unknowns and of a counter, and the
-loop around it is written once, in `iterate`.
+All are Newton's method, for at least as many unknowns as equations. They differ in their steps, so
+a step is a function of the unknowns and of a counter, and the loop around it is written once, in
+`iterate`. In this file a step is one of an iteration, unless it is called a step of the solver.
 
 - `simplified_newton` is for candidates as near as the local error of a solver's step (Hairer,
   Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
   is on the manifold, for the candidate `ŷ`, the factor `S` of the metric `M⁻¹ = S Sᵀ`, and the
   gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
-  see `implicit`. The matrix `G(y) S Uᵀ` of a step is that at the last state, so that the iteration
-  is Newton's method. With many constraints it is that at the candidate.
+  see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
+  last state, so that the iteration is Newton's method; for more it is evaluated at the candidate.
 - `projected_newton` is `simplified_newton` within bounds.
 - `damped_newton` is for starts far away. Each step is the shortest, in the metric, that solves the
   equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
@@ -119,8 +119,8 @@ def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
 
 
 def after_step(settled: Array, hopeful: Array, counter: Array) -> Array:
-    """As `after_test`, for an iteration that judges a step by its length and takes it in any case:
-    whether it was so short that this is the last, and whether another would make sense."""
+    """The counter after a step, in an iteration that tests not the unknowns but the lengths of its
+    steps: `settled` if the step was so short that it is the last, `hopeful` if another may help."""
     then = jnp.where(settled, 0, jnp.where(hopeful & (counter > 1), counter - 1, -1))
     return jnp.where(counter > 0, then, counter).astype(counter.dtype)
 
@@ -185,20 +185,20 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         order = order_of(rows.gram(along).matrix)
         return order, in_order(order, along.matrix)
 
-    def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
-        order, at_candidate = known
-        seen = problem.linearise(y)
+    def advance(common: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+        order, at_candidate = common
+        linearised = problem.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
-        g, jacobian = seen if lanes else lax.optimization_barrier(seen)
+        g, jacobian = linearised if lanes else lax.optimization_barrier(linearised)
         level, wrong = problem.level(g, problem.scale(jacobian, y))
         sizes, rows = scaled(jacobian)
         rows, wrong = in_order(order, rows.matrix), in_order(order, wrong / sizes)
-        fresh = directions is None and max_steps > FROZEN_STEPS
+        may_switch = directions is None and max_steps > FROZEN_STEPS
         # In each step the counter goes down by one, but before the last step, which polishes, the
         # test sets it to two. So we look at it before the test. Should the last step leave the
         # tolerance, the one that tries to return is along the gradients at its state.
         frozen = counter > max_steps + 1 - FROZEN_STEPS
-        along = jnp.where(frozen, at_candidate, rows) if fresh else at_candidate
+        along = jnp.where(frozen, at_candidate, rows) if may_switch else at_candidate
         counter = after_test(level, counter)
         # A step that only polishes is as long as roundoff over the sine of the angle between
         # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
@@ -316,10 +316,10 @@ def projected_newton(
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
 
-    If the constraints are linear, their residuals are the gradient of a function of the multipliers
-    that is convex and has kinks, where components reach their bounds. Newton's method for its
-    minimum may go round in a circle if it makes full steps across kinks. So each step goes to the
-    minimum along its direction, where the slope changes its sign.
+    If the constraints are linear, their residuals are the gradient of a convex function of the
+    multipliers. Where components reach their bounds, this gradient has kinks, and Newton's method
+    for the minimum may cycle if it makes full steps across them. So each step goes to the minimum
+    of the function along the step.
     """
 
     def advance(z: Array, counter: Array) -> tuple[Array, Array]:
@@ -338,21 +338,21 @@ def projected_newton(
 
 
 def _share(problem: Problem, z: Array, multiplier: Array, change: Array, goes_on: Array) -> Array:
-    """The share of a step at which the convex function is least, by bisection of its slope along
-    the step, which is the product of the residuals with the step of the multipliers."""
+    """The share of a Newton step at which the convex function is least, by bisection of its descent
+    along the step, the product of the residuals with what is subtracted from the multipliers."""
 
-    def slope(share: Array | float) -> Array:
+    def descent(share: Array | float) -> Array:
         return jnp.sum(multiplier * problem.residual(z - share * change))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2
-        further = slope(middle) >= 0
+        further = descent(middle) >= 0
         return jnp.where(further, middle, ends[0]), jnp.where(further, ends[1], middle)
 
-    # A step in full is kept if it goes hardly past the minimum. If a component at its bound is what
-    # a step would move, the step is too long by one over `AT_BOUND`.
+    # A full step is kept if it goes hardly past the minimum. If all components that it moves are
+    # beyond their bounds, where `clip` has the derivative `AT_BOUND`, the step is far too long.
     ends = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
-    in_full = (slope(1.0) >= -(AT_BOUND**0.5) * slope(0.0)) | ~goes_on
+    in_full = (descent(1.0) >= -(AT_BOUND**0.5) * descent(0.0)) | ~goes_on
     bisected = lambda: lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, ends)[1]  # noqa: E731
     share = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
     return jnp.where(in_full, ends[1], share)

@@ -40,7 +40,7 @@ def iterative_refinement(
     return x
 
 
-# For each two places, from the second on, whether the constraints there are exchanged.
+# For each pair of places, without the first place, whether their constraints are exchanged.
 Order = tuple[Bool[Array, ""], ...]
 
 
@@ -52,34 +52,34 @@ def forward_elimination(
     least: float | Array | None = None,
     ordered: bool = False,
 ) -> tuple[Array, Array, Order]:
-    """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination, and its
-    order. The combination of the first with the numbers of the second is `rowsᵀ gram⁻¹ b`.
+    """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination, and the
+    order of the pivots. The transpose of the first times the second is `rowsᵀ gram⁻¹ b`.
 
-    Relative to the squares of the lengths of rows the pivots are the squares of the sines of the
-    angles between the gradient of each constraint and those before it. Next is always the
-    constraint with the largest of them: if a nearly parallel one came earlier, its roundoff would
-    be magnified in the pivots of those that could replace it. What is given may be `ordered` in
-    this way already. A pivot of at most `least` of the diagonal, by default roundoff, counts as
-    infinite, so that its multiplier is zero."""
+    Divided by the element on the diagonal of `gram`, the pivot of a constraint is the squared sine
+    of the angle between its gradient and the span of the gradients before it. The next constraint
+    is that with the largest: if a nearly parallel gradient came earlier, its roundoff would be
+    magnified in the pivots of those that could replace it. The arguments may be `ordered` in this
+    way already. A pivot of at most `least` times the element on the diagonal, by default roundoff,
+    counts as infinite, so that its multiplier is zero."""
     m = len(gram)
     least = roundoff_pivot(gram.dtype) if least is None else least
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
-    right, sides, order = list(b), list(rows), []
+    right, reduced, order = list(b), list(rows), []
     for k in range(m):
         for i in range(k + 1, m) if k and not ordered else ():  # at first all are equal
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             order.append(larger)
-            for each in (*matrix[k:], matrix, size, right, sides):
+            for each in (*matrix[k:], matrix, size, right, reduced):
                 _exchange(each, k, i, larger)
         pivot = jnp.where(jnp.abs(matrix[k][k]) > least * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
-            right[i], sides[i] = right[i] - below * right[k], sides[i] - beside * sides[k]
+            right[i], reduced[i] = right[i] - below * right[k], reduced[i] - beside * reduced[k]
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         right[k] = right[k] / pivot
-    return jnp.stack(sides), jnp.stack(right), tuple(order)
+    return jnp.stack(reduced), jnp.stack(right), tuple(order)
 
 
 def order_of(gram: Float[Array, "m m"]) -> Order:

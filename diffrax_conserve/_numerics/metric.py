@@ -1,8 +1,8 @@
 """The metric `M` of a projection, in the form of a factor `S` of its inverse, `M⁻¹ = S Sᵀ`.
 
 Projections never use `M` itself. For weights `S` is a diagonal matrix. For parts of the state that
-have a matrix it is made from a Cholesky factor. And a metric may prefer the directions in which a
-step has moved, so that a correction keeps what these directions keep.
+have a matrix it is made from a Cholesky factor. And a metric may prefer corrections in the span of
+the last changes of the state, so that linear functions that these do not change are conserved.
 """
 
 import abc
@@ -49,7 +49,7 @@ class AbstractFactor(eqx.Module):
 
     @abc.abstractmethod
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`S change`, the change of the state that is `change` when the metric measures it."""
+        """`S change`, for a change in the coordinates in which the metric is Euclidean."""
 
     @abc.abstractmethod
     def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -138,10 +138,10 @@ class Preferring(AbstractFactor):
     """The factor `S (P + δ (1 - P))`, where `S` is the factor of another metric, the `own` one, and
     `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, as measured by `S`.
 
-    In this metric a correction leaves the span only where nothing within it reaches the manifold,
-    because outside of the span it is longer by `1/δ`. The square of `δ`, its share in `M⁻¹`, is
-    what is added to the diagonal of a large matrix too, and for the same reason: so that a system
-    can be solved that the span alone leaves singular.
+    In this metric a correction leaves the span only where none within it reaches the manifold,
+    because lengths outside of the span are multiplied by `1/δ`. The Gram matrix of the span alone
+    may be singular. So `δ²`, the weight in `M⁻¹` of the complement, is the power of roundoff that
+    is added to the diagonal of a large Gram matrix too.
     """
 
     own: AbstractFactor
@@ -150,10 +150,11 @@ class Preferring(AbstractFactor):
 
     @classmethod
     def along(cls, own: AbstractFactor, changes: Float[Array, "k n"]) -> "Preferring":
-        """With the span of given changes of the state, by the Gram-Schmidt process. Each change is
-        made orthogonal to the others twice, because once would leave roundoff in the ratio of its
-        length before and after. If no more than a share `δ` of it is new, it is left out: the new
-        part has too few digits to keep what the others keep."""
+        """Prefers the span of given changes of the state, by the Gram-Schmidt process. Each change
+        is made orthogonal to those before it twice, because the roundoff that is left after the
+        first time grows with the ratio of its lengths before and after. If at most a share `δ` of
+        the change is new, it is left out: the new part has too few digits to conserve what the
+        other changes conserve."""
         changes = jax.vmap(own.to_metric)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
@@ -196,8 +197,8 @@ def _outside(dtype: Any) -> float:
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:
-    """`metric`, checked now as far as its values are known. The weights of a tracer are checked at
-    run time, and functions where they are called."""
+    """`metric`, checked now as far as its values are known. Weights that are tracers are checked at
+    run time. Of the values of functions only the shape is checked, where they are called."""
 
     def check(weight: Any) -> Any:
         if callable(weight):

@@ -7,10 +7,9 @@ as zero. The roundoff of a residual is proportional to the size of the terms tha
 *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
 in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
 no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
-measures them, and they are added as the *cancellation* of the scale. And a component that has moved
-by `c_k` is known to roundoff of `c_k` only, which matters where the component itself vanishes, as
-on `q[0] = 0`. So in the step of a solve its size counts as `|y_k| + c_k`, with its change in the
-step.
+measures them, and they are added as the *cancellation* of the scale. A component that has changed
+by `c_k` in a step of the solver is known to roundoff of `c_k` only, which matters where it vanishes
+itself, as on `q[0] = 0`. So in a step of the solver its size counts as `|y_k| + c_k`.
 """
 
 import dataclasses
@@ -37,8 +36,8 @@ from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
-# within; all are so small that only chance could make them smaller. They are ordered such that the
-# level of a state is the minimum over its residuals.
+# within their tolerances; all are noise. They are ordered such that the level of a state is the
+# minimum over its residuals.
 NOT_FINITE, ABOVE_TOLERANCE, WITHIN_TOLERANCE, AT_ROUNDOFF = -1, 0, 1, 2
 # The residuals of one entry of a manifold, as a function of the vector of the state.
 Residual = Callable[[Float[Array, " n"]], Float[Array, " k"]]
@@ -152,8 +151,8 @@ class Problem(eqx.Module):
     def level(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """The level of a state, from `NOT_FINITE` to `AT_ROUNDOFF`, and what is to be corrected:
-        the residuals, but for those that are noise. The residuals and their scales are given."""
+        """The level of a state with these residuals and scales, from `NOT_FINITE` to `AT_ROUNDOFF`,
+        and the residuals that are to be corrected, with zeros for those that are noise."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
         # A tolerance that has underflowed would be met by a residual that has underflowed too,

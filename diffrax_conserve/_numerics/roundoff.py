@@ -60,8 +60,8 @@ def cancellation_scale(
     gradients do not show.
 
     That part is measured once, at the start of a solve, and added to the scale at every state.
-    Where value and gradient show more at the start, the part is zero: otherwise it would contain
-    what the gradient shows there, and add it again, or add it where there is nothing.
+    Where the value and the gradient at the start give a larger scale, the part is zero: otherwise
+    roundoff that the gradient shows would be counted twice, or at states that do not have it.
     """
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)

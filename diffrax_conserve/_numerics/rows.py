@@ -4,19 +4,20 @@ A projection needs few operations with them, which are two interfaces, `Abstract
 `AbstractGram`. Here are those of dense rows; sparse ones are in `_large.sparse`.
 
 Gram matrices are singular where constraints depend on each other, as when an integral is given
-twice. Their multipliers are then not determined, but what they move is, if the constraints do not
+twice. The multipliers are then not unique, but the correction is, if the constraints do not
 contradict each other. There are three ways to solve such a system.
 
-- Up to four constraints are eliminated one after the other, written out in scalars, and next always
-  the one whose gradient is farthest from a combination of those before it. Once it is such a
-  combination, its pivot is roundoff. We give it the multiplier zero: if the others hold, it holds
-  too. Gradients that are only nearly parallel are all kept, because a correction needs the
-  direction in which they differ. A derivative does not, and would lose its digits in that
-  direction; see `implicit`. Nor, below double precision, does a step that only polishes; see
-  `iterate`.
-- More are factored by LAPACK, with a share of the diagonal added, so that no pivot vanishes. In a
-  derivative the share is the least pivot that counts: what is smaller has nearly no effect.
-- A sparse matrix is factored in blocks, with the same share in a derivative too.
+- Up to four constraints: Gaussian elimination with pivots from the diagonal, written out in
+  scalars. The next constraint is that whose gradient has the largest angle to the span of the
+  gradients before it. If the gradient is in this span, its pivot is roundoff, and the multiplier is
+  set to zero: if the other constraints hold, this one holds too. Gradients that are only nearly
+  parallel are all kept, because a correction needs the direction in which they differ. A derivative
+  does not need it, and would lose its digits in that direction; see `implicit`. Below double
+  precision, the last iteration, which only polishes, does not need it either; see `iterate`.
+- More constraints: LU factors by LAPACK, with a small share of the diagonal added, so that no pivot
+  vanishes. In a derivative the share is the least pivot that counts, so that smaller ones have
+  hardly an effect.
+- A sparse matrix: factors in blocks, with one share for corrections and derivatives.
 """
 
 import abc
@@ -98,8 +99,9 @@ class AbstractRows(eqx.Module):
         return sizes, self.divide_rows(sizes)
 
     def unit(self: Rows) -> tuple[Float[Array, " m"], Rows]:
-        """Rows of the length one, so that their pivots are squares of sines, and what they were
-        divided by. Sparse rows are those of `scaled`, because their pivots are not looked at."""
+        """What the rows were divided by, and the rows, now of the length one, so that the pivots of
+        their Gram matrix are squares of sines. Sparse rows are only `scaled`, because the pivots of
+        a sparse matrix are not compared with `least`."""
         return self.scaled()
 
     def least_pivot(self) -> float:
@@ -111,12 +113,9 @@ class AbstractRows(eqx.Module):
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
-    In all methods `least` is the least pivot that counts, by default roundoff. Sparse matrices have
-    no other.
+    In all methods `least` is the least pivot that counts, by default roundoff. Sparse matrices
+    ignore it.
     """
-
-    @abc.abstractmethod
-    def __len__(self) -> int: ...
 
     @abc.abstractmethod
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -124,9 +123,9 @@ class AbstractGram(eqx.Module):
 
     @abc.abstractmethod
     def factorise(self, *, least: float | Array | None = None) -> Solve:
-        """`(U Vᵀ)⁻¹ b` as a function of `b`, which is a PyTree of the factors. What is added to the
-        diagonal of a large matrix is an error of the solution, which `solve` removes, and so do the
-        steps of an iteration."""
+        """`(U Vᵀ)⁻¹ b` as a function of `b`, which is a PyTree of the factors. The share of the
+        diagonal that is added to a large matrix makes an error, which `solve` removes by iterative
+        refinement, and an iteration by its further steps."""
 
     def solve(
         self, b: Float[Array, " m"], *, least: float | Array | None = None
@@ -142,8 +141,8 @@ class AbstractGram(eqx.Module):
         least: float | Array | None = None,
         ordered: bool = False,
     ) -> Float[Array, " n"]:
-        """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V`, here `along`, that changes `U x` by
-        `b`. Whether the rows are `ordered`: see `forward_elimination`."""
+        """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V` that changes `U x` by `b`. `along`: the
+        rows `V`. `ordered`: see `forward_elimination`."""
         del ordered
         return along.rmatvec(self.solve(b, least=least))
 
@@ -198,16 +197,13 @@ class FewGram(AbstractGram):
 
     matrix: Float[Array, "m m"]
 
-    def __len__(self) -> int:
-        return len(self.matrix)
-
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
         return _combination(x, self.matrix.T)
 
     def factorise(self, *, least: float | Array | None = None) -> Solve:
         del least
         matrix, unit = _of_unit_diagonal(self.matrix)
-        one = jnp.eye(len(self), dtype=self.matrix.dtype)
+        one = jnp.eye(len(matrix), dtype=matrix.dtype)
         above, below, _ = forward_elimination(matrix, one, one)
         return _Inverses(below, above.T, unit)
 
@@ -241,9 +237,6 @@ class DenseGram(AbstractGram):
     """The Gram matrix of more rows."""
 
     matrix: Float[Array, "m m"]
-
-    def __len__(self) -> int:
-        return len(self.matrix)
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
         return _combination(x, self.matrix.T)
@@ -315,13 +308,13 @@ def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Flo
     rows of `G` and columns of `B` are taken with the length one, so that nothing depends on the
     units of the multipliers.
     """
-    heights, rows = DenseRows(matrix[n:, :n]).unit()
-    widths, along = DenseRows(matrix[:n, n:].T).unit()
+    row_norms, rows = DenseRows(matrix[n:, :n]).unit()
+    column_norms, along = DenseRows(matrix[:n, n:].T).unit()
     columns = DenseRows(rows.matrix.T)
     factors = lu_factors(matrix[:n, :n] + columns.gram(columns).matrix)
     along = DenseRows(lu_solution(factors, along.matrix.T).T)
-    second = b[n:] / heights
+    second = b[n:] / row_norms
     first = lu_solution(factors, b[:n] + rows.rmatvec(second))
     wrong = rows.matvec(first) - second
     multiplier = rows.gram(along).solve(wrong, least=rows.least_pivot())
-    return jnp.concatenate([first - along.rmatvec(multiplier), multiplier / widths])
+    return jnp.concatenate([first - along.rmatvec(multiplier), multiplier / column_norms])

@@ -97,8 +97,8 @@ class AlongLine(AbstractProjection):
             )
         # The iteration moves along `S Uᵀ λ`, for a factor `S` and a row `U` that are given. With
         # `S = diag(s)`, `s = |w|` and the dimensionless row `w / s` this is `w λ`. Where an element
-        # of `w` is zero, `s` must not be, because the derivative of the component is not, but so
-        # small that the component counts for nothing.
+        # of `w` is zero, its derivative need not be. So `s` is not zero there, but so small that
+        # the component counts for nothing.
         line = self._line(problem, candidate)
         least = float(jnp.finfo(line.dtype).tiny) ** 0.5
         s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
@@ -153,9 +153,9 @@ def _is_no_return(
 ) -> Bool[Array, ""]:
     """Whether a state on the line along a step is not the start of the step, which is on the
     manifold too. It is no solution: time would stand still. So the end of a step must be at least
-    as near to the candidate as to the start, which is `γ ≥ 1/2`. Every component tells, so the
-    largest differences will do, in any units. A saved time just after the start is another matter:
-    there the way is as short as its error."""
+    as near to the candidate as to the start, which is `γ ≥ 1/2`. All three are on one line, so that
+    the ratio of their distances is the same in every norm. A saved time is not tested, because just
+    after the start of the step the change of the state may be as small as its error."""
     assert problem.step is not None
     far = lambda x: jnp.max(jnp.abs(y - x), initial=0)  # noqa: E731
     return (far(candidate) <= far(problem.step.y0)) | (problem.t != problem.step.t1)

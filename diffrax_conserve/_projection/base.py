@@ -27,8 +27,8 @@ class AbstractProjection(Hashable):
     # Whether `Problem.step` is set. If it is, dense output stores the error estimate too, which
     # costs memory.
     sees_step: ClassVar[bool] = True
-    # Whether the correction is along the gradients of the functions, from wherever it starts. Then
-    # damped steps along them are another attempt where this one fails.
+    # Whether corrections are along the gradients of the functions, from any candidate. Then dense
+    # output tries the damped Newton method where the projection fails.
     follows_gradients: ClassVar[bool] = False
     # The tolerances, `None` for that of roundoff. No annotations, so that these are no fields.
     rtol = None

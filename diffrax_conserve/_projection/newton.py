@@ -145,14 +145,14 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions = _Conditions(given, base, lengths)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
-    fits = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
+    best_multiplier = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
     scale = problem.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 
-    def tolerance(mine: float, of_user: Any) -> Array:
-        """The tolerances of the user are for the constraints. The point is nearest to roundoff."""
-        of_user = jnp.broadcast_to(mine if of_user is None else of_user, scale.shape)
-        return jnp.concatenate([jnp.full_like(y, mine), of_user.astype(y.dtype)])
+    def tolerance(default: float, of_user: Any) -> Array:
+        """The tolerances of the user are for the constraints. The others hold to roundoff."""
+        of_user = jnp.broadcast_to(default if of_user is None else of_user, scale.shape)
+        return jnp.concatenate([jnp.full_like(y, default), of_user.astype(y.dtype)])
 
     tested = dataclasses.replace(
         problem,
@@ -164,7 +164,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         rtol=tolerance(ROUNDOFF * eps, problem.rtol),
         atol=tolerance(0.0, problem.atol),
     )
-    return conditions, jnp.concatenate([jnp.zeros_like(y), fits]), tested
+    return conditions, jnp.concatenate([jnp.zeros_like(y), best_multiplier]), tested
 
 
 def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:
@@ -181,8 +181,8 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
         left = jnp.where(found.ok, left - 1, 0)
         return jnp.where(found.ok, end, base), found.ok, count + found.num_iterations, left
 
-    # The change from the first base may be so large that its roundoff is that of another state.
-    # So we start once more, from the result: now the change is roundoff.
+    # The change from the first base may be so large that its roundoff exceeds that of the result.
+    # So we start once more, with the result as the base: now the change itself is roundoff.
     begin = first, jnp.asarray(False), jnp.asarray(0), jnp.asarray(2)
     base, ok, count, _ = lax.while_loop(lambda now: now[-1] > 0, approach, begin)
     ok = ok & still.problem.holds(still.clip(base))

@@ -94,7 +94,7 @@ def _projected(
     usable = unravel(jnp.where(jnp.isfinite(y), y, vector), candidate)
     value, jacobian, there = cancellation_scale(manifold, t, usable, args)
     # A projection may have tolerances of its own. If it reports a success, we believe it, unless
-    # there is less than half of the roundoff that it assumed.
+    # the scale at the result is less than half of the cancellation at the candidate.
     shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(ravel(usable)))
     judged = problem(there)
     ok = tree_stop_gradient(judged).holds(lax.stop_gradient(y))

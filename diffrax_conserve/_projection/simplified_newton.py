@@ -32,11 +32,12 @@ class SimplifiedNewton(AbstractNewton):
     after a long step it takes more iterations, and fails sooner. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
-    The derivative, by the implicit function theorem for $\lambda$, is exact for the returned state
-    while the corrections are along the gradients at the candidate; otherwise it is that along them
-    all the same. A constraint whose gradient has an angle to the span of the others with a sine of
-    at most $\varepsilon^{1/4}$, which is 1e-4 in float64, takes no part in it, or little if there
-    are more than four: see [Derivatives near a circular orbit][derivatives-near-a-circular-orbit].
+    The derivative, by the implicit function theorem for $\lambda$, is that of a projection along
+    the gradients at the candidate. It is exact for the returned state if all corrections were along
+    these. A constraint whose gradient has an angle to the span of the others with a sine of at most
+    $\varepsilon^{1/4}$, which is 1e-4 in float64, takes no part in the derivative, or little if
+    there are more than four: see [Derivatives near a circular
+    orbit][derivatives-near-a-circular-orbit].
 
     !!! example
 

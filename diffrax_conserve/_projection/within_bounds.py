@@ -48,8 +48,8 @@ class Bounds(eqx.Module):
         exactly at its bound has the derivative one, that from inside, unlike in `jnp.clip`."""
         lower, upper = self.lower, self.upper
         if slope:
-            nothing = z - jax.lax.stop_gradient(z)  # zero, but with the derivative one
-            lower, upper = lower + slope * nothing, upper + slope * nothing
+            zero = z - jax.lax.stop_gradient(z)  # zero, but with the derivative one
+            lower, upper = lower + slope * zero, upper + slope * zero
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
         return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
@@ -70,8 +70,8 @@ def project_within(
     `clip` is the state.
 
     The candidate may be beyond the bounds, and so may `z`. The gradients are those at the candidate
-    without the clip. A component that reaches its bound costs a step, so there may be twice as many
-    of them.
+    without the clip. A component that reaches its bound costs an iteration, so twice as many
+    iterations are allowed.
     """
     rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
     within = bounds.compose(problem)

@@ -54,13 +54,12 @@ _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED, _NO_STATE = range(1, 6)
 
 
 def is_off_manifold(problem: Problem, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a state is off the manifold by more than its tolerance, and than `√ε`, relative to
-    the sizes of the terms and of their changes in a step. An integral with a `value` of its own
-    does not count: a solve may start elsewhere. Nor does one whose gradient is not finite, as that
-    of the speed is at rest. `√ε` is usually much larger than the tolerance of a projection,
-    because initial states are often given with a few digits less. The changes count because all
-    terms may be roundoff at one state, such as those of `q · v = 0` where a component of a pendulum
-    passes zero.
+    """Whether a residual at a state exceeds its tolerance, and also `√ε` of its scale. An integral
+    with a `value` of its own does not count: a solve may start elsewhere. Nor does one whose scale
+    is NaN, as that of the speed is at rest. `√ε` is usually much larger than the tolerance of a
+    projection, because initial states are often given with a few digits less. The scale contains
+    the changes of the state in a step, because all terms may be roundoff at one state, such as
+    those of `q · v = 0` where a component of a pendulum passes zero.
     """
     g, jacobian = problem.linearise(y)
     scale = problem.scale(jacobian, y)
@@ -85,8 +84,8 @@ def failure_cause(
     too_far: BoolScalarLike = False,
     hopeless: BoolScalarLike = False,
 ) -> Int[Array, ""]:
-    """Why a step failed, 0 if it did not. `found` must be finite. `hopeless`: a shorter step would
-    hardly help."""
+    """Why a step failed, 0 if it did not. `found`: the state at its end, or the correction, which
+    must be finite. `hopeless`: a shorter step would hardly help."""
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
     finite, known = jnp.abs(jnp.sum(found)) < jnp.inf, jnp.all(jnp.isfinite(values))
     cause = jnp.where(ok, 0, jnp.where(hopeless, _NO_STATE, _NOT_REACHED))
@@ -116,9 +115,10 @@ def is_final(
 def end_of_step(
     cause: Int[Array, ""], y: PyTree[Array], result: dfx.RESULTS
 ) -> tuple[Any, dfx.RESULTS]:
-    """The state and the result of a step. The last state of a solve that failed is NaN: in a batch
-    such a lane is evaluated until the last one ends, and NaN costs no iterations. If the wrapped
-    solver has failed by itself, its own `result` is kept, unless the step could not start."""
+    """The state and the result of a step. The state at the end of a step that failed is NaN: in a
+    batch its lane is evaluated until the last lane ends, and a projection of NaN ends after one
+    iteration. If the wrapped solver has failed by itself, its own `result` is kept, unless the step
+    could not start."""
     failed = (cause > 0) & ((result == dfx.RESULTS.successful) | (cause == _START))
     result = dfx.RESULTS.where(failed, member(FIRST - 1 + cause), result)
     return jtu.tree_map(lambda y: jnp.where(cause > 0, jnp.nan, y), y), result

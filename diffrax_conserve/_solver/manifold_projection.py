@@ -47,8 +47,8 @@ from .terms import (
 )
 from .wrapper import ForwardingSolver
 
-# So many changes of the state are taken from the dense output of a step. They span the directions
-# in which it moves if it is a polynomial of at most this degree, as that of most solvers is.
+# So many changes of the state are taken from the dense output of a step. If the dense output is a
+# polynomial of at most this degree in time, as for most solvers, they span all changes in the step.
 _CHANGES = 4
 
 
@@ -255,7 +255,7 @@ class ManifoldProjection(ForwardingSolver):
     ) -> "_Proposal":
         """The step of the wrapped solver. From here on states are vectors, and times those of the
         vector field."""
-        jumped = made_jump if self._keeps_stage else True
+        jumped = made_jump if self._needs_made_jump else True
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jumped
         )
@@ -267,16 +267,16 @@ class ManifoldProjection(ForwardingSolver):
         return _Proposal(step, ravel(y1), path, error, dense_info, inner, result, sign)
 
     @property
-    def _keeps_stage(self) -> bool:
-        """Whether the wrapped solver is told of jumps only where diffrax says so.
+    def _needs_made_jump(self) -> bool:
+        """Whether the wrapped solver gets the `made_jump` of diffrax, and not `True` in every step.
 
         A solver with the property "first same as last" keeps the slope at the candidate for the
-        next step, which starts at the projected state. Told of a jump, it evaluates the slope there
-        anew. It is told so in every step, because while one lane of a batch is in its first step,
-        diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend on the
-        others. Two kinds of solvers are told what diffrax says. In an implicit method the kept
-        slope fits the last stage, which its root finder has solved; a slope at the projected state
-        would amplify the error of the root finder. `QUICSORT` refuses to be told of a jump.
+        next step, which starts at the projected state. With `made_jump=True` it evaluates the slope
+        there anew. The flag is set in every step, because while one lane of a batch is in its first
+        step, diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend
+        on the others. There are two exceptions. In an implicit method the kept slope fits the last
+        stage, which its root finder has solved; a slope at the projected state would amplify the
+        error of the root finder. `QUICSORT` refuses `made_jump=True`.
         """
         return isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
 
@@ -336,7 +336,7 @@ class ManifoldProjection(ForwardingSolver):
         info: ProjectionInfo,
         made_jump: BoolScalarLike,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-        """Why the step failed, 0 if it did not, and whether a shorter step would not be better."""
+        """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
         step, candidate = proposal.step, proposal.candidate
         cannot_start = self._cannot_start(target, state, step, made_jump)
         changes, length = component_changes(step.y0, candidate), step.t1 - step.t0
@@ -355,9 +355,9 @@ class ManifoldProjection(ForwardingSolver):
     def _cannot_start(
         self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
-        """Whether a conserved value is not finite, or a step starts off the manifold where nothing
-        has projected its state: where no step has ended, as at the start of a solve, and after a
-        jump of the vector field, with which a constraint may jump."""
+        """Whether a conserved value is not finite, or a step starts off the manifold. The second is
+        tested if the state is not the end of the last step, as at the start of a solve, and after a
+        jump of the vector field, because a constraint may jump with it."""
         lost = ~jnp.all(jnp.isfinite(state.values))
         if not any(must_start_on(entry) for _, entry in named_entries(self.manifold)):
             return lost
@@ -434,13 +434,14 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
 - `keep_linear`: whether linear functions of the state that the wrapped solver keeps, such as the
     momentum, the mass or the charge, stay conserved although `manifold` does not contain them.
     Every Runge-Kutta method keeps $c \cdot y$ for each $c$ with $c \cdot f = 0$, because its steps
-    are combinations of slopes. Then a correction is one too: it leaves the span of the changes of
-    the state in the dense output of this step and the one before only where nothing within reaches
-    the manifold. Linear entries of `manifold` are kept as without it. These are up to eight
-    directions, for a few constraints: more than eight are refused. It costs eight vectors of the
-    size of the state in memory, in dense output for each step, and their products in time; a sparse
-    Jacobian is treated as dense. Active bounds, `AlongLine`, a `ClosedForm` and the stages of
-    `Staged` that have a metric of their own ignore it.
+    are combinations of slopes. With this option corrections are combinations of slopes too, in the
+    span of the changes of the state in the dense output of this step and of the one before. They
+    leave this span only where no correction within it reaches the manifold. Linear entries of
+    `manifold` are kept in any case. The span has up to eight dimensions, so more than eight
+    constraints are refused. The option costs eight vectors of the size of the state in memory, in
+    dense output for each step, and their products in time; a sparse Jacobian is treated as dense.
+    Active bounds, `AlongLine`, a `ClosedForm` and the stages of `Staged` that have a metric of
+    their own ignore it.
 
 **Raises:**
 

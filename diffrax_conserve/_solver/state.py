@@ -56,9 +56,9 @@ def units_after(
 
     The unit of a quantity in a step is the geometric mean of its size and its change. Each alone
     misleads: a quantity may be large only because its origin is far away, and it may hardly change
-    for a while, at a turning point, or along the axis of a rotation. Where squares are exchanged,
-    as by the components of a vector of constant length, or between a place and a velocity by an
-    energy, `|y Δy|` is the same on both sides.
+    for a while, at a turning point, or along the axis of a rotation. Where the sum of two squares
+    is constant, as the length of a vector or the energy of an oscillator, `|y Δy|` is the same for
+    both.
 
     A quantity that hardly changes counts as changing by `ε` of itself. This floor is inside the
     root, so that the derivative stays finite, and the root is that of a ratio, so that nothing is
@@ -76,10 +76,10 @@ def largest_of_quantity(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
     state like `like`.
 
     Each component of a state is a quantity, with a unit of its own: here, and wherever this package
-    judges errors or drifts. There is one exception. A correction in unlike units would turn a
-    vector, such as the place of a body. So in a state of several leaves, in which unlike quantities
-    can be kept apart, each vector along the last axis of a leaf is corrected in one unit. A single
-    array may hold unlike quantities.
+    judges errors or drifts. There is one exception. If the components of a vector, such as the
+    position of a body, had different units, corrections would turn the vector. So in a state of
+    several leaves, in which unlike quantities can be kept apart, each vector along the last axis of
+    a leaf has one unit. A single array may hold unlike quantities.
     """
     if len(jtu.tree_leaves(like)) == 1:
         return x

@@ -22,15 +22,15 @@ Path = Callable[[RealScalarLike], Float[Array, " n"]]
 
 class Target(eqx.Module):
     """Everything that a projection needs except the time and the candidate. Within a step only
-    `gained` changes, by `advanced`, so that dense output can project by the target too. Times are
-    those of the vector field, and states are vectors.
+    `gained` depends on the time, see `advanced`, so that dense output uses the same target. Times
+    are those of the vector field, and states are vectors.
 
     - `like`: the shapes and dtypes of the state.
     - `values`: the conserved values at the start of the solve.
     - `cancellation`: the part of the scales that the gradients do not show.
     - `changes`: how far each component moves in the step.
-    - `factor`: that of the metric where the projection has none of its own: of the motion, or with
-      noise of the numbers of the state.
+    - `factor`: the factor of the metric where the projection has none of its own: of the metric of
+      motion, or with noise of the Euclidean one.
     - `gained`: in the first row the integrals of the rates since the start of the solve, in the
       second what rounding has added to them; `None` if no entry has a rate.
     - `preferred`: changes of the state in this step and the last one, if corrections are to stay
@@ -67,20 +67,20 @@ class Target(eqx.Module):
     def following(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
         """The target with values that a state `y` on the manifold can keep.
 
-        A balance comes to rest, for example when friction has stopped a pendulum. The integral of
-        its rate then keeps a rest of roundoff, say an energy of -1e-17, which no state has: all
+        The rate of a balance may vanish, for example when friction has stopped a pendulum. Its
+        integral then keeps an error of roundoff, say an energy of -1e-17, which no state has: all
         later projections would fail. So where the residual at the start of a step is within the
-        tolerance, but more than half of what counts as noise, the value follows the state until it
-        is that.
+        tolerance, but more than half of what counts as noise, the conserved value is moved until
+        the residual is half of what counts as noise.
         """
         if self.gained is None:
             return self
         problem, y = tree_stop_gradient((self.problem(t, y), y))
-        off, jacobian = problem.linearise(y)
+        residual, jacobian = problem.linearise(y)
         limit = problem.tolerance(problem.scale(jacobian, y))
-        within = (self.gained[0] != 0) & (jnp.abs(off) <= limit)
+        within = (self.gained[0] != 0) & (jnp.abs(residual) <= limit)
         noise = NOISE / ROUNDOFF * limit / 2
-        follow = jnp.where(within, off - jnp.clip(off, -noise, noise), 0)
+        follow = jnp.where(within, residual - jnp.clip(residual, -noise, noise), 0)
         # The next integral is added minus the second row, so that it is larger by `follow`.
         return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
 
@@ -106,6 +106,6 @@ class Target(eqx.Module):
         return dataclasses.replace(problem, factor=factor)
 
     def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:
-        """The factor of the metric of the projection."""
+        """The factor of the metric of the projection at a state, without the preference."""
         own = self.projection.metric
         return self.factor if own is None else factor_of(own, t, unravel(y, self.like), self.args)

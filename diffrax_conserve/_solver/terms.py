@@ -21,8 +21,8 @@ def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[A
 
 
 def in_field_time(terms: PyTree[dfx.AbstractTerm], *times: RealScalarLike) -> tuple[Any, ...]:
-    """The terms and times in the time of the vector field, for whoever calls no solver: below this
-    no sign is needed."""
+    """The terms and times in the time of the vector field, without the sign of diffrax. They are
+    for evaluating the vector field; a wrapped solver takes those that diffrax gives."""
     direction = time_direction(terms, times[0])
     is_term = lambda x: isinstance(x, dfx.AbstractTerm)  # noqa: E731
     bare = lambda x: x.term if isinstance(x, WrapTerm) else x  # noqa: E731
