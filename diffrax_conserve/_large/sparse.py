@@ -428,7 +428,10 @@ class BlockGram(AbstractGram):
         left, right = self.factors
         values = jnp.sum(_take(left.colours, first) * _take(right.colours, second), axis=1)
         values = values.at[on_diagonal].set(diagonal.reshape(-1))
-        values = jnp.where(places.is_regular(values), values, jnp.nan)
+        # With what was added to its diagonal, a symmetric matrix is positive definite, so that no
+        # pivot is zero. The test for other matrices takes as long as two solutions.
+        if left is not right:
+            values = jnp.where(places.is_regular(values), values, jnp.nan)
         return KluFactors(values, places)
 
 
