@@ -571,8 +571,12 @@ class ConstraintProjection(AbstractProjection):
             free = dataclasses.replace(problem, factor=Diagonal(structure.units(sizes)))
             y, info = SimplifiedNewton().solve(free, candidate)
             return y, problem.report(candidate, y, info.num_iterations, ok=info.ok)
-        y = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
-        return y, problem.report(candidate, y)
+        y, settled = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
+        info = problem.report(candidate, y)
+        # Where a force is large and the unknowns beside it are small, as a voltage is when it
+        # changes its sign, the residual does not go below the roundoff of the force, which the
+        # scale does not contain. Corrections that have converged tell more.
+        return y, problem.report(candidate, y, info.num_iterations, ok=info.ok | settled)
 
 
 @eqx.filter_jit
@@ -584,7 +588,7 @@ def _consistent(
     if structure.index == 0:
         return y, tree_all_finite(_Slopes(dae)(t, y, args))
     if moves is None and structure.index == 1:
-        found = unravel(_solved_for(dae, t, y, args, algebraic_newton), y)
+        found = unravel(_solved_for(dae, t, y, args, algebraic_newton)[0], y)
         return found, tree_all_finite(found)
     sizes = jnp.abs(lax.stop_gradient(ravel(y)))
     units = structure.units(jnp.where(sizes == 0, 1, sizes))
@@ -613,9 +617,9 @@ def _consistent(
 @eqx.filter_jit
 def _solved_for(
     dae: DAE, t: RealScalarLike, state: Y, args: Args, newton: Callable[..., Solved]
-) -> Float[Array, " n"]:
-    """The state of equations of index 1, moved without what they differentiate; NaN if Newton's
-    method finds none."""
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """The state of equations of index 1, moved without what they differentiate, NaN if Newton's
+    method finds none; and whether its corrections have converged."""
     structure, t, state = _at(dae, t, state, args)
     y = ravel(state)
     reduction = Reduction(structure, dae._equations(t, state, args), t, y)
@@ -629,7 +633,8 @@ def _solved_for(
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
     residual = small(residual, y[free])
-    return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
+    found = root(residual, ft.partial(newton, residual), y[free], divided)
+    return moved(found.y), found.ok & jnp.asarray(False if found.more is None else found.more)
 
 
 @final
