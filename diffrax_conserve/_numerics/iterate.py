@@ -55,6 +55,9 @@ from .problem import (
     relative,
 )
 
+# So many steps are in front of the loop in the lanes of a batch: Newton's method doubles the number
+# of right digits, and a solver usually proposes four or more.
+_STEPS_IN_FRONT = 2
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
 
@@ -87,6 +90,11 @@ class _Now(NamedTuple):
 
 
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
+    """As `continued`, from unknowns that were not tested."""
+    return continued(advance, _Now(y, tests(max_steps), jnp.asarray(0)))
+
+
+def continued(advance: Advance, start: _Now) -> Solved:
     """Advances the unknowns until the counter says that they are done.
 
     The counter is the number of tests that are left. The unknowns are tested before each step and
@@ -102,7 +110,6 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
         y, counter = advance(now.y, now.counter)
         return _Now(y, counter, now.num_iterations + (counter > 0).astype(int))
 
-    start = _Now(y, tests(max_steps), jnp.asarray(0))
     end = lax.while_loop(lambda now: any_lane(now.counter > 0), body, start)
     return Solved(end.y, end.counter == 0, end.num_iterations)
 
@@ -180,34 +187,17 @@ def simplified_newton(
 
 def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
-    out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
+    out in scalars, which XLA fuses to few kernels; alone it is fastest in arrays.
+
+    A loop over lanes goes on until the last of them is done, and each kernel of it passes over all.
+    So in lanes the first steps, which are enough for nearly every step of a solver, are in front of
+    the loop.
+    """
     problem, candidate, directions = given
     dtype = problem.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
-    def shared(y: Any) -> Any:
-        """What the steps share: the order in which they eliminate the constraints, and in this
-        order the directions, or the gradients at the candidate."""
-        rows = scaled_rows(problem.factor.scale_columns(problem.linearise(y)[1]))[1]
-        along = rows if directions is None else directions
-        order = order_of(gram_matrix(rows, along))
-        return order, in_order(order, along)
-
-    def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
-        order, at_candidate = known
-        seen = problem.linearise(y)
-        # Without a barrier XLA would evaluate the residuals once for each use of them.
-        g, jacobian = seen if lanes else lax.optimization_barrier(seen)
-        level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
-        rows, wrong = in_order(order, rows), in_order(order, wrong / sizes)
-        fresh = directions is None and max_steps > FROZEN_STEPS
-        # In each step the counter goes down by one, but before the last step, which polishes, the
-        # test sets it to two. So we look at it before the test. Should the last step leave the
-        # tolerance, the one that tries to return is along the gradients at its state.
-        frozen = counter > max_steps + 1 - FROZEN_STEPS
-        along = jnp.where(frozen, at_candidate, rows) if fresh else at_candidate
-        counter = after_test(level, counter)
+    def moved(y: Array, rows: Array, along: Array, wrong: Array, level: Array) -> Array:
         # A step that only polishes is as long as roundoff over the sine of the angle between
         # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
         # constraint whose gradient is more nearly parallel to others takes no part in it. In
@@ -215,18 +205,57 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         least = None
         if dtype != jnp.float64:
             least = jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        moved = y - problem.factor.to_state(
-            row_space_correction(rows, along, wrong, least=least, ordered=True)
-        )
-        return keep_done(counter, moved, y), counter
+        change = row_space_correction(rows, along, wrong, least=least, ordered=True)
+        return y - problem.factor.to_state(change)
+
+    def seen(y: Array) -> tuple[Array, Array, Array]:
+        """The level of a state, what is to be corrected there, and the gradients."""
+        g, jacobian = problem.linearise(y)
+        if not lanes:
+            # Without a barrier XLA would evaluate the residuals once for each use of them.
+            g, jacobian = lax.optimization_barrier((g, jacobian))
+        level, wrong = problem.level(g, problem.scale(jacobian, y))
+        sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
+        return level, wrong / sizes, rows
+
+    def begin(y: Any) -> tuple[Any, Any, Array, Array]:
+        """What the steps share: the order in which they eliminate the constraints, and in this
+        order the directions, or the gradients at the candidate. In lanes also the state after the
+        first steps, and its counters."""
+        rows = scaled_rows(problem.factor.scale_columns(problem.linearise(y)[1]))[1]
+        along = rows if directions is None else directions
+        order = order_of(gram_matrix(rows, along))
+        along = in_order(order, along)
+        counter, num_iterations = tests(max_steps), jnp.asarray(0)
+        if lanes:
+            for _ in range(steps := min(_STEPS_IN_FRONT, max_steps)):
+                level, wrong, rows = seen(y)
+                y = moved(y, in_order(order, rows), along, in_order(order, wrong), level)
+                num_iterations = num_iterations + (level != AT_ROUNDOFF)
+            counter = jnp.where(seen(y)[0] == AT_ROUNDOFF, 0, counter - steps).astype(counter.dtype)
+        return (order, along), y, counter, num_iterations
+
+    def advance(known: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+        order, at_candidate = known
+        level, wrong, rows = seen(y)
+        rows, wrong = in_order(order, rows), in_order(order, wrong)
+        fresh = directions is None and max_steps > FROZEN_STEPS
+        # In each step the counter goes down by one, but before the last step, which polishes, the
+        # test sets it to two. So we look at it before the test. Should the last step leave the
+        # tolerance, the one that tries to return is along the gradients at its state.
+        frozen = counter > max_steps + 1 - FROZEN_STEPS
+        along = jnp.where(frozen, at_candidate, rows) if fresh else at_candidate
+        counter = after_test(level, counter)
+        return keep_done(counter, moved(y, rows, along, wrong, level), y), counter
 
     if lanes:
-        start, step, y = written_out_loop(shared, advance, candidate, tests(max_steps))
+        begin, advance, y = written_out_loop(begin, advance, candidate)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        start, step, y = shared, advance, lax.optimization_barrier(candidate)
-    found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
+        y = lax.optimization_barrier(candidate)
+    known, *start = begin(y)
+    found = continued(ft.partial(advance, known), _Now(*start))
     return found._replace(y=joined(candidate, found.y))
 
 

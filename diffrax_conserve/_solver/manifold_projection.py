@@ -12,16 +12,17 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._balance import has_rates
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
+from .._fast.scalars import in_kernels
 from .._interpolation import MakeManifoldInterpolation, Packed
 from .._manifold import Constraint, check_manifold, named_entries
 from .._numerics.metric import Diagonal, Identity
-from .._numerics.problem import Step, component_changes, step_length
+from .._numerics.problem import Problem, Step, component_changes, step_length
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._tree import ravel, tree_add, unravel
+from .._tree import ravel, tree_add, tree_stop_gradient, unravel
 from .failure import (
     end_of_step,
     failure_cause,
@@ -332,35 +333,49 @@ class ManifoldProjection(ForwardingSolver):
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether a shorter step would not be better."""
         step, candidate = proposal.step, proposal.candidate
-        cannot_start = self._cannot_start(target, state, step)
-        changes, length = component_changes(step.y0, candidate), step.t1 - step.t0
-        time = jnp.maximum(jnp.abs(step.t1), state.first_step.astype(jnp.result_type(step.t1)))
-        final = cannot_start | is_final(length, time, changes, candidate)
         correction, too_far = y1 - candidate, jnp.asarray(False)
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_length(step.y0, candidate, metric)
             too_far = metric.length(correction) > limit
-        given = info.ok, cannot_start, state.values, correction, too_far
-        return failure_cause(*given, hopeless=is_first | final), final
+        # The last step has ended on the manifold, unless there was none, the solve continues from
+        # the `solver_state` of another one, or the vector field jumps, with which a constraint may
+        # jump.
+        #
+        # The roundoff of a residual at the end of a step is proportional to its scale there, and
+        # that to the size of a component plus its change in that step. This sum may be much smaller
+        # in the next step. Its unit is not: that is at least the smaller one of size and change,
+        # and never decreases. So in the scale at a start the unit takes the place of the change.
+        start = dataclasses.replace(target, changes=state.units).problem(step.t0, step.y0)
+        entries = [entry for _, entry in named_entries(self.manifold)]
+        fn = ft.partial(_verdict, entries)
+        times = step.t1 - step.t0, jnp.maximum(jnp.abs(step.t1), state.first_step.astype(jnp.result_type(step.t1)))
+        given = start, step.y0, candidate, y1, times, state.values, info.ok, too_far, is_first
+        return in_kernels(fn, tree_stop_gradient(given))
 
-    def _cannot_start(self, target: Target, state: State, step: Step) -> Bool[Array, ""]:
-        """Whether a conserved value is not finite, or a step starts off the manifold. The last step
-        has ended on it, unless there was none, the solve continues from the `solver_state` of
-        another one, or the vector field jumps, with which a constraint may jump.
 
-        The roundoff of a residual at the end of a step is proportional to its scale there, and that
-        to the size of a component plus its change in that step. This sum may be much smaller in the
-        next step. Its unit is not: that is at least the smaller one of size and change, and never
-        decreases. So in the scale at a start the unit takes the place of the change.
-        """
-        lost = ~jnp.all(jnp.isfinite(state.values))
-        if not any(must_start_on(entry) for _, entry in named_entries(self.manifold)):
-            return lost
-        target = dataclasses.replace(target, changes=state.units)
-        problem = target.problem(step.t0, step.y0)
-        return lost | is_off_manifold(problem, self.manifold, step.y0)
+def _verdict(
+    entries: list[Any],
+    start: Problem,
+    y0: Array,
+    candidate: Array,
+    y1: Array,
+    times: tuple[Array, Array],
+    values: Array,
+    ok: Array,
+    too_far: Array,
+    is_first: Array,
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Why a step failed, and whether a shorter one would not be better. It cannot start if a
+    conserved value is not finite, or the state is off the manifold."""
+    cannot_start = ~jnp.all(jnp.isfinite(values))
+    if any(map(must_start_on, entries)):
+        cannot_start = cannot_start | is_off_manifold(start, entries, y0)
+    length, time = times
+    final = cannot_start | is_final(length, time, component_changes(y0, candidate), candidate)
+    given = ok, cannot_start, values, y1 - candidate, too_far
+    return failure_cause(*given, hopeless=is_first | final), final
 
 
 def first_changes(
