@@ -158,15 +158,16 @@ def in_kernels(fn: Callable[..., Any], given: Sequence[Any]) -> Any:
 
 
 def written_out_loop(
-    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array
+    starts: Sequence[Callable[[Any], Any]], advance: Callable[..., Any], y: Array
 ) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
     """The functions of a loop, `known, y, counter, *_ = start(y)` and `y, counter = advance(known,
-    y, counter)`, in scalars, with `y` as a tuple of them. They are given back as they are if one is
-    too large."""
-    starts, advances = in_scalars(start, y), in_scalars(advance, *jax.eval_shape(start, y)[:3])
-    if starts is None or advances is None:
-        return start, advance, y
-    return starts, advances, components(y)
+    y, counter)`, in scalars, with `y` as a tuple of them, and with the first of several `starts`
+    that is not too large. The last one and `advance` are given back as they are if they are."""
+    in_loop = in_scalars(advance, *jax.eval_shape(starts[-1], y)[:3])
+    begin = (x for start in starts if (x := in_scalars(start, y)) is not None)
+    if in_loop is None or (first := next(begin, None)) is None:
+        return starts[-1], advance, y
+    return first, in_loop, components(y)
 
 
 def components(x: Array) -> Any:
@@ -323,16 +324,15 @@ def _once(fn: Callable[[Array], Array], x: Array) -> Array:
 
 
 def _materialised(x: Array) -> Array:
-    """`x`, for which XLA makes a kernel: it is divided by a 1 that XLA cannot simplify away, because
-    `x` might be NaN."""
+    """`x`, for which XLA makes a kernel: it is divided by a 1 that XLA cannot simplify away,
+    because `x` might be NaN."""
     return x / jnp.where(x == x, 1, 2).astype(x.dtype)
 
 
 # The primitives that XLA considers expensive, so that it does not compute them again.
-_EXPENSIVE = frozenset(
-    """acos acosh asin asinh atan atan2 atanh cbrt cosh div erf erf_inv erfc exp exp2 expm1 lgamma
-    log log1p logistic pow rem rsqrt sinh sqrt tan tanh""".split()
-)
+_EXPENSIVE_NAMES = """acos acosh asin asinh atan atan2 atanh cbrt cosh div erf erf_inv erfc exp exp2
+expm1 lgamma log log1p logistic pow rem rsqrt sinh sqrt tan tanh"""
+_EXPENSIVE = frozenset(_EXPENSIVE_NAMES.split())
 # A kernel takes as long as about so many operations in it: with a division, 0.5 ns for each lane.
 _KERNEL = 16
 # In the first sweep values are kept that turn out to be cheap once others are kept.
@@ -418,7 +418,9 @@ class _Program:
             before: dict[int, int] = {}  # the operations that lead to a value, likewise
             last, chosen = chosen, set()
             for i in order:
-                before[i] = ft.reduce(op.or_, (before.get(j, 0) for j in self.entries[i][1]), 1 << i)
+                before[i] = ft.reduce(
+                    op.or_, (before.get(j, 0) for j in self.entries[i][1]), 1 << i
+                )
                 saved = before[i].bit_count() * (kernels[i].bit_count() - 1)
                 if saved > _KERNEL and i in kept and (i in last or sweep == 0):
                     chosen.add(i)

@@ -218,20 +218,20 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         sizes, rows = scaled_rows(problem.factor.scale_columns(jacobian))
         return level, wrong / sizes, rows
 
-    def begin(y: Any) -> tuple[Any, Any, Array, Array]:
+    def begin(steps: int, y: Any) -> tuple[Any, Any, Array, Array]:
         """What the steps share: the order in which they eliminate the constraints, and in this
-        order the directions, or the gradients at the candidate. In lanes also the state after the
-        first steps, and its counters."""
+        order the directions, or the gradients at the candidate. Then the state after the first
+        `steps`, and its counters."""
         rows = scaled_rows(problem.factor.scale_columns(problem.linearise(y)[1]))[1]
         along = rows if directions is None else directions
         order = order_of(gram_matrix(rows, along))
         along = in_order(order, along)
         counter, num_iterations = tests(max_steps), jnp.asarray(0)
-        if lanes:
-            for _ in range(steps := min(_STEPS_IN_FRONT, max_steps)):
-                level, wrong, rows = seen(y)
-                y = moved(y, in_order(order, rows), along, in_order(order, wrong), level)
-                num_iterations = num_iterations + (level != AT_ROUNDOFF)
+        for _ in range(steps):
+            level, wrong, rows = seen(y)
+            y = moved(y, in_order(order, rows), along, in_order(order, wrong), level)
+            num_iterations = num_iterations + (level != AT_ROUNDOFF)
+        if steps:
             counter = jnp.where(seen(y)[0] == AT_ROUNDOFF, 0, counter - steps).astype(counter.dtype)
         return (order, along), y, counter, num_iterations
 
@@ -249,13 +249,15 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         return keep_done(counter, moved(y, rows, along, wrong, level), y), counter
 
     if lanes:
-        begin, advance, y = written_out_loop(begin, advance, candidate)
+        # Of a large function the steps in front are left out.
+        starts = [ft.partial(begin, steps) for steps in (min(_STEPS_IN_FRONT, max_steps), 0)]
+        start, advance, y = written_out_loop(starts, advance, candidate)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        y = lax.optimization_barrier(candidate)
-    known, *start = begin(y)
-    found = continued(ft.partial(advance, known), _Now(*start))
+        start, y = ft.partial(begin, 0), lax.optimization_barrier(candidate)
+    known, *now = start(y)
+    found = continued(ft.partial(advance, known), _Now(*now))
     return found._replace(y=joined(candidate, found.y))
 
 

@@ -350,7 +350,8 @@ class ManifoldProjection(ForwardingSolver):
         start = dataclasses.replace(target, changes=state.units).problem(step.t0, step.y0)
         entries = [entry for _, entry in named_entries(self.manifold)]
         fn = ft.partial(_verdict, entries)
-        times = step.t1 - step.t0, jnp.maximum(jnp.abs(step.t1), state.first_step.astype(jnp.result_type(step.t1)))
+        first_step = state.first_step.astype(jnp.result_type(step.t1))
+        times = step.t1 - step.t0, jnp.maximum(jnp.abs(step.t1), first_step)
         given = start, step.y0, candidate, y1, times, state.values, info.ok, too_far, is_first
         return in_kernels(fn, tree_stop_gradient(given))
 
