@@ -4,11 +4,14 @@ Primitives are those of the traced program, with those of all programs inside. I
 fusions are those of the compiled one; XLA compiles each fusion to a kernel of its own. Seconds are
 processor seconds of tracing, lowering and compilation; those of `consistent` contain the search for
 the structure of the equations and the call itself. A quotient is over plain diffrax in the same
-run: Kvaerno5 on the pendulum as an ordinary differential equation.
+run: of the DAEs over Kvaerno5 on the pendulum as an ordinary differential equation, of RK4 on 64
+rigid bodies and of the gradient of Tsit5 on an orbit with saved times over those not projected.
+Leaves are the arrays of the solver state, each of which a gradient saves and restores.
 
 Writes `results/first_call.json`.
 """
 
+import functools as ft
 import re
 import time
 
@@ -59,6 +62,42 @@ def programs():
     yield "DAE pendulum, gradient", by_gravity(kept), consistent
     begin = lambda: (mass.consistent(amplifier.guess), jnp.array(0.2))  # noqa: E731
     yield "transistor amplifier", sound, begin
+    body, orbit = dfc.systems.RigidBody(), dfc.systems.Kepler()
+    bodies = lambda: (measuring.initial_states(body, 64),)  # noqa: E731
+    start = lambda: (orbit.y0, jnp.array(1.0))  # noqa: E731
+    for name, solver in (("RK4", dfc.RK4()), ("projected RK4", kept_by(dfc.RK4(), body))):
+        yield f"{name}, 64 rigid bodies", jax.vmap(ft.partial(turned, body, solver)), bodies
+    for name, solver in (("Tsit5", dfx.Tsit5()), ("projected Tsit5", kept_by(dfx.Tsit5(), orbit))):
+        yield f"{name}, gradient of an orbit", by_gravity(ft.partial(saved, orbit, solver)), start
+
+
+def kept_by(solver, system):
+    return dfc.ManifoldProjection(solver, system.manifold)
+
+
+def turned(body, solver, y0):
+    term, steps = dfx.ODETerm(body.vector_field), dict(adjoint=dfx.ForwardMode(), max_steps=None)
+    return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.05, y0, **steps, throw=False).ys
+
+
+def saved(orbit, solver, y0, strength):
+    """The field is multiplied by `strength`: it only changes the clock."""
+    term = dfx.ODETerm(
+        lambda t, y, k: jax.tree.map(lambda x: k * x, orbit.vector_field(t, y, None))
+    )
+    options = dict(
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 20)),
+        stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8),
+    )
+    return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.01, y0, strength, **options).ys
+
+
+def leaves(name):
+    """The arrays of the state of a projected solver."""
+    system = dfc.systems.RigidBody() if "RK4" in name else dfc.systems.Kepler()
+    inner = dfc.RK4() if "RK4" in name else dfx.Tsit5()
+    given = dfx.ODETerm(system.vector_field), 0.0, 1.0, system.y0, None
+    return len(jax.tree.leaves(jax.eval_shape(lambda: kept_by(inner, system).init(*given))))
 
 
 def primitives(jaxpr):
@@ -99,7 +138,9 @@ def main(argv=None):
             continue
         jax.clear_caches()  # each compiles what the others share with it
         row = found[name] = judged(fn, given)
-        kind = "gradient" in name
+        kind = name.split(", ", 1)[1:] if "RK4" in name or "orbit" in name else "gradient" in name
+        kind = str(kind)
+        row |= dict(leaves=leaves(name)) if "projected" in name else {}
         plain.setdefault(kind, row["first"])
         row["over_plain"] = row["first"] / plain[kind]
         print(f"{name}: " + ", ".join(f"{k} {v:.4g}" for k, v in row.items()), flush=True)

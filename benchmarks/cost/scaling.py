@@ -1,7 +1,8 @@
 """What a projected step costs: by the number of integrals, and in batches of growing size.
 
 1. `methods`: projected over plain, of RK4 and of adaptive Tsit5, alone and in a batch of 1,000: a
-   rigid body, three vortices and ten; the times of a step, and those of compilation.
+   rigid body, the conservative Lorenz model, a Toda lattice, three vortices and ten; the times of a
+   step, and those of compilation.
 2. `batch`: rigid bodies, 1 to 10⁶ trajectories, fixed steps: ns per step and trajectory.
 
 Runs on the device that jax picks. How to read it, and float32: `benchmarks/README.md`.
@@ -24,6 +25,8 @@ MAX_DRIFT = 100 * measuring.EPS
 # A system with its step.
 SYSTEMS = {
     "rigid body": (dfc.systems.RigidBody(), 0.05),
+    "Lorenz model": (dfc.systems.ConservativeLorenz(), 0.01),
+    "Toda lattice": (dfc.systems.TodaLattice(), 0.05),
     "three vortices": (dfc.systems.PointVortices(), 0.1),
     "ten vortices": (dfc.systems.PointVortices([1.0] * 10), 0.02),
 }

@@ -19,23 +19,33 @@ class State(eqx.Module):
     """What later steps need.
 
     - `inner`: the state of the wrapped solver.
-    - `values`, `cancellation`, `gained`: as in a `Target`.
+    - `constants`: `values` and `cancellation` as in a `Target`, and `first_step`, the length of the
+      first step that was tried, a scale of the times of the solve. They are one array, because in a
+      gradient each array of the state is saved and restored.
+    - `gained`: as in a `Target`.
     - `units`: the unit of each component in the metric of motion, see `units_after`, the largest of
       all steps so far; zero before the first step.
-    - `end`: the numbers of the state at which the last step ended; infinite before the first.
-    - `first_step`: the length of the first step that was tried, a scale of the times of the solve.
     - `preferred`: the changes of the state in the last two steps, if linear invariants are kept.
     """
 
     inner: Any
-    values: Float[Array, " m"]
-    cancellation: Float[Array, " m"]
+    constants: Float[Array, " 2*m+1"]
     gained: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
-    end: Float[Array, " n"]
-    first_step: RealScalarLike
     statistics: ProjectionStatistics
     preferred: Float[Array, "k n"] | None = None
+
+    @property
+    def values(self) -> Float[Array, " m"]:
+        return self.constants[: len(self.constants) // 2]
+
+    @property
+    def cancellation(self) -> Float[Array, " m"]:
+        return self.constants[len(self.constants) // 2 : -1]
+
+    @property
+    def first_step(self) -> Float[Array, ""]:
+        return self.constants[-1]
 
 
 def initial_values(

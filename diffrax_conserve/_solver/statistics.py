@@ -1,6 +1,5 @@
 """The statistics of the projections of a solve."""
 
-import dataclasses
 from typing import final
 
 import diffrax as dfx
@@ -39,40 +38,42 @@ class ProjectionStatistics(eqx.Module):
     - `bounded`: whether the projection has bounds, where corrections may be long.
     """
 
-    num_projections: Int[Array, "..."]
-    num_iterations: Int[Array, "..."]
-    max_iterations: Int[Array, "..."]
-    residual_before: Float[Array, "..."]
-    residual_after: Float[Array, "..."]
-    correction: Float[Array, "..."]
-    roundoff: Float[Array, "..."]
-    error: Float[Array, "..."]
-    worst: Int[Array, "..."]
+    # Two arrays, and not one for each number: in a batch each array of the solver state costs a
+    # kernel in every step, and in a gradient each is saved and restored.
+    counts: Int[Array, "*batch 4"]
+    sizes: Float[Array, "*batch 5"]
     names: tuple[str, ...] = eqx.field(static=True)
     bounded: bool = eqx.field(static=True)
+
+    num_projections = property(lambda self: self.counts[..., 0])
+    num_iterations = property(lambda self: self.counts[..., 1])
+    max_iterations = property(lambda self: self.counts[..., 2])
+    worst = property(lambda self: self.counts[..., 3])
+    residual_before = property(lambda self: self.sizes[..., 0])
+    residual_after = property(lambda self: self.sizes[..., 1])
+    correction = property(lambda self: self.sizes[..., 2])
+    roundoff = property(lambda self: self.sizes[..., 3])
+    error = property(lambda self: self.sizes[..., 4])
 
     @classmethod
     def zero(
         cls, manifold: Manifold, dtype: jnp.dtype, bounded: bool = False
     ) -> "ProjectionStatistics":
-        count, size, worst = jnp.asarray(0), jnp.zeros((), dtype), jnp.asarray(-1)
         names = tuple(name for name, _ in named_entries(manifold))
-        sizes = size, size, size, size, size * jnp.nan
-        return cls(count, count, count, *sizes, worst=worst, names=names, bounded=bounded)
+        counts, sizes = jnp.array([0, 0, 0, -1]), jnp.array([0, 0, 0, 0, jnp.nan], dtype)
+        return cls(counts, sizes, names, bounded)
 
     def __str__(self) -> str:
         if is_traced(self):
             return repr(self)
-        rows = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        rows["worst"] = names_at(self.worst, rows.pop("names"))
-        bounded = rows.pop("bounded")
-        if not rows["worst"]:
-            del rows["worst"]
+        rows = {name: getattr(self, name) for name in _SHOWN}
+        if worst := names_at(self.worst, self.names):
+            rows["worst"] = worst
         if np.all(np.isnan(self.error)):
             del rows["error"]
         text = printed("projections of the accepted steps", rows)
         suspicious = np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)
-        if not bounded and np.any(suspicious):
+        if not self.bounded and np.any(suspicious):
             text += (
                 "\nCorrections are far longer than the error estimates of the steps explain:"
                 "\ncheck by `check_invariance` that the quantities are conserved."
@@ -82,19 +83,27 @@ class ProjectionStatistics(eqx.Module):
     def add(self, info: ProjectionInfo, error: Array | None) -> "ProjectionStatistics":
         """The statistics after one more step, with the report on its projection, and the length of
         the error estimate."""
-        return ProjectionStatistics(
+        counts = (
             self.num_projections + 1,
             self.num_iterations + info.num_iterations,
             jnp.maximum(self.max_iterations, info.num_iterations),
+            jnp.where(info.ok, self.worst, info.worst),
+        )
+        sizes = (
             jnp.maximum(self.residual_before, info.residual_before),
             jnp.maximum(self.residual_after, info.residual_after),
             jnp.maximum(self.correction, info.correction),
             jnp.maximum(self.roundoff, info.roundoff),
             self.error if error is None else jnp.fmax(self.error, error),
-            jnp.where(info.ok, self.worst, info.worst),
-            self.names,
-            self.bounded,
         )
+        return ProjectionStatistics(jnp.stack(counts), jnp.stack(sizes), self.names, self.bounded)
+
+
+# What `print` shows, in this order.
+_SHOWN = (
+    *("num_projections", "num_iterations", "max_iterations", "residual_before", "residual_after"),
+    *("correction", "roundoff", "error"),
+)
 
 
 def statistics(sol: dfx.Solution) -> ProjectionStatistics:

@@ -118,6 +118,49 @@ def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another()
     assert "a step cannot start" in dfx.RESULTS[struck.result]
 
 
+def test_a_continued_solve_refuses_other_args():
+    """The state is the same, but it does not have the energy of before with another stiffness."""
+    energy = dfc.FirstIntegral(lambda t, y, k: y[1] ** 2 / 2 + k * y[0] ** 2 / 2)
+    spring = lambda t, y, k: jnp.stack([y[1], -k * y[0]])  # noqa: E731
+    solver = dfc.ManifoldProjection(dfx.Heun(), energy)
+
+    @jax.jit
+    def results(y0, t1, k):
+        options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False)
+        first = solve(spring, solver, y0, t1=t1, args=1.0, **options)
+        state = dict(solver_state=first.solver_state, args=k)
+        return solve(spring, solver, first.ys[-1], t0=t1, t1=2 * t1, **options, **state).result
+
+    same, other = (results(jnp.array([1.0, 0.3]), 1.0, k) for k in (1.0, 1.1))
+    assert same == dfx.RESULTS.successful
+    assert "a step cannot start" in dfx.RESULTS[other]
+
+
+def test_steps_may_become_much_shorter_where_the_terms_of_a_constraint_vanish():
+    """A pendulum at its turning point: `q · v` is zero to roundoff of the speeds before."""
+    rod = lambda t, y, args: (jnp.sum(y[0] ** 2) - 1, y[0] @ y[1])  # noqa: E731
+
+    def swing(t, y, args):
+        (q, v), down = y, jnp.array([0.0, 1.0])
+        return v, -(v @ v - down @ q) * q - down
+
+    @jax.jit
+    def result(angle, step):
+        q = jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+        speed = 1e-3 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        ts = jnp.cumsum(jnp.concatenate([jnp.zeros(1), step]))
+        return dfx.diffeqsolve(
+            dfx.ODETerm(swing), dfc.ManifoldProjection(dfc.RK4(), dfc.Constraint(rod)),
+            ts[0], ts[-1], None, (q, speed), throw=False,
+            stepsize_controller=dfx.StepTo(ts), saveat=dfx.SaveAt(t1=True),
+        ).result  # fmt: skip
+
+    for angle in (0.5, np.pi / 2):
+        # To where the speed is about zero, and on in steps that are shorter by up to ten digits.
+        step = jnp.concatenate([jnp.full(8, 1e-3 / np.sin(angle) / 8), 10.0 ** -jnp.arange(3, 14)])
+        assert result(angle, step) == dfx.RESULTS.successful
+
+
 def test_a_body_at_rest_may_have_a_speed_whose_gradient_is_nan_there():
     energy = lambda t, y, args: jnp.linalg.norm(y[1]) ** 2 / 2 + y[0] @ y[0] / 2  # noqa: E731
     solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(energy))
