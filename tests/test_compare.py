@@ -358,6 +358,21 @@ def test_what_is_said(errors, doubt, choice, words):
     assert report.solver is not None
 
 
+def test_what_the_solver_keeps_by_itself_needs_no_projection():
+    """Unless the projection gains all the same, as by bounds."""
+
+    def report(error, drift):
+        found = report_of(1e-3, error, doubt=1e-9)
+        rows = [dataclasses.replace(row, drift={"x": np.array([drift])}) for row in found.rows]
+        return dataclasses.replace(found, rows=tuple(rows))
+
+    assert report(1e-3, 1e-9).choice == "choice 1"
+    itself = report(1e-3, 1e-15)
+    assert itself.choice == "nothing kept"
+    assert "keeps `x` to roundoff without projection" in str(itself)
+    assert report(1e-4, 1e-15).choice == "choice 1"
+
+
 def test_a_projection_that_spoils_a_component_is_not_for_what_it_keeps():
     for error, choice in {1e-3: "nothing kept", 1e-4: "choice 1"}.items():
         plain, kept = report_of(1e-3, error).rows

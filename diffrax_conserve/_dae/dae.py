@@ -15,10 +15,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._custom_types import Args, RealScalarLike, Values, Y
+from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.scalars import small
 from .._hashable import Hashable
-from .._manifold import Constraint, slope_like
+from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
 from .._numerics.metric import Diagonal
@@ -26,10 +26,11 @@ from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_function
-from .._projection.base import AbstractProjection, adapted
+from .._projection.base import AbstractProjection, adapted, check_projection
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
-from .._solver.manifold_projection import ManifoldProjection
+from .._projection.staged import Staged
+from .._solver.manifold_projection import ManifoldProjection, or_nothing
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .newton import MAX_NEWTON_STEPS, algebraic_newton, at_rest_near, divided
 from .radau import Radau
@@ -155,13 +156,27 @@ class DAE(Hashable):
         """The term for [`diffrax.diffeqsolve`][], with the slopes that the equations determine."""
         return dfx.ODETerm(_Slopes(self))
 
-    def wrap(self, solver: dfx.AbstractSolver[Any]) -> ManifoldProjection:
+    def wrap(
+        self,
+        solver: dfx.AbstractSolver[Any],
+        manifold: Manifold = (),
+        *,
+        projection: AbstractProjection | None = None,
+    ) -> ManifoldProjection:
         """A solver whose steps and dense output satisfy all constraints to roundoff.
 
         **Arguments:**
 
         - `solver`: [`diffrax_conserve.Radau`][], or another solver of diffrax if the equations are
             not stiff.
+        - `manifold`: what is kept beside the equations, such as the energy of a mechanism: a
+            [`diffrax_conserve.FirstIntegral`][], also with a `rate`, a
+            [`diffrax_conserve.Constraint`][], or a PyTree of them. In messages their names begin
+            with `manifold['further']`.
+        - `projection`: how that is kept, and within which bounds:
+            [`diffrax_conserve.SimplifiedNewton`][], the default, or [`diffrax_conserve.Newton`][].
+            A state that satisfies the equations is found first, and from there the nearest one that
+            satisfies all. Bounds can be kept without a `manifold`.
 
         **Returns:**
 
@@ -169,7 +184,8 @@ class DAE(Hashable):
 
         **Raises:**
 
-        `TypeError` if `solver` is none, or one that is wrapped already.
+        `TypeError` if `solver` is none, or one that is wrapped already, if an entry of `manifold`
+        is neither a first integral nor a constraint, or if `projection` is none, or needs the step.
         """
         if isinstance(solver, Radau):  # a wrapper of one too, for diffrax
             if type(solver) is not Radau:
@@ -178,8 +194,20 @@ class DAE(Hashable):
                     "`diffrax_conserve.Radau()` itself."
                 )
             solver = dataclasses.replace(solver, _equations=_Stages(self))
-        manifold = {"equations": Constraint(_Constraints(self))}
-        return ManifoldProjection(solver, manifold, projection=ConstraintProjection(dae=self))
+        kept: dict[str, Any] = {"equations": Constraint(_Constraints(self))}
+        back: AbstractProjection = ConstraintProjection(dae=self)
+        if projection is not None or named_entries(manifold):
+            further = SimplifiedNewton() if projection is None else projection
+            check_projection(further)
+            if further.sees_step:
+                raise TypeError(
+                    f"`projection` is {further!r}, which moves along the step, but in `wrap` of a "
+                    "`DAE` it starts from a state that satisfies the equations. Pass "
+                    "`SimplifiedNewton()` or `Newton()`."
+                )
+            kept["further"] = or_nothing(manifold)
+            back = Staged(("equations", back), ("further", further))
+        return ManifoldProjection(solver, kept, projection=back)
 
     def consistent(
         self,

@@ -40,6 +40,9 @@ _TINY = 1e-18
 # A change of a conserved combination that is larger than this is more than roundoff; so is an error
 # that is a larger share of the largest value of its component.
 _BROKEN = 1e-11
+# An entry is kept by the solver itself only if it drifts by less than the error of the state over
+# this. So one that a solve keeps because it is accurate is not taken for one.
+_FROM_ERRORS = 1e3
 # So much of the largest component of all may be left in others where terms cancel.
 _CANCELLED = 1e-14
 
@@ -202,7 +205,23 @@ class ComparisonReport:
     @property
     def index(self) -> int | None:
         """The row to take; `None` if that cannot be said."""
-        return _chosen(self.error, np.array([row.worsened[1] for row in self.rows]))
+        error = self.error
+        found = _chosen(error, np.array([row.worsened[1] for row in self.rows]))
+        if not found or not {*self.rows[found].kept} <= {*self.kept_anyway}:
+            return found
+        # Only bounds can gain where all entries are kept anyway.
+        gain = _mean(error[found]) < (1 - _EQUAL) * _mean(error[0])
+        return found if gain else 0
+
+    @property
+    def kept_anyway(self) -> tuple[str, ...]:
+        """The entries that the solver keeps to roundoff without projection, such as linear ones by
+        a Runge-Kutta method."""
+        plain = self.rows[0]
+        if not plain.success.all():
+            return ()
+        limit = np.minimum(_BROKEN, plain.errors[:, -1] / _FROM_ERRORS)
+        return tuple(name for name, drift in plain.drift.items() if np.all(drift <= limit))
 
     @property
     def choice(self) -> str | None:
@@ -271,6 +290,11 @@ class ComparisonReport:
     def notes(self) -> list[str]:
         """What else there is to know, a sentence each."""
         found = [*self._horizon(), *self._failures(), *self._broken(), *self._units()]
+        if self.kept_anyway:
+            names = ", ".join(f"`{name}`" for name in self.kept_anyway)
+            found.append(
+                f"The solver keeps {names} to roundoff without projection: alone that needs none."
+            )
         if self.doubt.shape[0] == 1:
             found.append("This is one start: others may differ, so try several with `batch=True`.")
         return found

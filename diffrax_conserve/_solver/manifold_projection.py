@@ -56,7 +56,7 @@ def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
     return jnp.zeros(())
 
 
-def _or_nothing(manifold: Manifold) -> Manifold:
+def or_nothing(manifold: Manifold) -> Manifold:
     """The manifold; if it is empty, because bounds alone are kept, that of all states."""
     return manifold if named_entries(manifold) else Constraint(_nothing)
 
@@ -133,7 +133,7 @@ class ManifoldProjection(ForwardingSolver):
     """
 
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
-    manifold: Manifold = eqx.field(converter=_or_nothing)
+    manifold: Manifold = eqx.field(converter=or_nothing)
     projection: AbstractProjection = option(SimplifiedNewton())
     max_correction: RealScalarLike | None = option(None)
     keep_linear: bool = option(False, static=True)

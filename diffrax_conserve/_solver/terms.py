@@ -69,9 +69,8 @@ def check_projects_nothing(solver: dfx.AbstractSolver) -> None:
         if hasattr(layer, "manifold") and hasattr(layer, "projection"):
             raise ValueError(
                 f"`solver` contains a `{type(layer).__name__}`, whose manifold an outer projection "
-                "would leave. Put all entries into one manifold, around the solver inside. With a "
-                '`DAE` it is `{"dae": dae.wrap(Radau()).manifold, "energy": energy}`, and the '
-                "solver inside `diffrax_conserve.Radau(root_finder=...)` with tolerances."
+                "would leave. Put all entries into one manifold, around the solver inside; with a "
+                "`DAE` write `dae.wrap(solver, manifold)`."
             )
 
 

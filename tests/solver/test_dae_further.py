@@ -1,0 +1,188 @@
+"""What `DAE.wrap` keeps beside the equations: exact solutions, and pendulums in angles by scipy."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import diffrax_conserve as dfc
+
+from ..problems import EPS, largest, refused
+from .test_dae import CUBIC, constant
+
+GRAVITY = 9.81
+
+
+@eqx.filter_jit
+def solve(dae, solver, ts, y0, args=None, *, dt0=None, tol=1e-8, **options):
+    """With steps of fixed length if `dt0` is given."""
+    steps = dfx.PIDController(rtol=tol, atol=tol) if dt0 is None else dfx.ConstantStepSize()
+    options = dict(max_steps=4096, saveat=dfx.SaveAt(ts=ts), throw=False) | options
+    options |= dict(stepsize_controller=steps)
+    return dfx.diffeqsolve(dae.term, solver, ts[0], ts[-1], dt0, y0, args, **options)
+
+
+# ---- Index 1: the entry contains an unknown without a slope ----
+
+# It leaves one state for each time, the exact one, whatever the solver is.
+CLOCK = dfc.FirstIntegral(lambda t, y, a: 1.5 * y[1] ** 2 + jnp.log(y[1]) + a * t)
+
+
+def test_an_integral_of_an_algebraic_unknown():
+    """At saved times too, and its derivatives, by long steps of a method of order two."""
+    ts = jnp.linspace(0, 1, 7)
+    options = dict(dt0=0.25, adjoint=dfx.ForwardMode())
+    solver = CUBIC.wrap(dfx.Heun(), CLOCK)
+
+    @jax.jit
+    def both(z0, a):
+        end = lambda *p: solve(CUBIC, solver, ts, (p[0] ** 3 + p[0], p[0]), p[1], **options)  # noqa: E731
+        slopes = jax.jacfwd(lambda *p: end(*p).ys[1][-1], (0, 1))(z0, a)
+        return end(z0, a), slopes
+
+    found, (by_z0, by_a) = both(jnp.array(1.0), jnp.array(0.7))
+    assert found.result == dfx.RESULTS.successful
+    x, z = map(np.asarray, found.ys)
+    assert largest(x - z**3 - z) < 8 * EPS
+    assert largest(constant(np.asarray(ts), z, 0.7) - constant(0, 1.0, 0.7)) < 16 * EPS
+    slope = lambda z: 3 * z + 1 / z  # noqa: E731
+    assert np.allclose((by_z0, by_a), (slope(1.0) / slope(z[-1]), -1 / slope(z[-1])), rtol=1e-12)
+
+
+def test_bounds():
+    """A step of Euler's method that is too long makes an amount negative; the total is one."""
+    dae = dfc.DAE(lambda t, x, z, args: -x, algebraic=lambda t, x, z, args: x + z - 1)
+    y0, ts = dae.consistent(jnp.array(0.9), jnp.array(0.0)), jnp.array([0.0, 1.5])
+    within = dfc.Newton(lower=0.0)
+    for projection, end in ((None, (-0.45, 1.45)), (within, (0.0, 1.0))):
+        solver = dae.wrap(dfx.Euler(), projection=projection)
+        found = solve(dae, solver, ts, y0, dt0=1.5)
+        assert found.result == dfx.RESULTS.successful
+        np.testing.assert_allclose([y[-1] for y in found.ys], end, atol=4 * EPS)
+
+
+# ---- Mechanisms ----
+
+
+def rod(q, v, force):
+    return v, -force * q - jnp.array([0.0, GRAVITY]) - 0.3 * v
+
+
+# Only its velocity is told to be tangential, so that its length drifts.
+ROD = dfc.DAE(
+    residual=lambda t, y, dy, args: (
+        dy[0] - rod(*y)[0], dy[1] - rod(*y)[1], y[0] @ y[1] + 0 * y[2]
+    )
+)  # fmt: skip
+LENGTH = dfc.FirstIntegral(lambda t, y, args: y[0] @ y[0])
+ENERGY = dfc.FirstIntegral(
+    lambda t, y, args: y[1] @ y[1] / 2 + GRAVITY * y[0][1],
+    rate=lambda t, y, args: -0.3 * y[1] @ y[1],
+)
+
+
+def test_the_length_of_a_pendulum_of_index_2_and_the_balance_of_its_energy():
+    """The balance leaves the error of its integral, which is smaller than that of the state."""
+    y0 = ROD.consistent((jnp.array([1.0, 0.0]), jnp.zeros(2), jnp.array(0.0)))
+    assert ROD.report(y0).index == 2
+    ts = jnp.linspace(0, 3, 4)
+    exact = solve_ivp(
+        lambda t, u: (u[1], -GRAVITY * np.sin(u[0]) - 0.3 * u[1]), (0, 3), (np.pi / 2, 0),
+        method="DOP853", rtol=1e-13, atol=1e-13, t_eval=ts,
+    ).y  # fmt: skip
+    energy = exact[1] ** 2 / 2 - GRAVITY * np.cos(exact[0])
+    off = []
+    for manifold in ((), {"length": LENGTH, "energy": ENERGY}):
+        found = solve(ROD, ROD.wrap(dfx.Tsit5(), manifold), ts, y0, tol=1e-5)
+        assert found.result == dfx.RESULTS.successful
+        q, v, _ = map(np.asarray, found.ys)
+        length = largest(np.sum(q * q, axis=1) - 1)
+        off.append((length, largest(np.sum(v * v, axis=1) / 2 + GRAVITY * q[:, 1] - energy)))
+        place = np.stack([np.sin(exact[0]), -np.cos(exact[0])], axis=1)
+        assert largest(q - place) < 1e-3
+    assert off[0][0] > 1e-6
+    assert off[1][0] < 8 * EPS
+    assert off[1][1] < off[0][1] / 3
+
+
+def double(t, y, dy, args):
+    (q, v, force), (dq, dv, _) = y, dy
+    a, b = q
+    pull = jnp.stack([force[1] * (b - a) - force[0] * a, force[1] * (a - b)])
+    return dq - v, dv - pull + jnp.array([0.0, GRAVITY]), jnp.stack([a @ a, (b - a) @ (b - a)]) - 1
+
+
+def total_energy(t, y, args):
+    q, v, _ = y
+    return jnp.sum(v * v) / 2 + GRAVITY * jnp.sum(q[:, 1])
+
+
+def places(angles):
+    """Of the two masses, from angles from below; also of a tangent, with its derivatives."""
+    xp = jnp if isinstance(angles, jax.Array) else np
+    return xp.cumsum(xp.stack([xp.sin(angles), -xp.cos(angles)], axis=-1), axis=-2)
+
+
+def in_angles(angle, end):
+    """Both places at the end, of a double pendulum that starts at rest."""
+
+    def slope(t, u):
+        (p, r, w, z), d = u, u[0] - u[1]
+        inertia = np.array([[2, np.cos(d)], [np.cos(d), 1]])
+        turning = np.array([-np.sin(d) * z * z, np.sin(d) * w * w])
+        weight = GRAVITY * np.array([2 * np.sin(p), np.sin(r)])
+        return [w, z, *np.linalg.solve(inertia, turning - weight)]
+
+    start = (angle, 0.5, 0, 0)
+    found = solve_ivp(slope, (0, end), start, method="DOP853", rtol=1e-13, atol=1e-13)
+    return places(found.y[:2, -1])
+
+
+@pytest.mark.slow
+def test_the_energy_of_a_double_pendulum_of_index_3():
+    """And the derivative of its end by its start, by a difference of two solves in angles."""
+    dae = dfc.DAE(residual=double)
+    zero = jnp.zeros((2, 2))
+    y0 = dae.consistent((places(jnp.array([1.5, 0.5])), zero, jnp.zeros(2)))
+    solver = dae.wrap(dfc.Radau(), {"energy": dfc.FirstIntegral(total_energy)})
+    ts = jnp.linspace(0, 2, 9)
+
+    def end(angle):
+        start = places(jnp.stack([angle, jnp.array(0.5)])), zero, y0[2]
+        found = solve(dae, solver, ts, dae.consistent(start), adjoint=dfx.ForwardMode())
+        return found.ys[0][-1], found
+
+    by_angle, found = jax.jit(jax.jacfwd(end, has_aux=True))(jnp.array(1.5))
+    assert found.result == dfx.RESULTS.successful
+    values = np.asarray(jax.vmap(total_energy, (None, 0, None))(0.0, found.ys, None))
+    assert largest(values / values[0] - 1) < 1e-14
+    assert largest(found.ys[0][-1] - in_angles(1.5, 2.0)) < 1e-7
+    step = 1e-4
+    difference = (in_angles(1.5 + step, 2.0) - in_angles(1.5 - step, 2.0)) / (2 * step)
+    assert largest(by_angle - difference) < 1e-6
+
+
+# ---- Errors and failures ----
+
+
+def test_a_failure_names_its_entry():
+    far = dfc.FirstIntegral(lambda t, y, args: jnp.tanh(y[0]), value=jnp.array(2.0))
+    options = dict(dt0=0.1, saveat=dfx.SaveAt(t1=True, solver_state=True))
+    solver, y0 = CUBIC.wrap(dfx.Heun(), {"far": far}), (jnp.array(2.0), jnp.array(1.0))
+    found = solve(CUBIC, solver, jnp.array([0.0, 1.0]), y0, jnp.array(0.7), **options)
+    assert found.result != dfx.RESULTS.successful
+    assert "manifold['further']['far']" in str(dfc.statistics(found))
+
+
+test_wrong_arguments = refused(
+    (lambda: CUBIC.wrap(dfx.Heun(), {"far": jnp.sum}), TypeError, "further'.*'far"),
+    (lambda: CUBIC.wrap(dfx.Heun(), projection=dfc.Newton), TypeError, "which is not a projection"),
+    (
+        lambda: CUBIC.wrap(dfx.Heun(), projection=dfc.AlongLine(direction="step")),
+        TypeError,
+        "`projection` is",
+    ),
+)
