@@ -1,0 +1,247 @@
+"""Linear systems with a sparse matrix, by KLU, and the Jacobians that give their values.
+
+KLU (T. A. Davis and E. Palamadai Natarajan, *Algorithm 907: KLU, a direct sparse solver for circuit
+simulation problems*, ACM Trans. Math. Softw. 37, 2010) orders the places of a matrix once, which is
+done while a solve is traced. A solve inside of `jit` then factors the values. No factor is kept,
+so that there is nothing to free, and lanes and threads do not disturb each other.
+
+KLU works on a CPU, with float64 and complex128. A pivot that is exactly zero raises an error that
+ends the program, so a matrix is tested before; see `Places.is_regular`.
+"""
+
+import functools as ft
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Bool, Float, Shaped
+
+from .._constants import DENSE_ROW_RATIO, ROUNDOFF
+from .._tree import without_pattern
+from .asdex_import import asdex
+from .sparse import _constants, _content, _entries
+
+# A perturbation in the imaginary part of a real matrix. Its square is below the roundoff of any
+# element, so that it changes no real part.
+_TINY = 1e-20
+
+
+_LOCK = threading.Lock()
+
+
+@ft.cache
+def klujax() -> Any:
+    """The package. Whatever its import raises is raised.
+
+    The import changes two settings of JAX for the whole process, which are put back.
+    """
+    names = "jax_enable_x64", "jax_platform_name"
+    with _LOCK:
+        before = {name: jax.config.read(name) for name in names}
+        try:
+            import klujax
+        finally:
+            for name, value in before.items():
+                jax.config.update(name, value)
+    return klujax
+
+
+def available(dtype: Any) -> bool:
+    """Whether numbers of this dtype are solved for by KLU here."""
+    if jnp.dtype(dtype) != jnp.float64 or jax.default_backend() != "cpu":
+        return False
+    try:
+        klujax(), asdex()
+    except Exception:  # missing, or made for another version of jax
+        return False
+    return True
+
+
+class Places:
+    """The places in which a square matrix has elements, in the order of its columns, and of rows
+    within a column. The values of a matrix are an array in this order."""
+
+    def __init__(self, rows: Any, columns: Any, size: int):
+        numbers = np.asarray(columns, np.int64) * size + np.asarray(rows, np.int64)
+        self.size, self.numbers = size, np.unique(numbers)
+        self.rows = (self.numbers % size).astype(np.int32)
+        self.columns = (self.numbers // size).astype(np.int32)
+        self._key = size, self.numbers.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Places) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def index(self, rows: Any, columns: Any) -> np.ndarray:
+        """The positions of elements among the values; past the end for those without a place."""
+        wanted = np.asarray(columns, np.int64) * self.size + np.asarray(rows, np.int64)
+        found = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
+        return np.where(self.numbers[found] == wanted, found, len(self.numbers))
+
+    def matvec(self, values: Shaped[Array, " k"], x: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
+        return jax.ops.segment_sum(values * x[self.columns], self.rows, self.size)
+
+    def solve(self, values: Shaped[Array, " k"], b: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
+        """`A⁻¹ b`; NaN if the matrix is singular to roundoff, or not finite."""
+        values = jnp.where(self.is_regular(values), values, jnp.nan)
+        return self.solve_regular(values, b)
+
+    def solve_regular(
+        self, values: Shaped[Array, " k"], b: Shaped[Array, " n"]
+    ) -> Shaped[Array, " n"]:
+        """`A⁻¹ b`, of a matrix that is known to be regular, or has values that are NaN."""
+        dtype = jnp.result_type(values, b)
+        if self._permutation is None:
+            return jnp.full(b.shape, jnp.nan, dtype)
+        values, b = values.astype(dtype), b.astype(dtype)
+        return lax.custom_linear_solve(
+            lambda x: self.matvec(values, x),
+            b,
+            lambda _, b: self._klu("solve_with_symbol", values, b),
+            lambda _, b: self._klu("tsolve_with_symbol", values, b),
+        )
+
+    def is_regular(self, values: Shaped[Array, " k"]) -> Bool[Array, ""]:
+        """Whether a matrix is regular, to roundoff, in units of its rows and columns in which the
+        largest elements are one.
+
+        A vector in general position is solved for. To see exact zeros among the pivots, each
+        element has a tiny imaginary part in general position: where real parts cancel exactly, the
+        imaginary parts do not, and the pivot is tiny, but not zero. The real parts are the same.
+        """
+        if self._permutation is None:
+            return jnp.asarray(False)
+        values = lax.stop_gradient(values)
+        if jnp.iscomplexobj(values):
+            real, imag = values.real, values.imag
+            parts = jnp.concatenate([real, -imag, imag, real])
+            return self._real_form[0].is_regular(parts[self._real_form[1]])
+        sizes = jnp.abs(values)
+        heights = jax.ops.segment_max(sizes, self.rows, self.size)
+        heights = jnp.where(heights == 0, 1, heights)[self.rows]
+        widths = jax.ops.segment_max(sizes / heights, self.columns, self.size)
+        widths = jnp.where(widths == 0, 1, widths)[self.columns]
+        pattern = without_pattern(len(self.numbers) + self.size, values.dtype)
+        shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
+        scaled = values / heights / widths + _TINY * 1j * shift
+        x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))
+        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(values.dtype).eps)))
+
+    def _klu(self, name: str, values: Array, b: Array) -> Array:
+        """Calls KLU; `b` may have several columns. The primitives are bound themselves, because the
+        functions of klujax sort the places in each program anew. With a matrix that is not finite
+        KLU may find no pivot, so it gets a permutation instead."""
+        finite = jnp.all(jnp.isfinite(values))
+        values = jnp.where(finite, values, jnp.asarray(self._permutation, values.dtype))
+        kind = "c128" if jnp.iscomplexobj(values) else "f64"
+        call = getattr(klujax(), f"{name}_{kind}").bind
+        where = jnp.asarray(self.rows), jnp.asarray(self.columns)
+        columns = b.reshape(1, self.size, -1)
+        x = call(*where, values[None], columns, self._symbol).reshape(b.shape)
+        return jnp.where(finite, x, jnp.nan)
+
+    @property
+    def _symbol(self) -> Array:
+        return jnp.asarray(_analyzed(self).raw, jnp.uint64)
+
+    @ft.cached_property
+    def _permutation(self) -> np.ndarray | None:
+        """The values of a matrix that is a permutation; `None` if every matrix with these places is
+        singular."""
+        ones = np.ones(len(self.numbers), np.int8)
+        matrix = sp.csr_matrix((ones, (self.rows, self.columns)), (self.size, self.size))
+        columns = sp.csgraph.maximum_bipartite_matching(matrix, perm_type="column")
+        if np.any(columns < 0):
+            return None
+        return (columns[self.rows] == self.columns).astype(float)
+
+    @ft.cached_property
+    def _real_form(self) -> tuple["Places", np.ndarray]:
+        """The places of a complex matrix as a real one of twice the size, and the order of its
+        values."""
+        n, rows, columns = self.size, self.rows, self.columns
+        rows = np.concatenate([rows, rows, rows + n, rows + n])
+        columns = np.concatenate([columns, columns + n, columns, columns + n])
+        return Places(rows, columns, 2 * n), np.lexsort((rows, columns))
+
+
+# The orders in which KLU eliminates. Compiled programs contain their addresses, so they are kept.
+_ANALYZED: dict[Places, Any] = {}
+
+
+def _analyzed(places: Places) -> Any:
+    package = klujax()
+    with _LOCK:  # another thread must not replace what a program contains
+        if places not in _ANALYZED:
+            with jax.ensure_compile_time_eval():
+                found = package.analyze(places.rows, places.columns, places.size)
+            _ANALYZED[places] = found
+        return _ANALYZED[places]
+
+
+class SparseJacobian:
+    """The places of the elements of a Jacobian that can differ from zero, in the order of `Places`,
+    and how they are computed.
+
+    Columns of the same colour share no row, so that one forward pass with the sum of their seeds
+    computes all of them (Curtis, Powell and Reid, 1974). A few dense rows would leave no two
+    columns with the same colour. So each of them is computed by a reverse pass.
+
+    - `rows`, `columns`: the places.
+    - `num_passes`: the numbers of forward and of reverse passes.
+    """
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
+        order = np.lexsort((rows, columns))
+        rows, columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
+        counts = np.bincount(rows, minlength=shape[0])
+        dense = counts > DENSE_ROW_RATIO * max(1, np.median(counts))
+        few = ~dense[rows]
+        found = asdex().SparsityPattern.from_coo(rows[few], columns[few], shape)
+        colours, number = asdex().color_cols(found) if np.any(few) else (np.zeros(shape[1], int), 0)
+        self.rows, self.columns, self.dense_rows = rows, columns, np.flatnonzero(dense)
+        self.num_passes = int(number), len(self.dense_rows)
+        self._colours = np.asarray(colours)
+        by_colour = self._colours[columns] * shape[0] + rows
+        by_row = number * shape[0] + (np.cumsum(dense) - 1)[rows] * shape[1] + columns
+        self._taken = np.where(few, by_colour, by_row)
+
+    def values(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Float[Array, " k"]:
+        """The values of the elements, in the order of the places."""
+        colours, dense = self.num_passes
+        seeds = jnp.asarray(np.arange(colours)[:, None] == self._colours, x.dtype)
+        passes = [jax.vmap(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(seeds).reshape(-1)]
+        if dense:
+            vjp = jax.vjp(fn, x)[1]
+            rows = jnp.zeros((dense, jax.eval_shape(fn, x).size), x.dtype)
+            rows = rows.at[np.arange(dense), self.dense_rows].set(1)
+            passes.append(jax.vmap(lambda row: vjp(row)[0])(rows).reshape(-1))
+        return jnp.concatenate(passes)[self._taken]
+
+
+def sparse_jacobian(fn: Callable[[Array], Array], x: Any) -> SparseJacobian | None:
+    """The places of the Jacobian of a function of a vector like `x`; `None` if they cannot be
+    found. Constants of the function that JAX traces may have any values."""
+    traced = jax.make_jaxpr(fn)(jax.ShapeDtypeStruct(x.shape, x.dtype))
+    key = str(traced.jaxpr), *map(_content, _constants(traced))
+    if key not in _KNOWN:
+        with jax.ensure_compile_time_eval():
+            try:
+                rows, columns = _entries(traced, x)
+            except NotImplementedError:  # an operation that asdex does not know
+                _KNOWN[key] = None
+            else:
+                shape = traced.out_avals[0].shape[0], x.shape[0]
+                _KNOWN[key] = SparseJacobian(rows, columns, shape)
+    return _KNOWN[key]
+
+
+# The Jacobians that were found, by their functions.
+_KNOWN: dict[Any, SparseJacobian | None] = {}

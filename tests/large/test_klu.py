@@ -1,0 +1,192 @@
+"""Sparse linear systems against dense ones of numpy, and sparse Jacobians against dense ones."""
+
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffrax_conserve._large.klu import Places, sparse_jacobian
+
+pytest.importorskip("klujax")
+
+
+def _matrix(n, dtype, seed=0):
+    """A sparse matrix whose rows and columns have units of very different sizes."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, n)).astype(dtype)
+    if np.iscomplexobj(a):
+        a = a + 1j * rng.normal(size=(n, n))
+    taken = (rng.random((n, n)) < 2 / n) | np.eye(n, dtype=bool)
+    units = 10.0 ** rng.integers(-6, 6, n)
+    return np.where(taken, a + 3 * np.eye(n), 0) * units[:, None] * units[::-1]
+
+
+def _places(a):
+    rows, columns = np.nonzero(a)
+    places = Places(rows, columns, len(a))
+    return places, jnp.asarray(a[places.rows, places.columns])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
+def test_solve_is_that_of_a_dense_matrix(dtype):
+    a = _matrix(60, dtype)
+    places, values = _places(a)
+    b = np.random.default_rng(1).normal(size=60)
+    want = np.linalg.solve(a, b)
+    np.testing.assert_allclose(jax.jit(places.solve)(values, b), want, rtol=1e-8)
+    x = np.random.default_rng(2).normal(size=60)
+    np.testing.assert_allclose(places.matvec(values, x), a @ x, rtol=1e-12)
+    batch = np.stack([b, 2 * b, b[::-1]])
+    found = jax.jit(jax.vmap(places.solve, (None, 0)))(values, batch)
+    np.testing.assert_allclose(found, np.linalg.solve(a, batch.T).T, rtol=1e-8)
+    many = jnp.stack([values, 3 * values])
+    found = jax.vmap(lambda v: jax.vmap(lambda b: places.solve(v, b))(jnp.asarray(batch)))(many)
+    np.testing.assert_allclose(found[1], np.linalg.solve(3 * a, batch.T).T, rtol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
+def test_derivatives_are_those_of_a_dense_solve(dtype):
+    places, values = _places(_matrix(12, dtype, 3))
+    b = jnp.asarray(np.random.default_rng(2).normal(size=12), dtype)
+
+    def dense(values, b):
+        a = jnp.zeros((12, 12), dtype).at[places.rows, places.columns].set(values)
+        return jnp.linalg.solve(a, b)
+
+    def size(solve):
+        return lambda values, b: jnp.sum(jnp.abs(solve(values * values, b)) ** 2)
+
+    for order in (jax.jacfwd, jax.jacrev, lambda f, n: jax.jacfwd(jax.grad(f, 0), n)):
+        if np.iscomplexobj(b) and order is not jax.jacrev:
+            continue
+        for argument in (0, 1):
+            found = order(size(places.solve), argument)(values, b)
+            want = order(size(dense), argument)(values, b)
+            scale = np.max(np.abs(want))
+            np.testing.assert_allclose(found / scale, want / scale, atol=1e-8)
+
+
+def _singular(case, n=8):
+    a = 3 * np.eye(n) + np.eye(n, k=1) + np.eye(n, k=-1)
+    if case == "zero column":
+        a[:, 2] = 0
+    if case == "zero row":
+        a[5] = 0
+    if case == "zero":
+        a[:] = 0
+    if case == "equal rows":
+        a[3] = a[4]
+    if case == "sums to zero":
+        a = a - np.diag(a.sum(1))
+    if case == "three rows in two columns":
+        a[:3, 2:] = 0
+    if case == "rank one":
+        a = np.ones((n, n))
+    if case in ("nan", "inf"):
+        a[3, 3] = float(case)
+    return a
+
+
+CASES = "zero column|zero row|zero|equal rows|sums to zero|three rows in two columns|rank one"
+
+
+@pytest.mark.parametrize("case", [*CASES.split("|"), "nan", "inf"])
+@pytest.mark.parametrize("factor", [1.0, 0.1, 0.1 + 0.7j])
+@pytest.mark.parametrize("structural", [False, True])
+def test_a_singular_matrix_gives_nan(case, factor, structural):
+    a = factor * _singular(case)
+    taken = a != 0 if structural else np.ones_like(a, bool)
+    if not taken.any():
+        return
+    places = Places(*np.nonzero(taken), len(a))
+    values = jnp.asarray(a[places.rows, places.columns])
+    found = jax.jit(places.solve)(values, jnp.ones(len(a)))
+    assert np.all(np.isnan(found))
+    # Another lane is not disturbed, and neither is a derivative.
+    good = _singular("regular")[places.rows, places.columns].astype(values.dtype)
+    batch = jnp.stack([values, jnp.asarray(good)])
+    lanes = jax.vmap(places.solve, (0, None))(batch, jnp.ones(len(a)))
+    assert np.all(np.isnan(lanes[0]))
+    if not structural:
+        np.testing.assert_allclose(
+            lanes[1], np.linalg.solve(_singular("regular"), np.ones(len(a))), rtol=1e-12
+        )
+
+
+def test_an_ill_conditioned_matrix_is_regular():
+    n = 40
+    a = np.eye(n) - 0.4 * np.eye(n, k=1)
+    a[-1, 0] = 1e-11
+    places, values = _places(a * 10.0 ** np.linspace(-40, 40, n)[:, None])
+    assert places.is_regular(values)
+
+
+def test_threads_and_loops():
+    a = _matrix(200, np.float64, 5)
+    places, values = _places(a)
+    b = np.random.default_rng(3).normal(size=200)
+
+    @jax.jit
+    def looped(values, b):
+        def body(i, x):
+            return places.solve_regular(values, b + 0 * x)
+
+        return jax.lax.fori_loop(0, 20, body, b)
+
+    want, wrong = np.linalg.solve(a, b), []
+
+    def run(k):
+        for i in range(5):
+            found = looped(values * (1 + k + i), b)
+            wrong.append(float(np.max(np.abs(found * (1 + k + i) / want - 1))))
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]
+    [t.start() for t in threads], [t.join() for t in threads]
+    assert len(wrong) == 20
+    assert max(wrong) < 1e-5
+
+
+def test_the_import_leaves_the_settings_of_jax():
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', {x64})\n"
+        "read = lambda: [jax.config.read(n) for n in ('jax_enable_x64', 'jax_platform_name')]\n"
+        "before = read()\n"
+        "import diffrax_conserve, sys; assert 'klujax' not in sys.modules\n"
+        "from diffrax_conserve._large.klu import available, klujax\n"
+        "import jax.numpy as jnp; assert not available(jnp.float32)\n"
+        "assert 'klujax' not in sys.modules; klujax(); assert read() == before, read()"
+    )
+    for x64 in (True, False):
+        subprocess.run([sys.executable, "-c", code.format(x64=x64)], check=True)
+
+
+def test_a_sparse_jacobian_is_the_dense_one():
+    n = 100
+
+    def fn(scale):
+        def fn(x):
+            y = scale * x**2 + jnp.roll(x, 1) * jnp.sin(jnp.roll(x, -2))
+            return y.at[4].set(jnp.sum(x**3)).at[7].set(x @ jnp.arange(1.0, n + 1)).at[9].set(1.0)
+
+        return fn
+
+    x = jnp.linspace(0.3, 2.0, n)
+    found = sparse_jacobian(fn(1.0), x)
+    assert found.num_passes[0] <= 9
+    assert found.num_passes[1] == 2
+    assert list(found.dense_rows) == [4, 7]
+
+    @jax.jit
+    def dense(scale):
+        places = sparse_jacobian(fn(scale), x)  # with a constant that is traced
+        values = places.values(fn(scale), x)
+        return jnp.zeros((n, n)).at[places.rows, places.columns].set(values)
+
+    np.testing.assert_allclose(dense(2.0), jax.jacfwd(fn(2.0))(x), rtol=1e-14)
+    places = Places(found.rows, found.columns, n)
+    np.testing.assert_array_equal(places.rows, found.rows)
+    np.testing.assert_array_equal(places.index(found.rows, found.columns), range(len(found.rows)))
