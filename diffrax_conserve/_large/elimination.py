@@ -8,14 +8,15 @@ the matrix of numbers in general position is eliminated, in an order in which li
   are all of most mass matrices.
 - What is left falls into parts that share no row and no column. Small parts are eliminated with the
   largest pivot, all parts of one shape together.
-- A large part is factored by SuperLU, with a diagonal of roundoff added so that it is no error if
-  it is singular. Its small pivots tell what is left over, which is eliminated in the same way.
+- A large part is factored by SuperLU, with roundoff added so that it is no error if it is singular. Its small pivots tell what is left over, which is eliminated in the same way.
 """
+
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
 from .._constants import REGULARISATION_POWER
 
@@ -27,14 +28,15 @@ _EPS = float(np.finfo(float).eps)
 _LEAST = _EPS**REGULARISATION_POWER
 # A pivot of SuperLU that is smaller is not taken at once. Its rows are compared again with what is
 # left over.
-_SMALL_PIVOT = _EPS**0.5
+_SMALL_PIVOT = _EPS**0.25
 # Parts with at most this many rows and columns are eliminated as dense matrices.
 _DENSE = 256
 # Single elements are looked for so often.
 _SWEEPS = 20
 # A matrix that fills in with more than this many elements is given up, within about a second.
 MOST_ELEMENTS = 10**7
-_COLUMNS = 256  # so many right sides are solved for at once
+MOST_OPERATIONS = 2 * 10**8  # of combinations of rows, which take about 5 s
+_COLUMNS = 16  # so many right sides at once, for which SuperLU calls no threads
 
 
 class TooFull(Exception):
@@ -68,9 +70,13 @@ def extended(matrix: sp.csr_array, chosen: Pivots) -> Pivots:
     rows, columns = (np.asarray(x, int) for x in chosen)
     if not rows.size:
         return _pivots(matrix)
-    others = _others(matrix.shape, rows, columns)
-    more = _pivots(_remainder(matrix, (rows, columns), others))
-    found = (np.append(a, b[c]) for a, b, c in zip((rows, columns), others, more, strict=True))
+    return _with_more(matrix, (rows, columns))
+
+
+def _with_more(matrix: sp.csr_array, pivots: Pivots) -> Pivots:
+    others = _others(matrix.shape, *pivots)
+    more = _pivots(_remainder(matrix, pivots, others))
+    found = (np.append(a, b[c]) for a, b, c in zip(pivots, others, more, strict=True))
     return tuple(found)  # pyright: ignore
 
 
@@ -82,8 +88,11 @@ def _remainder(matrix: sp.csr_array, pivots: Pivots, others: Pivots) -> sp.csr_a
     """What is left of the other rows and columns after elimination by these pivots."""
     (rows, columns), (below, beside) = pivots, others
     share = combinations(matrix[below][:, columns], matrix[rows][:, columns])
-    left = matrix[below][:, beside] - share @ matrix[rows][:, beside]
-    return _without_roundoff(sp.csr_array(left))
+    given, rest = matrix[below][:, beside], matrix[rows][:, beside]
+    left = sp.csr_array(given - share @ rest)
+    # What cancels but for the roundoff of its terms is zero.
+    terms = sp.csr_array(abs(given) + abs(share) @ abs(rest))
+    return _without_roundoff(sp.csr_array(left * (abs(left) > _LEAST * terms)))
 
 
 def combinations(rows: sp.csr_array, matrix: sp.csr_array) -> sp.csr_array:
@@ -92,6 +101,8 @@ def combinations(rows: sp.csr_array, matrix: sp.csr_array) -> sp.csr_array:
     found = np.flatnonzero(np.diff(rows.indptr))
     if not found.size:
         return sp.csr_array(rows.shape)
+    if found.size * matrix.shape[0] > MOST_OPERATIONS:
+        raise TooFull
     factors = spla.splu(sp.csc_array(matrix.T))
     parts, number = [], 0
     for start in range(0, found.size, _COLUMNS):
@@ -199,18 +210,33 @@ def _of_small_parts(matrix: sp.csr_array, rows: np.ndarray, columns: np.ndarray)
 
 def _of_large_part(matrix: sp.csr_array) -> Pivots:
     """The pivots of a large part by SuperLU, and of what its small pivots leave over."""
-    (m, n), size = matrix.shape, max(matrix.shape)
-    at = sp.coo_array(matrix)
-    padded = sp.csc_array((at.data, at.coords), (size, size))
-    factors = spla.splu(sp.csc_array(padded + _LEAST / 16 * sp.eye_array(size, format="csc")))
-    if factors.nnz > MOST_ELEMENTS:
+    matched = maximum_bipartite_matching(sp.csr_matrix(matrix), perm_type="column")
+    rows = np.flatnonzero(matched >= 0)
+    columns = matched[rows]
+    factors = _factored(matrix[rows][:, columns])
+    if factors is None or factors.nnz > MOST_ELEMENTS:
         raise TooFull
-    rows, columns = np.argsort(factors.perm_r), np.argsort(factors.perm_c)
-    good = (np.abs(factors.U.diagonal()) > _SMALL_PIVOT) & (rows < m) & (columns < n)
-    rows, columns = rows[good], columns[good]
-    if not rows.size or rows.size == min(m, n):
+    good = np.abs(factors.U.diagonal()) > _SMALL_PIVOT
+    rows, columns = (
+        x[np.argsort(order)][good]
+        for x, order in ((rows, factors.perm_r), (columns, factors.perm_c))
+    )
+    if not rows.size:
+        i = np.argmax(np.abs(matrix.data))
+        rows, columns = (x[i : i + 1] for x in sp.coo_array(matrix).coords)
+    if rows.size == min(matrix.shape):
         return rows, columns
-    others = _others(matrix.shape, rows, columns)
-    more = _pivots(_remainder(matrix, (rows, columns), others))
-    found = (np.append(a, b[c]) for a, b, c in zip((rows, columns), others, more, strict=True))
-    return tuple(found)  # pyright: ignore
+    return _with_more(matrix, (rows, columns))
+
+
+def _factored(matrix: sp.csr_array) -> Any:
+    """The factors of a matrix, to whose diagonal roundoff in general position is added. The
+    roundoff itself may cancel, so it is tried with other sizes; `None` if that does not help."""
+    for size in (1 / 16, 1 / 8, 1 / 4):
+        general = 1 + np.sin(np.arange(1.0, matrix.shape[0] + 1) ** 2) / 2
+        added = sp.diags_array(size * _LEAST * general)
+        try:
+            return spla.splu(sp.csc_array(matrix + added))
+        except RuntimeError:  # exactly singular
+            continue
+    return None
