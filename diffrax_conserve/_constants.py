@@ -52,6 +52,10 @@ TRIED = 8
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).
 LEAST_SPARSE = 33
+# From this number of unknowns on the linear systems of a stiff solver are solved by KLU, if their
+# matrix is sparse. From the second on a dense one is announced.
+LEAST_KLU = 100
+LARGE_DENSE = 300
 # A row is dense if it has more than this many times the elements of the median row: a bond has 6
 # elements, an energy all of them.
 DENSE_ROW_RATIO = 16

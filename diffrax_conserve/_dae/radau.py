@@ -16,12 +16,12 @@ from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike,
 from .._hashable import Hashable
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, after_step, iterate, keep_done
-from .._numerics.linear import lu_factors, lu_solution
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
 from .._time import nonzero_length
 from .._tree import ravel, unravel
+from .stage_systems import systems_at
 
 # The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
 # powers of the nodes, by which the coefficients of the collocation polynomial follow from them.
@@ -152,27 +152,24 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             times = t0 + jnp.asarray(_NODES, jnp.result_type(t0)) * (t1 - t0)
             return at_stages(times, y, inverse @ (y - start) / length)
 
-        by_y, by_slope = lax.stop_gradient(jax.jacfwd(residual, (1, 2))(t0, start, slope))
+        systems = systems_at(residual, t0, start, slope)
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
-        size_of_slopes = jnp.abs(start / length)
-        sizes = jnp.abs(by_y) @ jnp.abs(start) + jnp.abs(by_slope) @ size_of_slopes
+        sizes = systems.sizes_of_terms(start, start / length)
         least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
-        real = lu_factors(_REAL / length * by_slope + by_y)
-        pair = lu_factors(_PAIR / length * by_slope + by_y)
+        real, pair = systems.solvers(_REAL / length, _PAIR / length)
 
         def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
             """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
             by the eigenvectors of `A⁻¹`."""
-            modes = -jnp.asarray(_TO_MODES, pair[0].dtype) @ residuals
-            first = lu_solution(real, modes[0].real)
-            second = lu_solution(pair, modes[1])
-            vectors = jnp.asarray(_VECTORS, pair[0].dtype)
+            vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
+            modes = -to_modes @ residuals
+            first, second = real(modes[0].real), pair(modes[1])
             other = 2 * (vectors[:, 1, None] * second).real
             return vectors[:, 0, None].real * first + other
 
-        finder = self.root_finder
+        finder, pair_dtype = self.root_finder, jnp.result_type(start, complex(0))
 
         def size(change: Array, y: Array) -> Array:
             scale = finder.atol + finder.rtol * jnp.abs(y)
@@ -194,7 +191,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             found = iterate(advance, begin, max_steps=self.root_find_max_steps)
             return found._replace(y=found.y[0])
 
-        found = root(stages, newton, guess, jnp.linalg.solve)
+        found = root(stages, newton, guess, systems.stages_solution, systems.stages_jacobian)
         y = found.y
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
@@ -202,7 +199,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
 
         def filtered(y: Array) -> Array:
-            return -lu_solution(real, seen(residual(t0, y, slopes)))
+            return -real(seen(residual(t0, y, slopes)))
 
         error = filtered(start + filtered(start))
         ok = found.ok & jnp.all(jnp.isfinite(error))

@@ -53,13 +53,22 @@ def klujax() -> Any:
 
 def available(dtype: Any) -> bool:
     """Whether numbers of this dtype are solved for by KLU here."""
-    if jnp.dtype(dtype) != jnp.float64 or jax.default_backend() != "cpu":
-        return False
+    on_cpu = jnp.dtype(dtype) == jnp.float64 and jax.default_backend() == "cpu"
+    return on_cpu and not why_not()
+
+
+@ft.cache
+def why_not() -> str:
+    """Why the packages cannot be imported, and what to do; empty if they can be."""
     try:
-        klujax(), asdex()
-    except Exception:  # missing, or made for another version of jax
-        return False
-    return True
+        asdex()
+        klujax()
+    except Exception as error:  # missing, or made for another version of jax
+        return (
+            f"the packages for sparse ones cannot be imported ({type(error).__name__}: {error}): "
+            "`pip install 'diffrax-conserve[sparse]'`."
+        )
+    return ""
 
 
 class Places:

@@ -169,14 +169,13 @@ def _nan_tangent_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 @final
 class SquareSystem(AbstractSystem):
     """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that
-    solves them from a guess. The linear systems have their dense Jacobian."""
+    solves them from a guess. `solve` takes the Jacobian as `jacobian(residual)` returns it."""
 
     residual: Callable[[Any], Any]
     iterate: Callable[[Any], Solved]
     guess: Any
-    solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]] = eqx.field(
-        static=True
-    )
+    solve: Callable[[Array, Float[Array, " n"]], Float[Array, " n"]] = eqx.field(static=True)
+    jacobian: Callable[[Any], Callable[[Array], Array]] = eqx.field(static=True)
 
     def found(self) -> Solved:
         return self.iterate(self.guess)
@@ -188,7 +187,7 @@ class SquareSystem(AbstractSystem):
         return self.residual(unknowns)
 
     def linear_solution(self, solved: Solved, right: Any) -> Any:
-        matrix = jax.jacfwd(lambda x: _flat(self.residual(unflatten(x, solved.y))))
+        matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, solved.y))))
         return unflatten(self.solve(matrix(_flat(solved.y)), _flat(right)), solved.y)
 
 
@@ -196,14 +195,15 @@ def root(
     residual: Callable[[Any], Any],
     iterate: Callable[[Any], Solved],
     guess: Any,
-    solve: Callable[[Float[Array, "n n"], Float[Array, " n"]], Float[Array, " n"]],
+    solve: Callable[[Array, Float[Array, " n"]], Float[Array, " n"]],
+    jacobian: Callable[[Any], Callable[[Array], Array]] = jax.jacfwd,
 ) -> Solved:
     """The root of `residual` that `iterate(guess)` finds, for unknowns that are an array or a
     PyTree of them. Its derivative is by the theorem, with `solve(matrix, vector)` for linear
-    systems. The arrays over which the functions close, such as parameters, have their derivatives
+    systems, whose matrix is `jacobian(residual)(unknowns)`, flat. The arrays over which the functions close, such as parameters, have their derivatives
     too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
-    return solution(SquareSystem(residual, iterate, guess, solve))
+    return solution(SquareSystem(residual, iterate, guess, solve, jacobian))
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:
