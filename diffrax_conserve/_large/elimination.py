@@ -97,25 +97,28 @@ def _remainder(matrix: sp.csr_array, pivots: Pivots, others: Pivots) -> sp.csr_a
 
 def combinations(rows: sp.csr_array, matrix: sp.csr_array) -> sp.csr_array:
     """`rows matrix⁻¹`, the combinations of the rows of a regular matrix that `rows` are."""
-    rows = sp.csr_array(rows)
-    found = np.flatnonzero(np.diff(rows.indptr))
-    if not found.size:
-        return sp.csr_array(rows.shape)
-    if found.size * matrix.shape[0] > MOST_OPERATIONS:
+    rows, at = sp.csr_array(rows), sp.coo_array(matrix)
+    line, column = at.coords
+    # An element that is alone in its row and in its column is divided by.
+    alone = (np.bincount(line)[line] == 1) & (np.bincount(column)[column] == 1)
+    inverse = (1 / at.data[alone], (column[alone], line[alone]))
+    found = sp.csr_array(rows @ sp.csr_array(inverse, matrix.shape[::-1]))
+    others = _others(matrix.shape, line[alone], column[alone])
+    rest = rows[:, others[1]]
+    some = np.flatnonzero(np.diff(rest.indptr))
+    if some.size * len(others[0]) > MOST_OPERATIONS:
         raise TooFull
-    factors = spla.splu(sp.csc_array(matrix.T))
-    parts, number = [], 0
-    for start in range(0, found.size, _COLUMNS):
-        right = rows[found[start : start + _COLUMNS]].toarray().T
-        part = factors.solve(np.ascontiguousarray(right)).T
-        part[np.abs(part) <= _EPS * np.max(np.abs(part), axis=1, keepdims=True)] = 0
-        parts.append(sp.csr_array(part))
-        number += parts[-1].nnz
-        if number > MOST_ELEMENTS:
+    more = [(np.zeros(0), np.zeros(0, int), np.zeros(0, int))]
+    factors = spla.splu(sp.csc_array(matrix[others[0]][:, others[1]].T)) if some.size else None
+    for start in range(0, some.size, _COLUMNS):
+        those = some[start : start + _COLUMNS]
+        part = factors.solve(np.ascontiguousarray(rest[those].toarray().T)).T  # pyright: ignore
+        i, j = np.nonzero(np.abs(part) > _EPS * np.max(np.abs(part), axis=1, keepdims=True))
+        more.append((part[i, j], those[i], others[0][j]))
+        if sum(len(x) for x, *_ in more) > MOST_ELEMENTS:
             raise TooFull
-    all_parts = sp.coo_array(sp.vstack(parts))
-    at, column = all_parts.coords
-    return sp.csr_array((all_parts.data, (found[at], column)), rows.shape)
+    values, i, j = (np.concatenate(x) for x in zip(*more, strict=True))
+    return found + sp.csr_array((values, (i, j)), rows.shape)
 
 
 def _pivots(matrix: sp.csr_array) -> Pivots:
