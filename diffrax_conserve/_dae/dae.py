@@ -13,8 +13,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import scipy.sparse as sp
+from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._constants import LEAST_KLU
 from .._custom_types import Args, RealScalarLike, Values, Y
 from .._fast.scalars import small
 from .._hashable import Hashable
@@ -31,17 +34,19 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
+from .large import SparseMatrix
+from .large_search import NotFound
 from .newton import MAX_NEWTON_STEPS, algebraic_newton, at_rest_near, divided
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
-from .search import Search, any_traced, lifted, tree_key
+from .search import MOST_DENSE, Search, any_traced, lifted, tree_key
 
 
 @final
 class _Matrix(eqx.Module):
     """A constant matrix, known while JAX traces."""
 
-    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    known: SparseMatrix = eqx.field(static=True)
 
 
 def _mass(mass: Any) -> Any:
@@ -52,14 +57,19 @@ def _mass(mass: Any) -> Any:
             "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are "
             "solved. Pass a function `mass(t, y, args)`, and what it depends on in `args`."
         )
-    mass = np.asarray(mass)
-    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(mass)):
+    if isinstance(mass, BCOO):
+        at = np.asarray(mass.indices)
+        values = np.asarray(mass.data)
+        mass = sp.coo_array((values, (at[:, 0], at[:, 1])), mass.shape) if at.ndim == 2 else mass
+    mass = mass if sp.issparse(mass) else np.asarray(mass)
+    values = mass.tocoo().data if sp.issparse(mass) else mass  # pyright: ignore
+    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(values)):
         raise ValueError(
             f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square "
             "matrix of numbers, with a row for each equation and a column for each number of the "
             "state, or a function `mass(t, y, args)` that returns one."
         )
-    return _Matrix(tuple(map(tuple, mass.astype(float).tolist())))
+    return _Matrix(SparseMatrix(sp.csr_array(mass, dtype=float)))
 
 
 @final
@@ -334,10 +344,10 @@ class DAE(Hashable):
                 f"`{which}` returns {given} numbers, but {of} has {size}: there must be as many "
                 "equations as unknowns."
             )
-        matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
-        if matrix is not None and len(matrix) != size:
+        matrix = self.mass.known if isinstance(self.mass, _Matrix) else None
+        if matrix is not None and matrix.shape[0] != size:
             raise ValueError(
-                f"`mass` has {len(matrix)} rows, but the state has {size} numbers: pass a matrix "
+                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers: pass a matrix "
                 "with a row for each equation and a column for each number of the state."
             )
 
@@ -350,7 +360,9 @@ class DAE(Hashable):
             if self.algebraic is not None:
                 g = ravel(values["algebraic"]).astype(vector.dtype)
                 return jnp.concatenate([slopes[: f.size] - f, g])
-            mass = self.mass(t, state, args) if matrix is None else matrix
+            if matrix is not None and size >= LEAST_KLU:
+                return matrix @ slopes - f
+            mass = self.mass(t, state, args) if matrix is None else matrix.matrix.toarray()
             return jnp.asarray(mass, vector.dtype) @ slopes - f
 
         return equations
@@ -459,7 +471,7 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
 
 
 def _search(dae: DAE, y: Y, args: Args) -> Search:
-    mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
+    mass = dae.mass.known.matrix if isinstance(dae.mass, _Matrix) else None
 
     def equations(tree: Any) -> Implicit:
         dae, args = tree
@@ -510,6 +522,11 @@ def _found(
     except FloatingPointError:
         raise ValueError(
             f"The equations, or their derivatives, are not finite near the state.{elsewhere}"
+        ) from None
+    except NotFound as error:
+        raise ValueError(
+            f"The structure of these {ravel(y).size} equations was not found, because {error}. It "
+            f"is found by dense matrices for at most {MOST_DENSE} of them."
         ) from None
 
 

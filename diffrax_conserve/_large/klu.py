@@ -208,7 +208,7 @@ class SparseJacobian:
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
-        order = np.lexsort((rows, columns))
+        self.shape, order = shape, np.lexsort((rows, columns))
         rows, columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
         counts = np.bincount(rows, minlength=shape[0])
         dense = counts > DENSE_ROW_RATIO * max(1, np.median(counts))
