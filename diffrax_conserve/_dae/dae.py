@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._constants import LEAST_KLU
 from .._custom_types import Args, RealScalarLike, Values, Y
-from .._fast.scalars import small
 from .._hashable import Hashable
+from .._large.klu import sparse_jacobian
 from .._manifold import Constraint, slope_like
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
@@ -36,7 +36,7 @@ from .._solver.manifold_projection import ManifoldProjection
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
-from .newton import MAX_NEWTON_STEPS, algebraic_newton, at_rest_near, divided
+from .newton import MAX_NEWTON_STEPS, SparseNewton, algebraic_newton, at_rest_near, divided
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
 from .search import MOST_DENSE, Search, any_traced, lifted, tree_key
@@ -645,8 +645,14 @@ def _solved_for(
     def residual(z: Array) -> Array:
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
-    residual = small(residual, y[free])
-    return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
+    residual = reduction.small(residual, y[free])
+    is_large = structure.large is not None and free.size >= LEAST_KLU
+    found = sparse_jacobian(residual, y[free]) if is_large else None
+    if found is None:
+        return moved(root(residual, ft.partial(newton, residual), y[free], divided).y)
+    sparse = SparseNewton(found)
+    newton = ft.partial(newton, residual, sparse=sparse)
+    return moved(root(residual, newton, y[free], sparse.solve, sparse.jacobian).y)
 
 
 @final

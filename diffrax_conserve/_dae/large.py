@@ -73,10 +73,16 @@ class Large:
     - `by_y`, `by_slope`: the places of `∂F/∂y` and `∂F/∂y'`.
     - `combinations`: the equations that are left first, as these combinations of the equations at
         no slopes; `None` if they contain no slopes.
+    - `along`: the directions in which a state moves without what the equations differentiate, with
+        a column for each unknown for whose slope they are not solved; `None` if it is not known.
     - `eliminations`: for each differentiation but the first.
+    - `for_slopes`: the places of the derivative by slopes of the equations after the last
+        differentiation, which determine all slopes.
     """
 
     by_y: SparseJacobian
     by_slope: SparseJacobian
     combinations: SparseMatrix | None = None
+    along: SparseMatrix | None = None
     eliminations: tuple[Elimination, ...] = ()
+    for_slopes: SparseJacobian | None = None

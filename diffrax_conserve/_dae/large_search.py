@@ -86,6 +86,7 @@ def _found(
         n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=Large(by_y, by_slope)
     )
     seen, brought, met, needed = np.zeros(n, bool), [], [], none
+    in_places = by_slope.rows, by_slope.columns
     gradients = sp.csr_array((0, n))
     while len(selected[0]) < n:
         before = known.rounds[structure.index :] if known is not None else ()
@@ -110,7 +111,15 @@ def _found(
             raise Singular(_tuple(blamed), absent)
         matrix = _replaced(matrix, left, new)
         needed = np.unique(of_last.columns)
+        kept = ~np.isin(in_places[0], left)
+        added = left[of_last.rows], of_last.columns
+        in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
+    for_slopes = SparseJacobian(*in_places, (n, n))
+    large = dataclasses.replace(structure.large, for_slopes=for_slopes)  # pyright: ignore
+    structure = dataclasses.replace(structure, large=large)
+    if structure.index == 1 and large.along is None:
+        raise NotFound("the coefficients of their slopes are coupled, and not constant")
     if all(met):
         structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
     return structure
@@ -162,6 +171,8 @@ def _with_round(
     )
     constant = structure.is_linear and structure.mass is not None
     if k == 0:
+        large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
+        structure = dataclasses.replace(structure, large=large)
         if structure.apart:
             return structure
         if not constant:
@@ -193,6 +204,22 @@ def _with_round(
         one = Elimination(levels=_levels(matrix, rows, columns, needed))
     large = dataclasses.replace(large, eliminations=(*large.eliminations, one))
     return dataclasses.replace(structure, large=large)
+
+
+def _along(
+    matrix: sp.csr_array, rows: np.ndarray, columns: np.ndarray, constant: bool
+) -> SparseMatrix | None:
+    """A basis of the vectors that rows of a matrix map to zero; `None` if it is not constant."""
+    n = matrix.shape[0]
+    free = np.setdiff1d(np.arange(n), columns)
+    basis = sp.csr_array((np.ones(len(free)), (free, np.arange(len(free)))), (n, len(free)))
+    outer = matrix[rows][:, free]
+    if outer.nnz:
+        if not constant:
+            return None
+        share = combinations(sp.csr_array(outer.T), sp.csr_array(matrix[rows][:, columns].T))
+        basis = basis - _spread(share, None, columns, n).T
+    return SparseMatrix(sp.csr_array(basis))
 
 
 def _spread(

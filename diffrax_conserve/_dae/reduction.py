@@ -30,7 +30,7 @@ from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import without_pattern
 from .large import Large
-from .newton import algebraic_newton, divided
+from .newton import SparseNewton, algebraic_newton, divided
 
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
@@ -144,12 +144,12 @@ class Reduction:
 
     def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
         self.like, self.structure = (t, y), structure
-        self.equations = self._small(equations, t, y, y)
+        self.equations = self.small(equations, t, y, y)
         self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
         for k in range(structure.index):
-            self.constraints = self._small(self._further(k), t, y)
+            self.constraints = self.small(self._further(k), t, y)
 
-    def _small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
+    def small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
         return fn if self.structure.large is not None else small(fn, *like)
 
     def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
@@ -210,18 +210,25 @@ class Reduction:
         return small(slopes, *self.like)
 
     def _needed_slopes(self, k: int) -> Callable[[Array, Array], Array]:
-        """Those slopes of round `k` that its constraints need."""
-        structure, equations, constraints = self.structure, self.equations, self.constraints
-        assert structure.large is not None
-        elimination = structure.large.eliminations[k - 1]
-        as_given = elimination.constant is not None
+        """Those slopes of round `k` that its constraints need; after the last one all."""
+        structure, large = self.structure, self.structure.large
+        assert large is not None
+        elimination = large.eliminations[k - 1] if k < structure.index else None
+        as_given = elimination is not None and elimination.constant is not None
 
         def slopes(t: Array, y: Array) -> Array:
             def residual(slopes: Array) -> Array:
-                rates = [] if as_given else _along(constraints, t, y, slopes)[1]
-                return self._replaced(equations(t, y, slopes), rates)
+                rates = [] if as_given else _along(self.constraints, t, y, slopes)[1]
+                return self._replaced(self.equations(t, y, slopes), rates)
 
-            return elimination.slopes(residual, y)
+            if elimination is not None:
+                return elimination.slopes(residual, y)
+            assert large.for_slopes is not None
+            begin, newton = jnp.zeros_like(y), SparseNewton(large.for_slopes)
+            if structure.is_linear:
+                return newton.solve(newton.jacobian(residual)(begin), -residual(begin))
+            iterate = ft.partial(algebraic_newton, residual, sparse=newton)
+            return root(residual, iterate, begin, newton.solve, newton.jacobian).y
 
         return slopes
 
@@ -232,7 +239,7 @@ class Reduction:
             _, rates = _along(lambda t, y: self.constraints(t, y)[:-1], t, y, slopes)
             return self._replaced(self.equations(t, y, slopes), rates)
 
-        return self._small(differentiated, t, y, slopes)(t, y, slopes)
+        return self.small(differentiated, t, y, slopes)(t, y, slopes)
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
@@ -243,13 +250,15 @@ class Reduction:
 
     def freely_moved(
         self, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+    ) -> tuple[Any, np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""
         structure = self.structure
         rows, columns = (np.array(x, int) for x in structure.rounds[0])
-        free = np.array([j for j in range(structure.size) if j not in columns], int)
+        free = np.setdiff1d(np.arange(structure.size), columns)
+        if structure.large is not None:
+            return structure.large.along, free
         matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
         solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
         one = jnp.eye(free.size, dtype=y.dtype)
@@ -291,7 +300,7 @@ class Reduction:
             fits = self.fits(*lax.stop_gradient((t, y)))
             return jtu.tree_map(lambda x: jnp.where(fits, x, jnp.nan), fn(t, y))
 
-        return self._small(checked, t, y)(t, y)
+        return self.small(checked, t, y)(t, y)
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
