@@ -36,7 +36,7 @@ from .._solver.manifold_projection import ManifoldProjection
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
-from .newton import MAX_NEWTON_STEPS, SparseNewton, algebraic_newton, at_rest_near, divided
+from .newton import MAX_NEWTON_STEPS, SparseNewton, algebraic_newton, at_rest_near, divided, least_exact
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
 from .search import MOST_DENSE, Search, any_traced, lifted, tree_key
@@ -590,8 +590,7 @@ class ConstraintProjection(AbstractProjection):
             return y, problem.report(candidate, y, info.num_iterations, ok=info.ok)
         if structure.large is not None:
             # Along a ladder of a thousand resistors the voltages underflow.
-            tiny = float(jnp.finfo(candidate.dtype).tiny)
-            problem = dataclasses.replace(problem, atol=tiny)
+            problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
         y = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
         return y, problem.report(candidate, y)
 

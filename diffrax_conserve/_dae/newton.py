@@ -114,6 +114,12 @@ class SparseNewton:
         return self.places.solve(values, b)
 
 
+def least_exact(dtype: Any) -> float:
+    """The least number of which a change by roundoff does not underflow."""
+    info = jnp.finfo(dtype)
+    return float(info.tiny) / float(info.eps)
+
+
 def algebraic_newton(
     residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
 ) -> Solved:
@@ -162,7 +168,7 @@ def at_rest_near(
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.
         size = size + eps**0.5 * factored.least_changes(size)
-        size = jnp.where(size > 0, size, 1)
+        size = jnp.where(size > 0, jnp.maximum(size, least_exact(z.dtype)), 1)
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
         # for half of that gain.
