@@ -13,11 +13,14 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import scipy.sparse as sp
+from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._constants import LEAST_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._fast.scalars import small
 from .._hashable import Hashable
+from .._large.klu import sparse_jacobian
 from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
@@ -32,17 +35,26 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_nothing
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
-from .newton import MAX_NEWTON_STEPS, algebraic_newton, at_rest_near, divided
+from .large import SparseMatrix
+from .large_search import NotFound
+from .newton import (
+    MAX_NEWTON_STEPS,
+    SparseNewton,
+    algebraic_newton,
+    at_rest_near,
+    divided,
+    least_exact,
+)
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
-from .search import Search, any_traced, lifted, tree_key
+from .search import MOST_DENSE, Search, any_traced, lifted, tree_key
 
 
 @final
 class _Matrix(eqx.Module):
     """A constant matrix, known while JAX traces."""
 
-    rows: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    known: SparseMatrix = eqx.field(static=True)
 
 
 def _mass(mass: Any) -> Any:
@@ -53,14 +65,19 @@ def _mass(mass: Any) -> Any:
             "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are "
             "solved. Pass a function `mass(t, y, args)`, and what it depends on in `args`."
         )
-    mass = np.asarray(mass)
-    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(mass)):
+    if isinstance(mass, BCOO):
+        at = np.asarray(mass.indices)
+        values = np.asarray(mass.data)
+        mass = sp.coo_array((values, (at[:, 0], at[:, 1])), mass.shape) if at.ndim == 2 else mass
+    mass = mass if sp.issparse(mass) else np.asarray(mass)
+    values = mass.tocoo().data if sp.issparse(mass) else mass  # pyright: ignore
+    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(values)):
         raise ValueError(
             f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square "
             "matrix of numbers, with a row for each equation and a column for each number of the "
             "state, or a function `mass(t, y, args)` that returns one."
         )
-    return _Matrix(tuple(map(tuple, mass.astype(float).tolist())))
+    return _Matrix(SparseMatrix(sp.csr_array(mass, dtype=float)))
 
 
 @final
@@ -362,10 +379,10 @@ class DAE(Hashable):
                 f"`{which}` returns {given} numbers, but {of} has {size}: there must be as many "
                 "equations as unknowns."
             )
-        matrix = np.asarray(self.mass.rows) if isinstance(self.mass, _Matrix) else None
-        if matrix is not None and len(matrix) != size:
+        matrix = self.mass.known if isinstance(self.mass, _Matrix) else None
+        if matrix is not None and matrix.shape[0] != size:
             raise ValueError(
-                f"`mass` has {len(matrix)} rows, but the state has {size} numbers: pass a matrix "
+                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers: pass a matrix "
                 "with a row for each equation and a column for each number of the state."
             )
 
@@ -378,7 +395,9 @@ class DAE(Hashable):
             if self.algebraic is not None:
                 g = ravel(values["algebraic"]).astype(vector.dtype)
                 return jnp.concatenate([slopes[: f.size] - f, g])
-            mass = self.mass(t, state, args) if matrix is None else matrix
+            if matrix is not None and size >= LEAST_KLU:
+                return matrix @ slopes - f
+            mass = self.mass(t, state, args) if matrix is None else matrix.matrix.toarray()
             return jnp.asarray(mass, vector.dtype) @ slopes - f
 
         return equations
@@ -487,7 +506,7 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
 
 
 def _search(dae: DAE, y: Y, args: Args) -> Search:
-    mass = np.asarray(dae.mass.rows) if isinstance(dae.mass, _Matrix) else None
+    mass = dae.mass.known.matrix if isinstance(dae.mass, _Matrix) else None
 
     def equations(tree: Any) -> Implicit:
         dae, args = tree
@@ -538,6 +557,11 @@ def _found(
     except FloatingPointError:
         raise ValueError(
             f"The equations, or their derivatives, are not finite near the state.{elsewhere}"
+        ) from None
+    except NotFound as error:
+        raise ValueError(
+            f"The structure of these {ravel(y).size} equations was not found, because {error}. It "
+            f"is found by dense matrices for at most {MOST_DENSE} of them."
         ) from None
 
 
@@ -599,6 +623,9 @@ class ConstraintProjection(AbstractProjection):
             free = dataclasses.replace(problem, factor=Diagonal(structure.units(sizes)))
             y, info = SimplifiedNewton().solve(free, candidate)
             return y, problem.report(candidate, y, info.num_iterations, ok=info.ok)
+        if structure.large is not None:
+            # Along a ladder of a thousand resistors the voltages underflow.
+            problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
         y, settled = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
         info = problem.report(candidate, y)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
@@ -660,8 +687,15 @@ def _solved_for(
     def residual(z: Array) -> Array:
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
-    residual = small(residual, y[free])
-    found = root(residual, ft.partial(newton, residual), y[free], divided)
+    residual = reduction.small(residual, y[free])
+    is_large = structure.large is not None and free.size >= LEAST_KLU
+    jacobian = sparse_jacobian(residual, y[free]) if is_large else None
+    if jacobian is None:
+        found = root(residual, ft.partial(newton, residual), y[free], divided)
+    else:
+        sparse = SparseNewton(jacobian)
+        newton = ft.partial(newton, residual, sparse=sparse)
+        found = root(residual, newton, y[free], sparse.solve, sparse.jacobian)
     return moved(found.y), found.ok & jnp.asarray(False if found.more is None else found.more)
 
 

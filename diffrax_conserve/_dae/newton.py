@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
+from .._large.klu import Places, SparseJacobian
 from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
@@ -18,6 +19,7 @@ from .._numerics.rows import DenseRows
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
 # lowers it by one thermal voltage, of 0.025 V, because the current is exponential.
 MAX_NEWTON_STEPS = 500
+Residual = Callable[[Array], Array]
 
 
 def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -42,12 +44,15 @@ class _Factored(NamedTuple):
     rows: Float[Array, " m"]
     columns: Float[Array, " m"]
 
+    jacobian: Float[Array, "m m"]
+
     @classmethod
-    def of(cls, jacobian: Float[Array, "m m"]) -> "_Factored":
+    def at(cls, residual: Residual, z: Float[Array, " m"]) -> "_Factored":
+        jacobian = jax.jacfwd(residual)(z)
         rows, columns = _sizes(jacobian)
         scaled = jacobian / rows[:, None] / columns
         one = scaled, jnp.zeros(1, jnp.int32)
-        return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns)
+        return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns, jacobian)
 
     def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
         right = residual / self.rows
@@ -58,12 +63,72 @@ class _Factored(NamedTuple):
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
         return jnp.all(pivots > ROUNDOFF * float(jnp.finfo(pivots.dtype).eps))
 
+    def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
+        """For each unknown the least change that the largest term of one of its equations stands
+        for, if unknowns have these sizes."""
+        slopes = jnp.abs(self.jacobian)
+        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
+        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+        return jnp.min(least, axis=0, initial=jnp.inf)
 
-def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
+
+class _SparseFactored(NamedTuple):
+    """As `_Factored`, for many unknowns. KLU factors again in each solve."""
+
+    places: Places
+    values: Float[Array, " k"]
+
+    def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
+        return -self.places.solve_regular(self.values, residual)
+
+    def regular(self) -> Bool[Array, ""]:
+        return ~jnp.any(jnp.isnan(self.values))
+
+    def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
+        rows, columns, slopes = self.places.rows, self.places.columns, jnp.abs(self.values)
+        terms = jax.ops.segment_max(slopes * size[columns], rows, self.places.size)
+        least = jnp.where(slopes > 0, terms[rows] / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+        return jax.ops.segment_min(least, columns, self.places.size)
+
+
+class SparseNewton:
+    """Newton's method with a sparse Jacobian, and the linear systems of the derivative. `sizes` are
+    those of the terms of the residual."""
+
+    def __init__(self, found: SparseJacobian):
+        self.found, self.places = found, Places(found.rows, found.columns, found.shape[0])
+
+    def at(self, residual: Residual, z: Float[Array, " m"]) -> _SparseFactored:
+        values = self.found.values(residual, z)
+        values = jnp.where(self.places.is_regular(values), values, jnp.nan)
+        return _SparseFactored(self.places, values)
+
+    def at_roundoff(self, residual: Residual, z: Float[Array, " m"]) -> Bool[Array, ""]:
+        sizes = self.places.matvec(jnp.abs(self.found.values(residual, z)), jnp.abs(z))
+        return jnp.all(jnp.abs(residual(z)) <= ROUNDOFF * float(jnp.finfo(z.dtype).eps) * sizes)
+
+    def jacobian(self, residual: Residual) -> Residual:
+        return lambda z: self.found.values(residual, z)
+
+    def solve(self, values: Float[Array, " k"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+        return self.places.solve(values, b)
+
+
+def least_exact(dtype: Any) -> float:
+    """The least number of which a change by roundoff does not underflow."""
+    info = jnp.finfo(dtype)
+    return float(info.tiny) / float(info.eps)
+
+
+def algebraic_newton(
+    residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
+) -> Solved:
     """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
-    z, at_rest, num_iterations, settled = at_rest_near(residual, z)
+    z, at_rest, num_iterations, settled = at_rest_near(residual, z, sparse)
 
     def at_roundoff() -> Bool[Array, ""]:
+        if sparse is not None:
+            return sparse.at_roundoff(residual, z)
         g, jacobian, hidden = cancellation_terms(residual, z)
         limit = ROUNDOFF * float(jnp.finfo(z.dtype).eps)
         scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
@@ -76,7 +141,9 @@ def algebraic_newton(residual: Callable[[Array], Array], z: Float[Array, " m"]) 
     return Solved(jnp.where(found, z, jnp.nan), found, num_iterations)
 
 
-def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> Solved:
+def at_rest_near(
+    residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
+) -> Solved:
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
     Nonlinear Problems*, Springer 2004, 3.3).
 
@@ -89,23 +156,20 @@ def at_rest_near(residual: Callable[[Array], Array], z: Float[Array, " m"]) -> S
     is NaN if corrections become infinite, or the Jacobian is singular.
     """
     eps = float(jnp.finfo(z.dtype).eps)
+    linearised = _Factored.at if sparse is None else sparse.at
 
     def advance(now: Any, counter: Array) -> tuple[Any, Array]:
         # The unknowns, the share of the correction to try next, and whether they have converged.
         z, share, _ = now
-        jacobian = jax.jacfwd(residual)(z)
-        factored = _Factored.of(jacobian)
+        factored = linearised(residual, z)
         step = factored.correction(residual(z))
         trial = z + share * step
         after = factored.correction(residual(trial))
         size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.
-        slopes = jnp.abs(jacobian)
-        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
-        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
-        size = size + eps**0.5 * jnp.min(least, axis=0, initial=jnp.inf)
-        size = jnp.where(size > 0, size, 1)
+        size = size + eps**0.5 * factored.least_changes(size)
+        size = jnp.where(size > 0, jnp.maximum(size, least_exact(z.dtype)), 1)
         before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
         # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
         # for half of that gain.

@@ -29,7 +29,8 @@ from .._constants import REGULARISATION_POWER
 from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import without_pattern
-from .newton import algebraic_newton, divided
+from .large import Large
+from .newton import SparseNewton, algebraic_newton, divided
 
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
@@ -59,17 +60,21 @@ class Structure:
       do not, such as positions, velocities and forces; empty if not all constraints can be met by
       these alone.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
+    - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
 
     size: int
     rounds: tuple[Round, ...]
     is_linear: bool
-    mass: np.ndarray | None = None
+    mass: Any = None
     apart: bool = False
     brought: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
+    large: Large | None = None
 
     def _values(self) -> tuple[Any, ...]:
+        if self.large is not None:  # found once for equations, so it is compared by identity
+            return self.large, self.rounds
         others = dataclasses.astuple(dataclasses.replace(self, mass=None))
         return *others, None if self.mass is None else self.mass.tobytes()
 
@@ -91,7 +96,7 @@ class Structure:
     @property
     def times(self) -> tuple[int, ...]:
         """How often each equation is differentiated."""
-        lefts = [self.left(k) for k in range(self.index)]
+        lefts = [set(self.left(k)) for k in range(self.index)]
         return tuple(sum(i in left for left in lefts) for i in range(self.size))
 
     @property
@@ -104,12 +109,13 @@ class Structure:
 
     def left(self, k: int) -> tuple[int, ...]:
         """The equations that are left in a round, and give constraints."""
-        return tuple(i for i in range(self.size) if i not in self.rounds[k].equations)
+        solved = set(self.rounds[k].equations)
+        return tuple(i for i in range(self.size) if i not in solved)
 
     @property
     def algebraic(self) -> tuple[int, ...]:
         """The unknowns for whose slopes no equation is solved before the last differentiation."""
-        known = self.rounds[-1].slopes if self.rounds else range(self.size)
+        known = set(self.rounds[-1].slopes if self.rounds else range(self.size))
         return tuple(j for j in range(self.size) if j not in known)
 
     def units(self, sizes: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -138,17 +144,23 @@ class Reduction:
 
     def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
         self.like, self.structure = (t, y), structure
-        self.equations = small(equations, t, y, y)
+        self.equations = self.small(equations, t, y, y)
         self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
         for k in range(structure.index):
-            self.constraints = small(self._further(k), t, y)
+            self.constraints = self.small(self._further(k), t, y)
+
+    def small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
+        return fn if self.structure.large is not None else small(fn, *like)
 
     def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
         """The constraints with those of round `k`. The first are the equations that are left at the
         slopes that are selected; each of the others is a derivative of what is left of the one
         before."""
         structure, before, equations = self.structure, self.constraints, self.equations
-        left = np.array(structure.left(k), int)
+        left, large = np.array(structure.left(k), int), structure.large
+        if k == 0 and large is not None and large.combinations is not None:
+            combinations = large.combinations
+            return lambda t, y: [combinations @ equations(t, y, jnp.zeros_like(y))]
         none = k == 0 and structure.apart  # such equations contain no slopes
         slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
         if k == 0:
@@ -165,6 +177,8 @@ class Reduction:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
         are not selected are zero."""
         structure, equations, constraints = self.structure, self.equations, self.constraints
+        if structure.large is not None:
+            return self._needed_slopes(k)
         every = tuple(range(structure.size))
         selected = structure.rounds[k] if k < structure.index else Round(every, every)
         rows, columns = (np.array(x, int) for x in selected)
@@ -195,6 +209,29 @@ class Reduction:
 
         return small(slopes, *self.like)
 
+    def _needed_slopes(self, k: int) -> Callable[[Array, Array], Array]:
+        """Those slopes of round `k` that its constraints need; after the last one all."""
+        structure, large = self.structure, self.structure.large
+        assert large is not None
+        elimination = large.eliminations[k - 1] if k < structure.index else None
+        as_given = elimination is not None and elimination.constant is not None
+
+        def slopes(t: Array, y: Array) -> Array:
+            def residual(slopes: Array) -> Array:
+                rates = [] if as_given else _along(self.constraints, t, y, slopes)[1]
+                return self._replaced(self.equations(t, y, slopes), rates)
+
+            if elimination is not None:
+                return elimination.slopes(residual, y)
+            assert large.for_slopes is not None
+            begin, newton = jnp.zeros_like(y), SparseNewton(large.for_slopes)
+            if structure.is_linear:
+                return newton.solve(newton.jacobian(residual)(begin), -residual(begin))
+            iterate = ft.partial(algebraic_newton, residual, sparse=newton)
+            return root(residual, iterate, begin, newton.solve, newton.jacobian).y
+
+        return slopes
+
     def stages(self, t: Array, y: Array, slopes: Array) -> Array:
         """`F_{ν-1}`, the equations after all differentiations but the last."""
 
@@ -202,7 +239,7 @@ class Reduction:
             _, rates = _along(lambda t, y: self.constraints(t, y)[:-1], t, y, slopes)
             return self._replaced(self.equations(t, y, slopes), rates)
 
-        return small(differentiated, t, y, slopes)(t, y, slopes)
+        return self.small(differentiated, t, y, slopes)(t, y, slopes)
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
@@ -211,15 +248,15 @@ class Reduction:
             values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
 
-    def freely_moved(
-        self, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Float[Array, "n m"], np.ndarray]:
+    def freely_moved(self, t: Array, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""
         structure = self.structure
         rows, columns = (np.array(x, int) for x in structure.rounds[0])
-        free = np.array([j for j in range(structure.size) if j not in columns], int)
+        free = np.setdiff1d(np.arange(structure.size), columns)
+        if structure.large is not None:
+            return structure.large.along, free
         matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
         solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
         one = jnp.eye(free.size, dtype=y.dtype)
@@ -236,6 +273,11 @@ class Reduction:
         structure = self.structure
         if structure.mass is not None or not structure.rounds:
             return jnp.asarray(True)
+        if structure.large is not None:
+            by_slope, slopes = structure.large.by_slope, jnp.zeros_like(y)
+            values = by_slope.values(lambda slopes: self.equations(t, y, slopes), slopes)
+            left = np.isin(by_slope.rows, structure.left(0))
+            return ~jnp.any(values[left])
         left = self._by_slopes(t, y)[np.array(structure.left(0), int)]
         if structure.apart:
             return ~jnp.any(left)
@@ -256,7 +298,7 @@ class Reduction:
             fits = self.fits(*lax.stop_gradient((t, y)))
             return jtu.tree_map(lambda x: jnp.where(fits, x, jnp.nan), fn(t, y))
 
-        return small(checked, t, y)(t, y)
+        return self.small(checked, t, y)(t, y)
 
 
 def _along(constraints: Any, t: Array, y: Array, slopes: Array) -> Any:
@@ -350,18 +392,23 @@ def _near(
 ) -> tuple[Array, ...]:
     """A time and a state at this relative distance, and what is known of the equations there."""
     given = small(ft.partial(equations, numbers), t, y, y)
-    pattern = without_pattern(3 * y.size + 1, y.dtype)
-    largest = jnp.max(jnp.abs(y), initial=0)
-    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
-    moved = y + share * size * (1 + pattern[: y.size] / 2)
-    later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
-    slopes = size * pattern[:-1].reshape(3, -1)[1:]
+    later, moved, slopes = general_states(t, y, share)
     all_at = small(lambda *now: (given(*now), *jax.jacfwd(given, (1, 2))(*now)), t, y, y)
     values, by_ys, by_slope = jax.vmap(lambda slope: all_at(later, moved, slope))(slopes)
     value, by_y = values[0], by_ys[0]
     finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
     absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
     return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
+
+
+def general_states(t: Array, y: Array, share: float) -> tuple[Array, Array, Array]:
+    """A time and a state at this relative distance, and two slopes."""
+    pattern = without_pattern(3 * y.size + 1, y.dtype)
+    largest = jnp.max(jnp.abs(y), initial=0)
+    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
+    moved = y + share * size * (1 + pattern[: y.size] / 2)
+    later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
+    return later, moved, size * pattern[:-1].reshape(3, -1)[1:]
 
 
 def _extended(matrix: np.ndarray, round: Round) -> Round:

@@ -16,14 +16,20 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array
 
+from .._constants import LEAST_KLU
 from .._hashable import is_array
+from .._large.klu import available, why_not
 from .._tree import without_pattern
+from .large_search import NotFound, find_large_structure
 from .reduction import Implicit, Numbers, Singular, Structure, find_structure
 
 # General numbers of these sizes are tried in turn, until the equations are finite and regular:
 # exponentials of large numbers are infinite, and roots and logarithms need some signs.
+# Up to this many equations dense matrices do where sparse ones do not: they take half a minute.
+MOST_DENSE = 1000
 _SIZES = (1.0, 0.1, 10.0, 100.0, -1.0)
 
 
@@ -39,7 +45,7 @@ class Search:
         equations: Callable[[Any], Implicit],
         tree: Any,
         y: Array,
-        mass: np.ndarray | None,
+        mass: sp.csr_array | None,
         *,
         floats: bool,
     ):
@@ -58,6 +64,8 @@ class Search:
         consts = [None if _is_traced(x) else x for x in closed.consts]
         self._kinds = [_shape(x) for x in closed.consts], kinds, time, state
         self._consts, self._mass = consts, mass
+        unknown = [i for i, x in enumerate(consts) if x is None]
+        self._unknown = *unknown, *range(count, count + len(kinds))
         self.is_traced = any(x is None for x in consts)  # what the functions close over
 
         def given(numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
@@ -101,7 +109,21 @@ class Search:
     ) -> Structure:
         numbers = [*consts, *leaves]
         others = [_another(x) for x in numbers]
-        return find_structure(self._given, numbers, others, t, y, self._mass, known)
+        given, mass = (self._given, numbers, others, t, y), self._mass
+        try:
+            return _large_structure(*given, mass, self._unknown, known)
+        except NotFound:
+            if y.size > MOST_DENSE:
+                raise
+        return find_structure(*given, None if mass is None else mass.toarray(), known)
+
+
+def _large_structure(equations: Any, numbers: Any, others: Any, t: Any, y: Any, *more: Any) -> Any:
+    if y.size < LEAST_KLU:
+        raise NotFound("they are few")
+    if not available(y.dtype):
+        raise NotFound(why_not() or "that needs float64 on a CPU")
+    return find_large_structure(equations, numbers, others, t, y, *more)
 
 
 def _is_traced(x: Any) -> bool:

@@ -208,10 +208,12 @@ class SparseJacobian:
     """
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
-        order = np.lexsort((rows, columns))
+        self.shape, order = shape, np.lexsort((rows, columns))
         rows, columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
         counts = np.bincount(rows, minlength=shape[0])
-        dense = counts > DENSE_ROW_RATIO * max(1, np.median(counts))
+        # There are at least as many colours as elements in a row, and few rows take fewer passes.
+        widest = np.max(counts, initial=0)
+        dense = (counts > DENSE_ROW_RATIO * max(1, np.median(counts))) | (widest > shape[0])
         few = ~dense[rows]
         found = asdex().SparsityPattern.from_coo(rows[few], columns[few], shape)
         colours, number = asdex().color_cols(found) if np.any(few) else (np.zeros(shape[1], int), 0)

@@ -1,0 +1,352 @@
+"""The structure of large equations, from sparse matrices.
+
+It is found as that of small ones, in `reduction.find_structure`: by elimination of the derivatives
+at numbers in general position. asdex finds their places, `_large.elimination` eliminates. What this
+can not do is refused with its reason, before it takes long.
+"""
+
+import dataclasses
+import functools as ft
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array
+
+from .._large.asdex_import import asdex
+from .._large.elimination import TooFull, combinations, extended
+from .._large.klu import SparseJacobian
+from .large import Elimination, Large, SparseMatrix
+from .reduction import Numbers, Reduction, Round, Singular, Structure, WithNumbers, general_states
+
+# The largest index that is looked for. Each differentiation makes the functions larger, and
+# mechanisms have three.
+MAX_INDEX = 3
+# A matrix of eliminated slopes with more than this many elements for each row is given up: each
+# constraint would contain so many unknowns.
+_MOST_TERMS = 64
+_LEVELS = 8
+
+
+class NotFound(Exception):
+    """Why the structure was not found."""
+
+
+def find_large_structure(
+    equations: WithNumbers,
+    numbers: Numbers,
+    others: Numbers,
+    t: Array,
+    y: Array,
+    mass: sp.csr_array | None,
+    unknown: tuple[int, ...],
+    known: Structure | None = None,
+) -> Structure:
+    """As `find_structure`. `unknown` are the numbers that may have any values, also where they are
+    indices."""
+    try:
+        return _found(equations, numbers, others, t, y, mass, unknown, known)
+    except TooFull:
+        raise NotFound(
+            "the matrices of their derivatives fill in too much when they are eliminated"
+        ) from None
+    except NotImplementedError as error:
+        raise NotFound(f"asdex, which finds the places of derivatives, says: {error}") from None
+
+
+def _found(
+    equations: WithNumbers,
+    numbers: Numbers,
+    others: Numbers,
+    t: Array,
+    y: Array,
+    mass: sp.csr_array | None,
+    unknown: tuple[int, ...],
+    known: Structure | None,
+) -> Structure:
+    n = y.size
+    places = _Places(equations, numbers, unknown)
+    by_slope = places.of(lambda given, t, y, s: equations(given, t, y, s), 2, n)
+    by_y = places.of(lambda given, t, y, s: equations(given, t, y, s), 1, n)
+    t, y, values, is_linear, absent = _general_position(equations, by_y, by_slope, numbers, t, y)
+    matrix = other = _matrix(by_slope, values)
+    if mass is None:
+        later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
+        values = _by_slope(equations, by_slope, others, later, moved, y)
+        other = _matrix(by_slope, values)
+        mass = matrix if (matrix != other).nnz == 0 else None
+    none = np.zeros(0, int)
+    selected = extended(matrix, (none, none))
+    first = np.setdiff1d(np.arange(n), selected[0])
+    apart = not (matrix[first].nnz or other[first].nnz)
+    without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
+    structure = Structure(
+        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=Large(by_y, by_slope)
+    )
+    seen, brought, met, needed = np.zeros(n, bool), [], [], none
+    in_places = by_slope.rows, by_slope.columns
+    gradients = sp.csr_array((0, n))
+    while len(selected[0]) < n:
+        before = known.rounds[structure.index :] if known is not None else ()
+        if before and len(before[0].slopes) == len(selected[0]):
+            selected = tuple(np.array(x, int) for x in before[0])
+        if structure.index == MAX_INDEX:
+            raise NotFound(f"their index is larger than {MAX_INDEX}")
+        structure = _with_round(structure, selected, matrix, needed)
+        left = np.array(structure.left(structure.index - 1), int)
+        last = _Last(equations, structure)
+        of_last = places.of(last.constraints, 1, n)
+        new = _matrix(of_last, last.values(of_last, numbers, t, y))
+        contained = ~_empty(new, 0)
+        brought.append(np.flatnonzero(contained & ~seen))
+        met.append(len(extended(new[:, brought[-1]], (none, none))[0]) == len(left))
+        seen |= contained
+        gradients = sp.csr_array(sp.vstack([gradients, new]))
+        independent = extended(gradients, (none, none))[0]
+        if len(independent) < gradients.shape[0]:
+            start = gradients.shape[0] - len(left)
+            blamed = left[~np.isin(start + np.arange(len(left)), independent)]
+            raise Singular(_tuple(blamed), absent)
+        matrix = _replaced(matrix, left, new)
+        needed = np.unique(of_last.columns)
+        kept = ~np.isin(in_places[0], left)
+        added = left[of_last.rows], of_last.columns
+        in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
+        selected = extended(matrix, selected)
+    for_slopes = SparseJacobian(*in_places, (n, n))
+    large = dataclasses.replace(structure.large, for_slopes=for_slopes)  # pyright: ignore
+    structure = dataclasses.replace(structure, large=large)
+    if structure.index == 1 and large.along is None:
+        raise NotFound("the coefficients of their slopes are coupled, and not constant")
+    if all(met):
+        structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
+    return structure
+
+
+def _tuple(x: np.ndarray) -> tuple[int, ...]:
+    return tuple(x.tolist())
+
+
+def _empty(matrix: sp.csr_array, axis: int) -> np.ndarray:
+    """Which columns, or rows, have no element."""
+    return np.bincount(sp.coo_array(matrix).coords[1 - axis], minlength=matrix.shape[1 - axis]) == 0
+
+
+def _matrix(places: SparseJacobian, values: Any) -> sp.csr_array:
+    out = sp.csr_array((np.asarray(values), (places.rows, places.columns)), places.shape)
+    out.eliminate_zeros()
+    return out
+
+
+def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.csr_array:
+    kept = np.ones(matrix.shape[0])
+    kept[rows] = 0
+    by = sp.coo_array(by)
+    at = rows[by.coords[0]], by.coords[1]
+    out = sp.diags_array(kept) @ matrix + sp.csr_array((by.data, at), matrix.shape)
+    out = sp.csr_array(out)
+    out.eliminate_zeros()
+    return out
+
+
+# ---- Eliminated slopes ----
+
+
+def _with_round(
+    structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
+) -> Structure:
+    """The structure with one more round, of which the slopes that the constraints before it contain
+    are needed."""
+    rows, columns = selected
+    large, k = structure.large, structure.index
+    assert large is not None
+    given, others = rows, np.zeros(0, int)
+    if k:
+        others = np.array(structure.left(0), int)
+        given = np.setdiff1d(rows, others)
+    structure = dataclasses.replace(
+        structure, rounds=(*structure.rounds, Round(_tuple(rows), _tuple(columns)))
+    )
+    constant = structure.is_linear and structure.mass is not None
+    if k == 0:
+        large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
+        structure = dataclasses.replace(structure, large=large)
+        if structure.apart:
+            return structure
+        if not constant:
+            raise NotFound(
+                "equations without slopes are combinations of others, and the coefficients of "
+                "their slopes are not constant"
+            )
+        left = np.array(structure.left(0), int)
+        share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
+        whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
+        whole = whole - _spread(share, None, rows, structure.size)
+        large = dataclasses.replace(large, combinations=SparseMatrix(whole))
+        return dataclasses.replace(structure, large=large)
+    needed = np.intersect1d(needed, columns)
+    if constant and given.size == rows.size:
+        at = np.searchsorted(np.sort(columns), needed)
+        at = np.argsort(columns)[at]
+        one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
+        inverse = combinations(one, structure.mass[rows][:, columns])
+        if inverse.nnz > _MOST_TERMS * max(1, len(at)):
+            raise NotFound(
+                "the slopes of too many unknowns are coupled, as those of finite elements with a "
+                "consistent mass matrix: use a diagonal one"
+            )
+        one = Elimination(SparseMatrix(_spread(-inverse, needed, rows, structure.size)))
+    else:
+        one = Elimination(levels=_levels(matrix, rows, columns, needed))
+    large = dataclasses.replace(large, eliminations=(*large.eliminations, one))
+    return dataclasses.replace(structure, large=large)
+
+
+def _along(
+    matrix: sp.csr_array, rows: np.ndarray, columns: np.ndarray, constant: bool
+) -> SparseMatrix | None:
+    """A basis of the vectors that rows of a matrix map to zero; `None` if it is not constant."""
+    n = matrix.shape[0]
+    free = np.setdiff1d(np.arange(n), columns)
+    basis = sp.csr_array((np.ones(len(free)), (free, np.arange(len(free)))), (n, len(free)))
+    outer = matrix[rows][:, free]
+    if outer.nnz:
+        if not constant:
+            return None
+        share = combinations(sp.csr_array(outer.T), sp.csr_array(matrix[rows][:, columns].T))
+        basis = basis - _spread(share, None, columns, n).T
+    return SparseMatrix(sp.csr_array(basis))
+
+
+def _spread(
+    matrix: sp.csr_array, rows: np.ndarray | None, columns: np.ndarray, size: int
+) -> sp.csr_array:
+    """The matrix with its lines in these places of a larger one."""
+    at = sp.coo_array(matrix)
+    row = at.coords[0] if rows is None else rows[at.coords[0]]
+    shape = matrix.shape[0] if rows is None else size
+    return sp.csr_array((at.data, (row, columns[at.coords[1]])), (shape, size))
+
+
+def _levels(
+    matrix: sp.csr_array, rows: np.ndarray, columns: np.ndarray, needed: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Equations that are solved one after the other, each for one slope that is needed."""
+    at = sp.coo_array(matrix[rows][:, columns])
+    i, j = rows[at.coords[0]], columns[at.coords[1]]
+    known, levels = np.zeros(matrix.shape[0], bool), []
+    for _ in range(_LEVELS):
+        unsolved = ~known[j]
+        counts = np.bincount(i[unsolved], minlength=matrix.shape[0])
+        single = unsolved & (counts[i] == 1)
+        column, first = np.unique(j[single], return_index=True)
+        if not column.size:
+            break
+        levels.append((i[single][first], column))
+        known[column] = True
+    if not known[needed].all():
+        raise NotFound("slopes that a constraint needs are coupled, and not by constants")
+    wanted, kept = np.isin(np.arange(matrix.shape[0]), needed), []
+    for row, column in reversed(levels):
+        some = wanted[column]
+        if some.any():
+            kept.append((row[some], column[some]))
+        wanted[j[np.isin(i, row[some])]] = True
+    return tuple(reversed(kept))
+
+
+# ---- Numbers ----
+
+
+class _Places:
+    """Finds where derivatives have elements, whatever the unknown numbers are."""
+
+    def __init__(self, equations: WithNumbers, numbers: Numbers, unknown: tuple[int, ...]):
+        del equations
+        self.numbers, self.unknown = numbers, unknown
+
+    def of(self, fn: Any, argument: int, n: int) -> SparseJacobian:
+        """Of `fn(numbers, t, y, slopes)` by `y` or by `slopes`."""
+
+        def of_one(x: Array, t: Array, other: Array, *others: Array) -> Array:
+            numbers = [*self.numbers]
+            for i, value in zip(self.unknown, others, strict=True):
+                numbers[i] = value
+            pair = (x, other) if argument == 1 else (other, x)
+            return fn(numbers, t, *pair)
+
+        zeros, others = np.zeros(n), [np.asarray(self.numbers[i]) for i in self.unknown]
+        found = asdex().jacobian_sparsity(of_one, zeros, np.zeros(()), zeros, *others)
+        return SparseJacobian(np.asarray(found.rows), np.asarray(found.cols), found.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Last:
+    """The constraints of the last round."""
+
+    equations: WithNumbers
+    structure: Structure
+
+    def constraints(self, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
+        del slopes
+        reduction = Reduction(self.structure, ft.partial(self.equations, numbers), t, y)
+        return reduction.constraints(t, y)[-1]
+
+    def values(self, places: SparseJacobian, numbers: Numbers, t: Array, y: Array) -> Array:
+        return _last_values(self, places, numbers, t, y)
+
+
+@ft.partial(jax.jit, static_argnums=(0, 1))
+def _last_values(
+    last: _Last, places: SparseJacobian, numbers: Numbers, t: Array, y: Array
+) -> Array:
+    return places.values(lambda y: last.constraints(numbers, t, y, y), y)
+
+
+@ft.partial(jax.jit, static_argnums=(0, 1))
+def _by_slope(
+    equations: WithNumbers,
+    places: SparseJacobian,
+    numbers: Numbers,
+    t: Array,
+    y: Array,
+    slopes: Array,
+) -> Array:
+    return places.values(lambda slopes: equations(numbers, t, y, slopes), slopes)
+
+
+@ft.partial(jax.jit, static_argnums=(0, 1, 2))
+def _near(
+    equations: WithNumbers,
+    by_y: SparseJacobian,
+    by_slope: SparseJacobian,
+    numbers: Numbers,
+    t: Array,
+    y: Array,
+    share: float,
+) -> tuple[Array, ...]:
+    later, moved, slopes = general_states(t, y, share)
+    fn = ft.partial(equations, numbers)
+    of_y = by_y.values(lambda y: fn(later, y, slopes[0]), moved)
+    first, second = (by_slope.values(lambda s: fn(later, moved, s), x) for x in slopes)
+    total = jnp.sum(fn(later, moved, slopes[0])) + jnp.sum(of_y) + jnp.sum(first + second)
+    return later, moved, of_y, first, jnp.all(first == second), jnp.isfinite(total)
+
+
+def _general_position(
+    equations: WithNumbers,
+    by_y: SparseJacobian,
+    by_slope: SparseJacobian,
+    numbers: Numbers,
+    t: Array,
+    y: Array,
+) -> tuple[Array, Array, Array, bool, tuple[int, ...]]:
+    for share in (1e-1, 1e-3, 1e-5, 0.0):
+        found = _near(equations, by_y, by_slope, numbers, t, y, share)
+        later, moved, of_y, values, is_linear, finite = found
+        if finite:
+            absent = _empty(_matrix(by_y, of_y), 0) & _empty(_matrix(by_slope, values), 0)
+            return later, moved, values, bool(is_linear), _tuple(np.flatnonzero(absent))
+    raise FloatingPointError
