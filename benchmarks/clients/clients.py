@@ -1,0 +1,145 @@
+"""Published packages with one solver exchanged: what a projection costs and gains there.
+
+python benchmarks/clients/clients.py             # measures each that is installed, minutes
+python benchmarks/clients/clients.py --only NAME
+python benchmarks/clients/clients.py --write     # puts the table on its page
+
+Each problem is a file beside this one, and runs in a process of its own.
+"""
+
+import argparse
+import contextlib
+import importlib
+import importlib.util
+import io
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path += [str(HERE), str(HERE.parent / "cost")]
+import measuring
+
+RESULTS = measuring.RESULTS / "clients.json"
+PAGES = [HERE.parents[1] / "docs" / "in-your-code.md"]
+# The files, in the order of the table, and the packages that they import.
+PACKAGES = {
+    "galactic_orbit": "galax",
+    "guiding_centre": "essos",
+    "robot": "soromox",
+    "epidemic": "stochastix",
+    "flow_on_sphere": "bijx",
+    "quantum_state": "dynamiqs",
+    "density_matrix": "jaxquantum",
+}
+HEADS = ("package", "problem", "error", "drift", "cost", "first call", "`compare` says")
+
+
+def measure(name, smoke):
+    """The row of one problem: through the package, without projection and with it."""
+    import diffrax_conserve as dfc
+
+    client = importlib.import_module(name).client(smoke)
+    reference = client.reference()
+    solvers = {"plain": client.solver, "kept": client.kept()}
+    runs = {key: client.run(solver, client.tolerance) for key, solver in solvers.items()}
+    first = {key: measuring.timed(run) for key, run in runs.items()}
+    # One after the other: dynamiqs forgets what it compiled when the solver changes.
+    again = {}
+    for key, run in runs.items():
+        run()
+        again.update(measuring.take_turns({key: run}, 2 if smoke else 7))
+    row = dict(package=client.package, problem=client.problem)
+    row["version"] = measuring.version(client.package)
+    for key in runs:
+        row[key] = dict(
+            error=client.error(first[key].answer, reference),
+            drift=client.drift(first[key].answer),
+            first=first[key].seconds,
+            seconds=again[key].seconds,
+        )
+    if not smoke:
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            report = dfc.compare(
+                client.field, client.solver, client.manifold, client.y0, t1=float(client.ts[-1]),
+                rtol=client.tolerance, atol=client.tolerance, args=client.args,
+                projection=client.projection,
+            )  # fmt: skip
+        row |= dict(verdict=report.verdict, printed=printed.getvalue())
+    return row
+
+
+def installed(name):
+    return importlib.util.find_spec(PACKAGES[name]) is not None
+
+
+def measured_apart(name, smoke):
+    options = ["--smoke"] if smoke else []
+    command = [sys.executable, __file__, "--one", name, *options]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def read_results():
+    return json.loads(RESULTS.read_text())
+
+
+def ratio(row, key):
+    return f"{row['kept'][key] / row['plain'][key]:.1f}"
+
+
+def both(row, key):
+    return f"{row['plain'][key]:.0e} → {row['kept'][key]:.0e}"
+
+
+def tables(results):
+    rows = [results["rows"][name] for name in PACKAGES if name in results["rows"]]
+    cells = [
+        (
+            *(f"{x['package']} {x['version']}", x["problem"], both(x, "error"), both(x, "drift")),
+            *(ratio(x, "seconds"), ratio(x, "first"), x["says"]),
+        )
+        for x in rows
+    ]
+    lines = [HEADS, ("---",) * len(HEADS), *cells]
+    return {"clients": ["", *(f"| {' | '.join(line)} |" for line in lines), ""]}
+
+
+def filled(text, results):
+    for name, lines in tables(results).items():
+        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+        new = "\n".join([begin, *lines, end])
+        text = re.sub(
+            f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, x=new: x, text, flags=re.DOTALL
+        )
+    return text
+
+
+def main():
+    parser = measuring.parser(__doc__, "clients")
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--write", action="store_true", help="put the table on the page")
+    options = parser.parse_args()
+    if options.one:
+        print(json.dumps(measure(options.one, options.smoke)))
+        return
+    if not options.write:
+        rows = read_results()["rows"] if RESULTS.exists() else {}
+        for name in (name for name in PACKAGES if options.only in name):
+            if not installed(name):
+                print(f"{name}: {PACKAGES[name]} is not installed")
+                continue
+            rows[name] = measured_apart(name, options.smoke)
+            print(json.dumps(rows[name], indent=1), flush=True)
+        if not options.smoke:
+            about = measuring.machine(*PACKAGES.values())
+            RESULTS.write_text(json.dumps(dict(machine=about, rows=rows), indent=1) + "\n")
+        return
+    for page in PAGES:
+        page.write_text(filled(page.read_text(encoding="utf-8"), read_results()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
