@@ -20,7 +20,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path += [str(HERE), str(HERE.parent / "cost")]
-import measuring
+import measuring  # noqa: E402
 
 RESULTS = measuring.RESULTS / "clients.json"
 PAGES = [HERE.parents[1] / "docs" / "in-your-code.md"]
@@ -94,12 +94,26 @@ def both(row, key):
     return f"{row['plain'][key]:.0e} → {row['kept'][key]:.0e}"
 
 
+def says(verdict):
+    """What `compare` recommends in few words, and the error of that over plain, as it judges it."""
+    chosen, times = (
+        re.search(r"`(.*?)`", verdict),
+        re.search(r"error is ([\d.e+-]+) times", verdict),
+    )
+    beside = f", error × {times[1]}" if times else ""
+    if verdict.startswith("Do not"):
+        return f"do not{beside}"
+    if verdict.startswith("Projecting changes"):
+        return f"{chosen[1]}, for what it keeps{beside}"
+    return f"{chosen[1]}{beside}" if verdict.startswith("Take `") else verdict
+
+
 def tables(results):
     rows = [results["rows"][name] for name in PACKAGES if name in results["rows"]]
     cells = [
         (
             *(f"{x['package']} {x['version']}", x["problem"], both(x, "error"), both(x, "drift")),
-            *(ratio(x, "seconds"), ratio(x, "first"), x["says"]),
+            *(ratio(x, "seconds"), ratio(x, "first"), says(x["verdict"])),
         )
         for x in rows
     ]
@@ -133,9 +147,9 @@ def main():
                 continue
             rows[name] = measured_apart(name, options.smoke)
             print(json.dumps(rows[name], indent=1), flush=True)
-        if not options.smoke:
-            about = measuring.machine(*PACKAGES.values())
-            RESULTS.write_text(json.dumps(dict(machine=about, rows=rows), indent=1) + "\n")
+            if not options.smoke:
+                about = measuring.machine(*PACKAGES.values())
+                RESULTS.write_text(json.dumps(dict(machine=about, rows=rows), indent=1) + "\n")
         return
     for page in PAGES:
         page.write_text(filled(page.read_text(encoding="utf-8"), read_results()), encoding="utf-8")

@@ -40,7 +40,7 @@ def client(smoke=False):
 
         @jax.jit
         def states(rho):
-            with mock.patch.object(dfx, "Kept", lambda: solver, create=True):
+            with mock.patch.object(dfx, "Kept", create=True, return_value=solver):
                 rho = jqt.Qarray.create(rho)
                 solved = jqt.mesolve(hamiltonian, rho, ts, c_ops=losses, solver_options=options)
             return solved.data
