@@ -3,9 +3,12 @@
 They are installed by `make clients`, which `make slow` calls, and are skipped elsewhere.
 """
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import pytest
+
+import diffrax_conserve as dfc
 
 from .test_benchmarks import benchmark
 
@@ -83,3 +86,27 @@ def test_a_density_matrix_of_a_package_stays_positive():
     )
     assert plain < -1e-8
     assert kept >= 0
+
+
+@pytest.mark.slow
+def test_states_and_laws_are_quantities_where_diffrax_takes_them():
+    units = pytest.importorskip("unxt", reason="installed by `make clients`")
+    quantity = units.Quantity
+    start = {"q": quantity(jnp.array([1.0, 0.0]), "m"), "v": quantity(jnp.array([0.0, 1.0]), "m/s")}
+
+    def field(t, y, args):
+        return {"q": quantity(y["v"].value, "m"), "v": quantity(-y["q"].value, "m/s")}
+
+    def energy(t, y, args):
+        return quantity(jnp.sum(y["v"].value ** 2) + jnp.sum(y["q"].value ** 2), "m2/s2")
+
+    kept = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(energy))
+    ends = [
+        dfx.diffeqsolve(dfx.ODETerm(field), solver, 0, 10, 0.5, start).ys
+        for solver in (dfx.Tsit5(), kept)
+    ]
+    plain, projected = (
+        abs(energy(0.0, jax.tree.map(lambda x: x[-1], end), None).value - 2) for end in ends
+    )
+    assert projected < 1e-15 < 1e-8 < plain
+    assert ends[1]["q"].unit == start["q"].unit

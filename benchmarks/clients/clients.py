@@ -39,7 +39,6 @@ HEADS = ("package", "problem", "error", "drift", "cost", "first call", "`compare
 
 def measure(name, smoke):
     """The row of one problem: through the package, without projection and with it."""
-    import diffrax_conserve as dfc
 
     client = importlib.import_module(name).client(smoke)
     reference = client.reference()
@@ -60,24 +59,31 @@ def measure(name, smoke):
             first=first[key].seconds,
             seconds=again[key].seconds,
         )
-    if not smoke:
-        with contextlib.redirect_stdout(io.StringIO()) as printed:
-            report = dfc.compare(
-                client.field, client.solver, client.manifold, client.y0, t1=float(client.ts[-1]),
-                rtol=client.tolerance, atol=client.tolerance, args=client.args,
-                projection=client.projection,
-            )  # fmt: skip
-        row |= dict(verdict=report.verdict, printed=printed.getvalue())
     return row
+
+
+def compared(name, smoke):
+    """What `compare` prints and recommends for one problem, which compiles for minutes."""
+    import diffrax_conserve as dfc
+
+    client = importlib.import_module(name).client(smoke)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        report = dfc.compare(
+            client.field, client.solver, client.manifold, client.y0, t1=float(client.ts[-1]),
+            rtol=client.tolerance, atol=client.tolerance, args=client.args,
+            projection=client.projection,
+        )  # fmt: skip
+    return dict(verdict=report.verdict, printed=printed.getvalue())
 
 
 def installed(name):
     return importlib.util.find_spec(PACKAGES[name]) is not None
 
 
-def measured_apart(name, smoke):
+def apart(part, name, smoke):
+    """`measure` or `compared`, in a process of its own."""
     options = ["--smoke"] if smoke else []
-    command = [sys.executable, __file__, "--one", name, *options]
+    command = [sys.executable, __file__, "--part", part, name, *options]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -113,7 +119,7 @@ def tables(results):
     cells = [
         (
             *(f"{x['package']} {x['version']}", x["problem"], both(x, "error"), both(x, "drift")),
-            *(ratio(x, "seconds"), ratio(x, "first"), says(x["verdict"])),
+            *(ratio(x, "seconds"), ratio(x, "first"), says(x.get("verdict", ""))),
         )
         for x in rows
     ]
@@ -131,25 +137,33 @@ def filled(text, results):
     return text
 
 
-def main():
-    parser = measuring.parser(__doc__, "clients")
-    parser.add_argument("--one", help=argparse.SUPPRESS)
-    parser.add_argument("--write", action="store_true", help="put the table on the page")
-    options = parser.parse_args()
-    if options.one:
-        print(json.dumps(measure(options.one, options.smoke)))
-        return
-    if not options.write:
-        rows = read_results()["rows"] if RESULTS.exists() else {}
-        for name in (name for name in PACKAGES if options.only in name):
-            if not installed(name):
-                print(f"{name}: {PACKAGES[name]} is not installed")
-                continue
-            rows[name] = measured_apart(name, options.smoke)
+def run_all(options):
+    """All costs first, because the comparisons take long; what is done is kept."""
+    rows = read_results()["rows"] if RESULTS.exists() else {}
+    names = [name for name in PACKAGES if options.only in name]
+    for name in names:
+        if not installed(name):
+            print(f"{name}: {PACKAGES[name]} is not installed")
+    for part in ("measure", "compared"):
+        for name in filter(installed, names):
+            rows[name] = rows.get(name, {}) | apart(part, name, options.smoke)
             print(json.dumps(rows[name], indent=1), flush=True)
             if not options.smoke:
                 about = measuring.machine(*PACKAGES.values())
                 RESULTS.write_text(json.dumps(dict(machine=about, rows=rows), indent=1) + "\n")
+
+
+def main():
+    parser = measuring.parser(__doc__, "clients")
+    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--write", action="store_true", help="put the table on the page")
+    options = parser.parse_args()
+    if options.part:
+        part, name = options.part
+        print(json.dumps(dict(measure=measure, compared=compared)[part](name, options.smoke)))
+        return
+    if not options.write:
+        run_all(options)
         return
     for page in PAGES:
         page.write_text(filled(page.read_text(encoding="utf-8"), read_results()), encoding="utf-8")
