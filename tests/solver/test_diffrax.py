@@ -183,8 +183,12 @@ def test_parts_that_are_none_or_integers_change_nothing():
     kept = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y["speed"] ** 2))
     alone = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
     y0 = {"speed": OMEGA0, "index": 3, "controller": None}
-    more = solve(with_more, dfc.ManifoldProjection(dfx.Heun(), kept), y0, t1=0.5).ys
-    ys = solve(rigid_body, dfc.ManifoldProjection(dfx.Heun(), alone), OMEGA0, t1=0.5).ys
+    # By default the metric of a single array is that of its components.
+    one = dfc.SimplifiedNewton(metric=1.0)
+    solver = dfc.ManifoldProjection(dfx.Heun(), kept, projection=one)
+    more = solve(with_more, solver, y0, t1=0.5).ys
+    solver = dfc.ManifoldProjection(dfx.Heun(), alone, projection=one)
+    ys = solve(rigid_body, solver, OMEGA0, t1=0.5).ys
     np.testing.assert_allclose(more["speed"], ys, rtol=0, atol=1e-12)
     assert more["controller"] is None
     assert jnp.all(more["index"] == 3)
