@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # Two targets would run pip in the same environment.
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lowest newest slow coverage shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
+.PHONY: help demo test lowest newest slow clients coverage shapes soak mutants lint format types docs examples bench bench-smoke bench-learned bench-studies bench-published build clean distclean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -100,12 +100,21 @@ newest: | $(BIN)/python ## run the tests with the newest Python, jax and asdex t
 	@$(BIN)/uv pip freeze --quiet --python $(NEWEST)/bin/python | grep -E '^(asdex|diffrax|equinox|jax)='
 	$(NEWEST)/bin/python -m pytest $(SHARED) -m "not slow and not examples"
 
+CLIENTS := $(VENV)/clients
+
+clients: | $(BIN)/python ## run published packages that use diffrax, with one solver exchanged
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv venv --quiet --clear --python "$(NEWEST_PYTHON)" $(CLIENTS)
+	$(BIN)/uv pip install --quiet --python $(CLIENTS)/bin/python --editable '.[clients,test]'
+	$(CLIENTS)/bin/python -m pytest -m slow tests/test_clients.py
+
 slow: export XLA_FLAGS ?=
 slow: export EQX_ON_ERROR ?= raise
 slow: $(SLOW) ## run the slow tests, with all pages of the docs, and all benchmarks at toy sizes
 	$(BIN)/python -m pytest $(SHARED) -m slow
 	$(BIN)/python benchmarks/studies/mjx.py
 	$(MAKE) bench-smoke SMOKED="$(SMOKABLE)"
+	$(MAKE) clients
 
 COVERED ?= tests
 

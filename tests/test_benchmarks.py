@@ -43,7 +43,7 @@ def test_a_table_is_that_of_the_results(name, monkeypatch):
     assert [line for line in lines if line not in text] == []
 
 
-@pytest.mark.parametrize("name", ["report", "tables"])
+@pytest.mark.parametrize("name", ["report", "tables", "clients"])
 def test_the_results_are_what_the_pages_show(name):
     module = benchmark(name)
     results = module.read_results()

@@ -217,6 +217,26 @@ def test_transformations():
 
 
 @pytest.mark.slow
+def test_parts_that_are_none_or_integers_change_nothing():
+    """diffrax makes integers floating-point; parts of a state that are `None` have no leaf."""
+
+    def with_more(t, y, args):
+        return {"speed": rigid_body(t, y["speed"], args), "index": 0, "controller": None}
+
+    kept = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y["speed"] ** 2))
+    alone = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
+    y0 = {"speed": OMEGA0, "index": 3, "controller": None}
+    # By default the metric of a single array is that of its components.
+    one = dfc.SimplifiedNewton(metric=1.0)
+    solver = dfc.ManifoldProjection(dfx.Heun(), kept, projection=one)
+    more = solve(with_more, solver, y0, t1=0.5).ys
+    solver = dfc.ManifoldProjection(dfx.Heun(), alone, projection=one)
+    ys = solve(rigid_body, solver, OMEGA0, t1=0.5).ys
+    np.testing.assert_allclose(more["speed"], ys, rtol=0, atol=1e-12)
+    assert more["controller"] is None
+    assert jnp.all(more["index"] == 3)
+
+
 def test_strict_promotion_rank_promotion_and_nan_debugging():
     def final(y0):
         solver = dfc.ManifoldProjection(dfx.Euler(), RIGID_BODY)
