@@ -11,7 +11,7 @@ are differences. Errors are the largest of a component at the end, from `Radau` 
 1e-9. Times are those of an error of 1e-5, between the two tolerances that enclose it, and the first
 call is that of `consistent` and of a solve, with the search for places and compilation.
 
-Writes `results/large.json`. `--only` takes a name with its size, such as `heat, 1000`.
+Writes `results/large.json`. `--only` takes a name with its size, such as `heat, 1000 unknowns`.
 """
 
 import functools as ft
@@ -38,7 +38,7 @@ TOLERANCES = [1e-3, 1e-4, 1e-5, 1e-6, 1e-7]
 STEPS = ft.partial(dfx.PIDController, pcoeff=0.4, icoeff=0.3)
 
 
-# ---- The problems: `f`, the mass matrix, a guess, the end, and the width of the band if narrow ----
+# ---- The problems: `f`, the mass matrix, a guess, the end, and the width of a narrow band ----
 
 
 def heat(n):
@@ -210,10 +210,10 @@ def main():
     sizes = {key: [128] for key in PROBLEMS} if options.smoke else SIZES
     for name in PROBLEMS:
         for n in sizes[name]:
-            if options.only not in f"{name}, {n}":
+            if options.only not in f"{name}, {n} unknowns":
                 continue
             found = measured(name, n, [1e-4, 1e-6] if options.smoke else TOLERANCES)
-            results[f"{name}, {n}"] = found
+            results[f"{name}, {n} unknowns"] = found
             ida = [found[kind]["at_error"] for kind in ("band", "sparse") if kind in found]
             row = [
                 name, f"{found['n']:,}", f"{found['first_call']:.1f}",
