@@ -21,8 +21,7 @@ A. Walther, *Evaluating Derivatives*, SIAM 2008).
 
 import functools as ft
 import itertools as it
-import operator as op
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
@@ -100,8 +99,7 @@ def written(
         ]
         found = [*zip(program.results(closed, inputs), outs, strict=True)]
         rows = [[program.array(i, x.dtype)] if arrays else i.ravel().tolist() for i, x in found]
-        results = [i for row in rows for i in row]
-        evaluate = program.evaluation(results, () if arrays else program.kept(results))
+        evaluate = program.evaluation([i for row in rows for i in row])
     except _NotWrittenOut:
         return None
 
@@ -143,31 +141,16 @@ def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     return call
 
 
-def in_kernels(fn: Callable[..., Any], given: Sequence[Any]) -> Any:
-    """`fn(*given)`, a few numbers that are not differentiated. In a batch they are computed in
-    scalars if that is possible, each once, however often it is used."""
-
-    def run(given: Any, lanes: bool) -> Any:
-        call = ft.partial(fn, *given)
-        if not lanes or (written := in_scalars(call)) is None:
-            return call()
-        keep = lambda x: _materialised(x.astype(float)).astype(x.dtype)  # noqa: E731
-        return jtu.tree_map(keep, written())
-
-    return alone_or_in_lanes(run)(tuple(given))
-
-
 def written_out_loop(
-    starts: Sequence[Callable[[Any], Any]], advance: Callable[..., Any], y: Array
+    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, counter: Array
 ) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
-    """The functions of a loop, `known, y, counter, *_ = start(y)` and `y, counter = advance(known,
-    y, counter)`, in scalars, with `y` as a tuple of them, and with the first of several `starts`
-    that is not too large. The last one and `advance` are given back as they are if they are."""
-    in_loop = in_scalars(advance, *jax.eval_shape(starts[-1], y)[:3])
-    begin = (x for start in starts if (x := in_scalars(start, y)) is not None)
-    if in_loop is None or (first := next(begin, None)) is None:
-        return starts[-1], advance, y
-    return first, in_loop, components(y)
+    """The functions of a loop, `first = start(y)` and `y, counter = advance(first, y, counter)`, in
+    scalars, with `y` as a tuple of them. They are given back as they are if one is too large."""
+    first = jax.eval_shape(start, y)
+    starts, advances = in_scalars(start, y), in_scalars(advance, first, y, counter)
+    if starts is None or advances is None:
+        return start, advance, y
+    return starts, advances, components(y)
 
 
 def components(x: Array) -> Any:
@@ -323,20 +306,6 @@ def _once(fn: Callable[[Array], Array], x: Array) -> Array:
     return fn(x) / (lax.stop_gradient(x) * 0 + 1)
 
 
-def _materialised(x: Array) -> Array:
-    """`x`, for which XLA makes a kernel: it is divided by a 1 that XLA cannot simplify away,
-    because `x` might be NaN."""
-    return x / jnp.where(x == x, 1, 2).astype(x.dtype)
-
-
-# The primitives that XLA considers expensive, so that it does not compute them again.
-_EXPENSIVE_NAMES = """acos acosh asin asinh atan atan2 atanh cbrt cosh div erf erf_inv erfc exp exp2
-expm1 lgamma log log1p logistic pow rem rsqrt sinh sqrt tan tanh"""
-_EXPENSIVE = frozenset(_EXPENSIVE_NAMES.split())
-# A kernel takes as long as about so many operations in it: with a division, 0.5 ns for each lane.
-_KERNEL = 16
-# In the first sweep values are kept that turn out to be cheap once others are kept.
-_SWEEPS = 3
 # Primitives that are computed otherwise.
 _INSTEAD: dict[str, Callable[..., Any]] = {
     "sin": ft.partial(_once, lax.sin),
@@ -354,8 +323,6 @@ class _Program:
         # is given.
         self.entries: list[Any] = []
         self.places: dict[Any, int] = {}  # of operations and numbers
-        self.names: dict[int, Any] = {}  # of operations
-        self.inexact: set[int] = set()  # the places of operations whose results are real numbers
         self.negated: dict[int, int] = {}  # the place of `x` by that of `-x`
         # The arrays that were taken apart, by the place of their first element. If one is needed as
         # a whole again, it need not be stacked.
@@ -368,65 +335,26 @@ class _Program:
     def results(self, closed: Any, inputs: list[_Places]) -> list[_Places]:
         return walk(closed, inputs, self._constant, self._equation)
 
-    def evaluation(
-        self, results: list[int], kept: Collection[int] = ()
-    ) -> Callable[[list[Any]], list[Any]]:
-        """The results as a function of what is given, with a kernel for each value that is kept."""
-        entries, order = self.entries, self._needed(results)
-        if len(order) > self.limit:
-            raise _NotWrittenOut
-
-        def evaluate(given: list[Any]) -> list[Any]:
-            values = given + entries[len(given) :]
-            for i in order:
-                fn, row = entries[i]
-                x = fn(*(values[j] for j in row))
-                values[i] = _materialised(x) if i in kept else x
-            return [values[i] for i in results]
-
-        return evaluate
-
-    def _needed(self, results: list[int]) -> list[int]:
-        """The operations that lead to the results, in order."""
+    def evaluation(self, results: list[int]) -> Callable[[list[Any]], list[Any]]:
+        """The results as a function of what is given."""
         needed, rest = set(), [*results]
         while rest:
             i = rest.pop()
             if i not in needed and isinstance(self.entries[i], tuple):
                 needed.add(i)
                 rest += self.entries[i][1]
-        return sorted(needed)
+        if len(needed) > self.limit:
+            raise _NotWrittenOut
+        entries, order = self.entries, sorted(needed)
 
-    def kept(self, results: list[int]) -> set[int]:
-        """The operations whose results are worth a kernel of their own.
-
-        XLA evaluates what is cheap again in each kernel that needs it, back to what is given and to
-        results of operations that it considers expensive, such as a division. A kernel is made for
-        each of these and for each result. So the operations before a value, times the number of
-        further kernels that need it, are saved if the value is kept.
-        """
-        order = self._needed(results)
-        ends = {*results, *(i for i in order if self.names.get(i) in _EXPENSIVE)}
-        kept = {i for i in order if i in self.inexact} - ends
-        chosen: set[int] = set()
-        for sweep in range(_SWEEPS):
-            kernels = dict.fromkeys(order, 0)  # those that need a value, as the bits of a number
-            for i in reversed(order):
-                of = kernels[i] if i not in ends | chosen else 1 << i
-                for j in self.entries[i][1]:
-                    if j in kernels:
-                        kernels[j] |= of
-            before: dict[int, int] = {}  # the operations that lead to a value, likewise
-            last, chosen = chosen, set()
+        def evaluate(given: list[Any]) -> list[Any]:
+            values = given + entries[len(given) :]
             for i in order:
-                before[i] = ft.reduce(
-                    op.or_, (before.get(j, 0) for j in self.entries[i][1]), 1 << i
-                )
-                saved = before[i].bit_count() * (kernels[i].bit_count() - 1)
-                if saved > _KERNEL and i in kept and (i in last or sweep == 0):
-                    chosen.add(i)
-                if i in ends or i in chosen:
-                    before[i] = 0
-        return chosen
+                fn, row = entries[i]
+                values[i] = fn(*(values[j] for j in row))
+            return [values[i] for i in results]
+
+        return evaluate
 
     # ---- Equations ----
 
@@ -618,7 +546,6 @@ class _Program:
         if key not in self.places:
             self.places[key] = len(self.entries)
             self.entries.append((fn, row))
-            self.names[self.places[key]] = name
         return self.places[key]
 
     def _scalar(
@@ -636,8 +563,6 @@ class _Program:
         if name in ("add", "mul"):
             row = tuple(sorted(row))
         place = self._operation(name, fn, row, params)
-        if dtype.kind == "f":
-            self.inexact.add(place)
         if name == "neg":
             self.negated[place] = row[0]
         return place

@@ -44,9 +44,6 @@ from .problem import (
 )
 from .rows import AbstractRows, DenseRows
 
-# So many steps are in front of the loop in the lanes of a batch: Newton's method doubles the number
-# of right digits, and a solver usually proposes four or more.
-_STEPS_IN_FRONT = 2
 # A step of an iteration: the unknowns and the counter after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
 
@@ -79,11 +76,6 @@ class _Now(NamedTuple):
 
 
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
-    """As `continued`, from unknowns that were not tested."""
-    return continued(advance, _Now(y, tests(max_steps), jnp.asarray(0)))
-
-
-def continued(advance: Advance, start: _Now) -> Solved:
     """Advances the unknowns until the counter says that they are done.
 
     The counter is the number of tests that are left. The unknowns are tested before each step and
@@ -99,6 +91,7 @@ def continued(advance: Advance, start: _Now) -> Solved:
         y, counter = advance(now.y, now.counter)
         return _Now(y, counter, now.num_iterations + (counter > 0).astype(int))
 
+    start = _Now(y, tests(max_steps), jnp.asarray(0))
     end = lax.while_loop(lambda now: any_lane(now.counter > 0), body, start)
     return Solved(end.y, end.counter == 0, end.num_iterations)
 
@@ -176,17 +169,37 @@ def simplified_newton(
 
 def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
-    out in scalars, which XLA fuses to few kernels; alone it is fastest in arrays.
-
-    A loop over lanes goes on until the last of them is done, and each kernel of it passes over all.
-    So in lanes the first steps, which are enough for nearly every step of a solver, are in front of
-    the loop.
-    """
+    out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     problem, candidate, directions = given
     dtype = problem.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
-    def moved(y: Array, rows: Any, along: Any, wrong: Array, level: Array) -> Array:
+    def scaled(jacobian: AbstractRows) -> Any:
+        return problem.factor.scale_columns(jacobian).scaled()
+
+    def shared(y: Any) -> Any:
+        """What the steps share: the order in which they eliminate the constraints, and in this
+        order the directions, or the gradients at the candidate."""
+        rows = scaled(problem.linearise(y)[1])[1]
+        along = rows if directions is None else directions
+        order = order_of(rows.gram(along).matrix)
+        return order, in_order(order, along.matrix)
+
+    def advance(common: Any, y: Any, counter: Array) -> tuple[Any, Array]:
+        order, at_candidate = common
+        linearised = problem.linearise(y)
+        # Without a barrier XLA would evaluate the residuals once for each use of them.
+        g, jacobian = linearised if lanes else lax.optimization_barrier(linearised)
+        level, wrong = problem.level(g, problem.scale(jacobian, y))
+        sizes, rows = scaled(jacobian)
+        rows, wrong = in_order(order, rows.matrix), in_order(order, wrong / sizes)
+        may_switch = directions is None and max_steps > FROZEN_STEPS
+        # In each step the counter goes down by one, but before the last step, which polishes, the
+        # test sets it to two. So we look at it before the test. Should the last step leave the
+        # tolerance, the one that tries to return is along the gradients at its state.
+        frozen = counter > max_steps + 1 - FROZEN_STEPS
+        along = jnp.where(frozen, at_candidate, rows) if may_switch else at_candidate
+        counter = after_test(level, counter)
         # A step that only polishes is as long as roundoff over the sine of the angle between
         # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
         # constraint whose gradient is more nearly parallel to others takes no part in it. In
@@ -196,58 +209,16 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
             least = jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
         rows, along = DenseRows(rows), DenseRows(along)
         change = rows.gram(along).row_space_correction(along, wrong, least=least, ordered=True)
-        return y - problem.factor.to_state(change)
-
-    def seen(y: Array) -> tuple[Array, Array, Array]:
-        """The level of a state, what is to be corrected there, and the gradients."""
-        g, jacobian = problem.linearise(y)
-        if not lanes:
-            # Without a barrier XLA would evaluate the residuals once for each use of them.
-            g, jacobian = lax.optimization_barrier((g, jacobian))
-        level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
-        return level, wrong / sizes, rows.matrix
-
-    def begin(steps: int, y: Any) -> tuple[Any, Any, Array, Array]:
-        """What the steps share: the order in which they eliminate the constraints, and in this
-        order the directions, or the gradients at the candidate. Then the state after the first
-        `steps`, and its counters."""
-        rows = problem.factor.scale_columns(problem.linearise(y)[1]).scaled()[1]
-        along = rows if directions is None else directions
-        order = order_of(rows.gram(along).matrix)
-        along = in_order(order, along.matrix)
-        counter, num_iterations = tests(max_steps), jnp.asarray(0)
-        for _ in range(steps):
-            level, wrong, rows = seen(y)
-            y = moved(y, in_order(order, rows), along, in_order(order, wrong), level)
-            num_iterations = num_iterations + (level != AT_ROUNDOFF)
-        if steps:
-            counter = jnp.where(seen(y)[0] == AT_ROUNDOFF, 0, counter - steps).astype(counter.dtype)
-        return (order, along), y, counter, num_iterations
-
-    def advance(common: Any, y: Any, counter: Array) -> tuple[Any, Array]:
-        order, at_candidate = common
-        level, wrong, rows = seen(y)
-        rows, wrong = in_order(order, rows), in_order(order, wrong)
-        may_switch = directions is None and max_steps > FROZEN_STEPS
-        # In each step the counter goes down by one, but before the last step, which polishes, the
-        # test sets it to two. So we look at it before the test. Should the last step leave the
-        # tolerance, the one that tries to return is along the gradients at its state.
-        frozen = counter > max_steps + 1 - FROZEN_STEPS
-        along = jnp.where(frozen, at_candidate, rows) if may_switch else at_candidate
-        counter = after_test(level, counter)
-        return keep_done(counter, moved(y, rows, along, wrong, level), y), counter
+        moved = y - problem.factor.to_state(change)
+        return keep_done(counter, moved, y), counter
 
     if lanes:
-        # Of a large function the steps in front are left out.
-        starts = [ft.partial(begin, steps) for steps in (min(_STEPS_IN_FRONT, max_steps), 0)]
-        start, advance, y = written_out_loop(starts, advance, candidate)
+        start, step, y = written_out_loop(shared, advance, candidate, tests(max_steps))
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        start, y = ft.partial(begin, 0), lax.optimization_barrier(candidate)
-    known, *now = start(y)
-    found = continued(ft.partial(advance, known), _Now(*now))
+        start, step, y = shared, advance, lax.optimization_barrier(candidate)
+    found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
     return found._replace(y=joined(candidate, found.y))
 
 

@@ -7,22 +7,24 @@ from typing import Any, NamedTuple, final
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._balance import has_rates
+from .._constants import ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
-from .._fast.scalars import in_kernels
 from .._interpolation import MakeManifoldInterpolation, Packed
 from .._manifold import Constraint, check_manifold, named_entries
+from .._numerics.iterate import any_lane
 from .._numerics.metric import Diagonal, Identity
-from .._numerics.problem import Problem, Step, component_changes, step_length
+from .._numerics.problem import Step, component_changes, step_length
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._tree import ravel, tree_add, tree_stop_gradient, unravel
+from .._tree import ravel, tree_add, unravel, without_pattern
 from .failure import (
     end_of_step,
     failure_cause,
@@ -194,7 +196,8 @@ class ManifoldProjection(ForwardingSolver):
             inner=self.solver.init(terms, t0, t1, y0, args),
             constants=jnp.concatenate([values, cancellation, first_step.astype(values.dtype)]),
             gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
-            units=component_changes(y, y),
+            units=jnp.zeros_like(y),
+            end=jnp.full((), jnp.inf, y.dtype),
             statistics=statistics,
             preferred=first_changes(terms, t0, t1, y0, args) if self.keep_linear else None,
         )
@@ -217,8 +220,7 @@ class ManifoldProjection(ForwardingSolver):
         state, start = self._target(terms, state, proposal, y0, args)
         target = start.advanced(step.t0, step.t1, proposal.path)
         y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
-        is_first = jnp.all(solver_state.units == 0)
-        cause, final = self._verdict(start, state, proposal, y1, info, is_first)
+        cause, final = self._verdict(start, state, proposal, y1, info, made_jump)
         y1, result = end_of_step(cause, y1, proposal.result)
         metric = start.metric(step.t0, step.y0)
         dense_info = dict(
@@ -234,6 +236,7 @@ class ManifoldProjection(ForwardingSolver):
             state,
             inner=proposal.inner,
             gained=target.gained,
+            end=_number_of(y1)[0],
             statistics=state.statistics.add(info, length),
         )
         error = reported_error(cause, final, proposal.error)
@@ -330,54 +333,52 @@ class ManifoldProjection(ForwardingSolver):
         proposal: "_Proposal",
         y1: Float[Array, " n"],
         info: ProjectionInfo,
-        is_first: Bool[Array, ""],
+        made_jump: BoolScalarLike,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
         step, candidate = proposal.step, proposal.candidate
+        cannot_start = self._cannot_start(target, state, step, made_jump)
+        length, first_step = step.t1 - step.t0, state.first_step.astype(jnp.result_type(step.t1))
+        time = jnp.maximum(jnp.abs(step.t1), first_step)
+        final = cannot_start | is_final(length, time, target.changes, candidate)
         correction, too_far = y1 - candidate, jnp.asarray(False)
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_length(step.y0, candidate, metric)
             too_far = metric.length(correction) > limit
-        # The last step has ended on the manifold, unless there was none, the solve continues from
-        # the `solver_state` of another one, or the vector field jumps, with which a constraint may
-        # jump.
-        #
-        # The roundoff of a residual at the end of a step is proportional to its scale there, and
-        # that to the size of a component plus its change in that step. This sum may be much smaller
-        # in the next step. Its unit is not: that is at least the smaller one of size and change,
-        # and never decreases. So in the scale at a start the unit takes the place of the change.
-        start = dataclasses.replace(target, changes=state.units).problem(step.t0, step.y0)
+        first = jnp.isinf(state.end)
+        given = info.ok, cannot_start, state.values, correction, too_far
+        return failure_cause(*given, hopeless=first | final), final
+
+    def _cannot_start(
+        self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
+    ) -> Bool[Array, ""]:
+        """Whether a conserved value is not finite, or a step starts off the manifold. The second is
+        tested if the state is not the end of the last step, as at the start of a solve, and after a
+        jump of the vector field, because a constraint may jump with it."""
+        lost = ~jnp.all(jnp.isfinite(state.values))
         entries = [entry for _, entry in named_entries(self.manifold)]
-        fn = ft.partial(_verdict, entries)
-        first_step = state.first_step.astype(jnp.result_type(step.t1))
-        times = step.t1 - step.t0, jnp.maximum(jnp.abs(step.t1), first_step)
-        given = start, step.y0, candidate, y1, times, state.values, info.ok, too_far, is_first
-        return in_kernels(fn, tree_stop_gradient(given))
+        if not any(map(must_start_on, entries)):
+            return lost
+        # A sum can have the roundoff of another order. A state that is NaN has failed already.
+        number, size = _number_of(step.y0)
+        roundoff = ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size
+        fresh = (jnp.abs(number - state.end) > roundoff) | made_jump
+        problem = target.problem(step.t0, step.y0)
+        off = lax.cond(
+            any_lane(fresh),
+            lambda: is_off_manifold(problem, entries, step.y0),
+            lambda: jnp.asarray(False),
+        )
+        return lost | (fresh & off)
 
 
-def _verdict(
-    entries: list[Any],
-    start: Problem,
-    y0: Array,
-    candidate: Array,
-    y1: Array,
-    times: tuple[Array, Array],
-    values: Array,
-    ok: Array,
-    too_far: Array,
-    is_first: Array,
-) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """Why a step failed, and whether a shorter one would not be better. It cannot start if a
-    conserved value is not finite, or the state is off the manifold."""
-    cannot_start = ~jnp.all(jnp.isfinite(values))
-    if any(map(must_start_on, entries)):
-        cannot_start = cannot_start | is_off_manifold(start, entries, y0)
-    length, time = times
-    final = cannot_start | is_final(length, time, component_changes(y0, candidate), candidate)
-    given = ok, cannot_start, values, y1 - candidate, too_far
-    return failure_cause(*given, hopeless=is_first | final), final
+def _number_of(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """A number by which a state is recognised, a sum of its components in general position, and the
+    sum of their sizes."""
+    terms = without_pattern(y.size, y.dtype) * y
+    return jnp.sum(terms), jnp.sum(jnp.abs(terms))
 
 
 def first_changes(

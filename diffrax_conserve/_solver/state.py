@@ -25,6 +25,8 @@ class State(eqx.Module):
     - `gained`: as in a `Target`.
     - `units`: the unit of each component in the metric of motion, see `units_after`, the largest of
       all steps so far; zero before the first step.
+    - `end`: a number by which the state is recognised at which the last step ended; infinite before
+      the first step.
     - `preferred`: the changes of the state in the last two steps, if linear invariants are kept.
     """
 
@@ -32,6 +34,7 @@ class State(eqx.Module):
     constants: Float[Array, " 2*m+1"]
     gained: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
+    end: Float[Array, ""]
     statistics: ProjectionStatistics
     preferred: Float[Array, "k n"] | None = None
 

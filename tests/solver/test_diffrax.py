@@ -118,24 +118,6 @@ def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another()
     assert "a step cannot start" in dfx.RESULTS[struck.result]
 
 
-def test_a_continued_solve_refuses_other_args():
-    """The state is the same, but it does not have the energy of before with another stiffness."""
-    energy = dfc.FirstIntegral(lambda t, y, k: y[1] ** 2 / 2 + k * y[0] ** 2 / 2)
-    spring = lambda t, y, k: jnp.stack([y[1], -k * y[0]])  # noqa: E731
-    solver = dfc.ManifoldProjection(dfx.Heun(), energy)
-
-    @jax.jit
-    def results(y0, t1, k):
-        options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False)
-        first = solve(spring, solver, y0, t1=t1, args=1.0, **options)
-        state = dict(solver_state=first.solver_state, args=k)
-        return solve(spring, solver, first.ys[-1], t0=t1, t1=2 * t1, **options, **state).result
-
-    same, other = (results(jnp.array([1.0, 0.3]), 1.0, k) for k in (1.0, 1.1))
-    assert same == dfx.RESULTS.successful
-    assert "a step cannot start" in dfx.RESULTS[other]
-
-
 def test_steps_may_become_much_shorter_where_the_terms_of_a_constraint_vanish():
     """A pendulum at its turning point: `q · v` is zero to roundoff of the speeds before."""
     rod = lambda t, y, args: (jnp.sum(y[0] ** 2) - 1, y[0] @ y[1])  # noqa: E731
