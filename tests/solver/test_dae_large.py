@@ -71,9 +71,9 @@ def pairs(n):
 
     def residual(t, y, dy, args):
         (x, z), (dx, _) = y, dy
-        return dx - z + x**3, x - jnp.sin(t) - 0.1 * jnp.roll(x, 1) ** 2
+        return dx - z + x**3, x - jnp.cos(t) - 0.1 * jnp.roll(x, 1) ** 2
 
-    return dfc.DAE(residual=residual), ((jnp.linspace(0.2, 0.1, n), jnp.zeros(n)),)
+    return dfc.DAE(residual=residual), ((jnp.linspace(1.2, 1.1, n), jnp.ones(n)),)
 
 
 def chain(n):
