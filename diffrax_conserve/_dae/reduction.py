@@ -212,14 +212,15 @@ class Reduction:
     def _needed_slopes(self, k: int) -> Callable[[Array, Array], Array]:
         """Those slopes of round `k` that its constraints need; after the last one all."""
         structure, large = self.structure, self.structure.large
+        equations, constraints = self.equations, self.constraints
         assert large is not None
         elimination = large.eliminations[k - 1] if k < structure.index else None
         as_given = elimination is not None and elimination.constant is not None
 
         def slopes(t: Array, y: Array) -> Array:
             def residual(slopes: Array) -> Array:
-                rates = [] if as_given else _along(self.constraints, t, y, slopes)[1]
-                return self._replaced(self.equations(t, y, slopes), rates)
+                rates = [] if as_given else _along(constraints, t, y, slopes)[1]
+                return self._replaced(equations(t, y, slopes), rates)
 
             if elimination is not None:
                 return elimination.slopes(residual, y)

@@ -218,14 +218,18 @@ def _of_large_part(matrix: sp.csr_array) -> Pivots:
     matched = maximum_bipartite_matching(sp.csr_matrix(matrix), perm_type="column")
     rows = np.flatnonzero(matched >= 0)
     columns = matched[rows]
-    factors = _factored(matrix[rows][:, columns])
-    if factors is None or factors.nnz > MOST_ELEMENTS:
-        raise TooFull
-    good = np.abs(factors.U.diagonal()) > _SMALL_PIVOT
-    rows, columns = (
-        x[np.argsort(order)][good]
-        for x, order in ((rows, factors.perm_r), (columns, factors.perm_c))
-    )
+    # What follows a small pivot is eliminated by its row, so the others are factored again alone.
+    small = True
+    while small and rows.size:
+        factors = _factored(matrix[rows][:, columns])
+        if factors is None or factors.nnz > MOST_ELEMENTS:
+            raise TooFull
+        good = np.abs(factors.U.diagonal()) > _SMALL_PIVOT
+        rows, columns = (
+            x[np.argsort(order)][good]
+            for x, order in ((rows, factors.perm_r), (columns, factors.perm_c))
+        )
+        small = not good.all()
     if not rows.size:
         i = np.argmax(np.abs(matrix.data))
         rows, columns = (x[i : i + 1] for x in sp.coo_array(matrix).coords)

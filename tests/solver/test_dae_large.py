@@ -1,0 +1,175 @@
+"""Large differential-algebraic equations: their structure and their consistent states are those
+that dense matrices find where these do, and have the numbers that are known by hand."""
+
+import time
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import diffrax_conserve as dfc
+from diffrax_conserve._dae import dae as dae_module, search
+
+pytest.importorskip("asdex")
+pytest.importorskip("klujax")
+
+
+# ---- Equations, each made anew, so that nothing that was found or compiled is shared ----
+
+
+def heat(n):
+    """With a boundary value and a slope of zero at the ends: index 1."""
+
+    def f(t, y, args):
+        inner = (y[2:] - 2 * y[1:-1] + y[:-2]) * n**2 + y[1:-1] * (1 - y[1:-1])
+        ends = (y[0] - 1 - jnp.sin(t))[None], (y[-1] - y[-2] ** 3)[None]
+        return jnp.concatenate([ends[0], inner, ends[1]])
+
+    mass = sp.diags_array(np.r_[0, np.ones(n - 2), 0])
+    return dfc.DAE(f, mass=mass), (jnp.linspace(1.0, 0.3, n),)
+
+
+def ladder(n):
+    """Of resistors, with condensers between two neighbours each: half as many equations as nodes
+    remain without slopes, although each node has one."""
+
+    def residual(t, y, dy, args):
+        left = jnp.concatenate([jnp.sin(t)[None], y[:-1]])
+        currents = left - y
+        charge = dy.reshape(-1, 2)[:, 0] - dy.reshape(-1, 2)[:, 1]
+        balance = jnp.concatenate([currents[1:], y[-1:] ** 3]) - currents
+        return jnp.stack([charge, -charge], 1).ravel() + balance
+
+    return dfc.DAE(residual=residual), (jnp.linspace(0.5, 0.1, n),)
+
+
+def ring(n):
+    """Of condensers: the currents of all add up to zero."""
+
+    def residual(t, y, dy, args):
+        current = dy - jnp.roll(dy, 1)
+        return current - jnp.roll(current, -1) + y * (1 + y**2) - jnp.cos(t) * jnp.linspace(1, 2, n)
+
+    return dfc.DAE(residual=residual), (jnp.linspace(0.5, 0.1, n),)
+
+
+def varying(n):
+    """Condensers whose capacity depends on their voltage, and nodes without one."""
+
+    def residual(t, y, dy, args):
+        capacity = jnp.where(np.arange(n) % 2, 0.0, 1 + y**2)
+        return capacity * dy + y**3 - (jnp.roll(y, 1) + jnp.roll(y, -1)) / 4 - 1
+
+    return dfc.DAE(residual=residual), (jnp.linspace(0.5, 0.1, n),)
+
+
+def pairs(n):
+    """Index 2: `x' = z + ...`, `0 = x - ...`."""
+
+    def residual(t, y, dy, args):
+        (x, z), (dx, _) = y, dy
+        return dx - z + x**3, x - jnp.cos(t) - 0.1 * jnp.roll(x, 1) ** 2
+
+    return dfc.DAE(residual=residual), ((jnp.linspace(1.2, 1.1, n), jnp.ones(n)),)
+
+
+def chain(n):
+    """Of links with length and mass 1, in Cartesian coordinates: index 3; with the sum of the
+    squares of two places, an algebraic unknown that pulls the last link."""
+
+    def residual(t, y, dy, args):
+        (q, v, force, w), (dq, dv, _, _) = y, dy
+        links = q - jnp.concatenate([jnp.zeros((1, 2)), q[:-1]])
+        pull = force[:, None] * links
+        total = jnp.concatenate([pull[1:], jnp.zeros((1, 2))]) - pull
+        total = total.at[-1, 0].add(0.1 * w)
+        lengths = jnp.sum(links**2, axis=1) - 1
+        return dq - v, dv - total + jnp.array([0.0, 9.81]), lengths, w - q[-1, 0] ** 2 / n**2
+
+    q = jnp.stack([jnp.arange(1.0, n + 1), jnp.zeros(n)], 1)
+    return dfc.DAE(residual=residual), ((q, jnp.zeros((n, 2)), jnp.zeros(n), jnp.array(0.5)),)
+
+
+def explicit(n):
+    """Index 0, with slopes that are coupled."""
+
+    def residual(t, y, dy, args):
+        return 3 * dy - jnp.roll(dy, 1) - jnp.sin(y)
+
+    return dfc.DAE(residual=residual), (jnp.linspace(0.5, 0.1, n),)
+
+
+def found(make, n, least, monkeypatch):
+    monkeypatch.setattr(search, "LEAST_KLU", least)
+    monkeypatch.setattr(dae_module, "LEAST_KLU", least)
+    dae, guess = make(n)
+    y0 = dae.consistent(*guess)
+    structure = dae_module._structure(dae, 0.0, y0, None)
+    assert (structure.large is not None) == (least == 0)
+    slopes = jax.jit(lambda y: dae.term.vf(0.0, y, None))(y0)
+    return structure, str(dae.report(*guess)), (y0, slopes)
+
+
+@pytest.mark.parametrize(
+    "make, n", [(explicit, 5), (heat, 9), (ladder, 8), (ring, 7), (varying, 8), (pairs, 4), (chain, 3)]
+)  # fmt: skip
+def test_structure_and_states_are_those_of_dense_matrices(make, n, monkeypatch):
+    dense, report, values = found(make, n, 10**9, monkeypatch)
+    large, same, others = found(make, n, 0, monkeypatch)
+    assert same == report and large.ranks == dense.ranks and large.times == dense.times
+    assert large.brought == dense.brought
+    for a, b in zip(jax.tree.leaves(values), jax.tree.leaves(others), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "make, n, index, freedom",
+    [
+        (heat, 10_000, 1, 9_998),
+        (ladder, 10_000, 1, 5_000),
+        (ring, 2_000, 1, 1_999),
+        (pairs, 1_000, 2, 0),
+        (chain, 1_000, 3, 2_000),
+    ],
+)
+def test_numbers_known_by_hand(make, n, index, freedom):
+    dae, guess = make(n)
+    structure = dae_module._structure(dae, 0.0, dae._state(guess), None)
+    assert (structure.index, structure.freedom) == (index, freedom)
+    assert structure.large is not None
+
+
+def test_what_is_not_found_is_refused_at_once():
+    """A dense derivative of an unknown operation, and an index of 4."""
+    n = 400
+
+    def residual(t, y, dy, args):
+        return jnp.concatenate([dy[: 3 * n] - y[n:], y[:n] - jnp.sin(t)])
+
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match="their index is larger than 3"):
+        dfc.DAE(residual=residual).consistent(jnp.ones(4 * n))
+    assert time.monotonic() - begin < 60
+
+
+def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
+    """Heat and a ladder of diodes, to the tolerance of the solve."""
+
+    def solved(least):
+        monkeypatch.setattr(search, "LEAST_KLU", least)
+        monkeypatch.setattr(dae_module, "LEAST_KLU", least)
+        dae, guess = heat(120)
+        y0 = dae.consistent(*guess)
+        steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
+        sol = dfx.diffeqsolve(
+            dae.term, dae.wrap(dfc.Radau()), 0.0, 0.1, 1e-4, y0, stepsize_controller=steps
+        )
+        return sol.ys[-1]
+
+    y = solved(100)
+    np.testing.assert_allclose(y, solved(10**9), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(y[0] - 1, np.sin(0.1), rtol=1e-13)
+    np.testing.assert_allclose(y[-1] - y[-2] ** 3, 0, atol=1e-15)
