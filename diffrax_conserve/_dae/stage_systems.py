@@ -70,9 +70,7 @@ class SparseSystems(NamedTuple):
         places = self.places.of_both
         regular = places.is_regular(shares[0] * self.by_slope + self.by_y)
         known = jnp.where(regular, self.by_y, jnp.nan)
-        return [
-            ft.partial(places.solve_regular, share * self.by_slope + known) for share in shares
-        ]
+        return [ft.partial(places.solve_regular, share * self.by_slope + known) for share in shares]
 
 
 class _Together:
