@@ -64,9 +64,9 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     operations in a step. A singular matrix ends Newton's method, as if it had not converged.
 
     Where the solution oscillates, as in a circuit, the local error does too, and a step that
-    follows it is rejected often. `diffrax.PIDController(rtol=..., atol=..., pcoeff=0.4, icoeff=0.3)`
-    is steadier: of the transistor amplifier it rejects a third as many steps, and its error is a
-    tenth.
+    follows it is often rejected. `diffrax.PIDController(rtol=1e-5, atol=1e-5, pcoeff=0.4,
+    icoeff=0.3)` is steadier: of the transistor amplifier it rejects half as many steps, and the
+    error is a fifth or less.
 
     Inside [`diffrax_conserve.DAE`][] the equations are $F(t, y, y') = 0$; by itself, they are
     $y' = f(t, y)$.

@@ -200,8 +200,8 @@ def root(
 ) -> Solved:
     """The root of `residual` that `iterate(guess)` finds, for unknowns that are an array or a
     PyTree of them. Its derivative is by the theorem, with `solve(matrix, vector)` for linear
-    systems, whose matrix is `jacobian(residual)(unknowns)`, flat. The arrays over which the functions close, such as parameters, have their derivatives
-    too."""
+    systems, whose matrix is `jacobian(residual)(unknowns)`, flat. The arrays over which the
+    functions close, such as parameters, have their derivatives too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
     return solution(SquareSystem(residual, iterate, guess, solve, jacobian))
 

@@ -24,7 +24,7 @@ def both(monkeypatch):
         for least in (2, 10**6):
             monkeypatch.setattr(stage_systems, "LEAST_KLU", least)
             found = jax.tree.leaves(jax.jit(compute)())
-            want = found if least == 2 else want  # noqa: F821
+            want = found if least == 2 else want
         for a, b in zip(found, want, strict=True):
             np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol * np.max(np.abs(b)))
         return found
