@@ -57,6 +57,17 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     systems are one real and one complex one of the size of the state. The error estimate is that
     of an embedded method of order three, and damps stiff components.
 
+    From 100 unknowns on, in float64 on a CPU, the linear systems are sparse: which elements of the
+    Jacobian can differ from zero is found when the solve is traced, and KLU solves them. That takes
+    the packages of `pip install 'diffrax-conserve[sparse]'`. Without them, in float32 and on a GPU,
+    or if a quarter of the elements can differ from zero, the systems are dense, which takes $n^3$
+    operations in a step. A singular matrix ends Newton's method, as if it had not converged.
+
+    Where the solution oscillates, as in a circuit, the local error does too, and a step that
+    follows it is often rejected. `diffrax.PIDController(rtol=1e-5, atol=1e-5, pcoeff=0.4,
+    icoeff=0.3)` is steadier: of the transistor amplifier it rejects half as many steps, and the
+    error is a fifth or less.
+
     Inside [`diffrax_conserve.DAE`][] the equations are $F(t, y, y') = 0$; by itself, they are
     $y' = f(t, y)$.
 

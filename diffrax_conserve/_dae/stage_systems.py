@@ -19,7 +19,7 @@ from .._large.klu import Places, SparseJacobian, available, sparse_jacobian, why
 from .._numerics.linear import lu_factors, lu_solution
 
 # `F(t, y, y')` of vectors.
-Residual = Callable[[Array, Array, Array], Array]
+Residual = Callable[..., Array]
 
 
 class DenseSystems(NamedTuple):
@@ -31,7 +31,7 @@ class DenseSystems(NamedTuple):
     stages_jacobian = staticmethod(jax.jacfwd)
 
     @classmethod
-    def at(cls, residual: Residual, t: Array, y: Array, slope: Array) -> "DenseSystems":
+    def at(cls, residual: Residual, t: Any, y: Array, slope: Array) -> "DenseSystems":
         return cls(*lax.stop_gradient(jax.jacfwd(residual, (1, 2))(t, y, slope)))
 
     def sizes_of_terms(self, y: Array, slope: Array) -> Float[Array, " n"]:
@@ -81,7 +81,7 @@ class _Together:
         rows = np.concatenate([by_y.rows, by_slope.rows])
         self.of_both = Places(rows, np.concatenate([by_y.columns, by_slope.columns]), size)
 
-    def at(self, residual: Residual, t: Array, y: Array, slope: Array) -> SparseSystems:
+    def at(self, residual: Residual, t: Any, y: Array, slope: Array) -> SparseSystems:
         t, y, slope = lax.stop_gradient((t, y, slope))
         by_y = self.by_y.values(lambda y: residual(t, y, slope), y)
         by_slope = self.by_slope.values(lambda slope: residual(t, y, slope), slope)
@@ -105,7 +105,8 @@ class _Together:
             for x in (self.by_y, self.by_slope)
             if i == j or x is self.by_slope
         ]
-        places = Places(*(np.concatenate(x) for x in zip(*parts, strict=True)), 3 * n)
+        rows, columns = (np.concatenate(x) for x in zip(*parts, strict=True))
+        places = Places(rows, columns, 3 * n)
         return SparseJacobian(places.rows, places.columns, (3 * n, 3 * n)), places
 
     @property
@@ -121,9 +122,7 @@ def _together(by_y: SparseJacobian, by_slope: SparseJacobian, size: int) -> _Tog
     return _Together(by_y, by_slope, size)
 
 
-def systems_at(
-    residual: Residual, t: Array, y: Array, slope: Array
-) -> DenseSystems | SparseSystems:
+def systems_at(residual: Residual, t: Any, y: Array, slope: Array) -> DenseSystems | SparseSystems:
     """The linear systems with the derivatives at a time, a state and slopes: sparse ones where that
     is faster."""
     n, dense = y.size, ft.partial(DenseSystems.at, residual, t, y, slope)
