@@ -1,0 +1,49 @@
+"""A loop that calls `step` itself, with `args` that change at each tick."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import diffrax_conserve as dfc
+
+from ..problems import EPS, largest
+
+TICK = 0.25
+TERM = dfx.ODETerm(lambda t, y, torque: jnp.stack([y[1], torque - jnp.sin(y[0])]))
+ENERGY = dfc.FirstIntegral(lambda t, y, torque: y[1] ** 2 / 2 - jnp.cos(y[0]) - torque * y[0])
+SOLVER = dfc.ManifoldProjection(dfc.RK4(), ENERGY)
+
+
+def ends(torques, y0):
+    def tick(y, torque):
+        state = SOLVER.init(TERM, 0.0, TICK, y, torque)
+        y, _, _, _, result = SOLVER.step(TERM, 0.0, TICK, y, torque, state, made_jump=False)
+        return y, (y, dfx.is_successful(result))
+
+    return jax.lax.scan(tick, y0, torques)[1]
+
+
+def test_the_work_of_a_torque_is_the_gain_in_energy_and_a_gradient_goes_through_all_ticks():
+    """`init` at each tick takes the value of the new torque. In a batch, by a difference."""
+    torques = jnp.array([[0.3, -0.2, 0.5, 0.1], [0.0, 0.4, -0.5, 0.2]])
+    y0 = jnp.array([[0.5, 0.2], [-0.4, 0.6]])
+
+    @jax.jit
+    def both(torques, along):
+        def last(torques):
+            ys, success = jax.vmap(ends)(torques, y0)
+            return jnp.sum(ys[:, -1] ** 2), (ys, success)
+
+        slopes, found = jax.grad(last, has_aux=True)(torques)
+        step = 1e-5
+        apart = last(torques + step * along)[0] - last(torques - step * along)[0]
+        return found, jnp.sum(slopes * along), apart / (2 * step)
+
+    along = jnp.array([[1.0, -2.0, 0.5, 1.5], [0.7, 0.3, -1.0, 2.0]])
+    (ys, success), slope, difference = both(torques, along)
+    assert success.all()
+    ys = np.concatenate([y0[:, None], ys], axis=1)
+    energy = ys[..., 1] ** 2 / 2 - np.cos(ys[..., 0])
+    assert largest(np.diff(energy) - torques * np.diff(ys[..., 0])) < 16 * EPS
+    assert abs(slope - difference) < 1e-8
