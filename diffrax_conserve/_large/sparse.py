@@ -40,7 +40,7 @@ from .._constants import (
     MAX_DENSE_SYSTEM,
     REGULARISATION_POWER,
 )
-from .._numerics.linear import Solve
+from .._numerics.linear import Solve, inverse_factors
 from .._numerics.rows import AbstractGram, AbstractRows
 from .asdex_import import asdex, reason
 from .detection import constants_of, content_key, jacobian_places
@@ -418,7 +418,7 @@ class BlockGram(AbstractGram):
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
         size = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
-        halves = _halves((corner + added * jnp.diag(size))[None])
+        halves = inverse_factors((corner + added * jnp.diag(size))[None])
         return BlockFactors(sparse, (self.rows, eliminated, halves), self.pattern)
 
     def _by_klu(self, diagonal: Array) -> Solve:
@@ -504,25 +504,6 @@ def _times(a: Array, b: Array) -> Array:
     return jnp.sum(a[..., None] * b[:, None], axis=2)
 
 
-def _halves(matrix: Float[Array, "blocks k k"]) -> tuple[Array, Array]:
-    """Two matrices for each block, of which `right left` is its inverse, by Gaussian elimination.
-    There is no search for pivots, which positive definite matrices such as Gram matrices do not
-    need.
-
-    We do not multiply the two: where constraints depend on each other, the elements of the inverse
-    are as large as one over what is added to the diagonal, and the roundoff of the product would
-    spoil what the constraints determine. In the halves only a row of `left` is large.
-    """
-    left = right = jnp.broadcast_to(jnp.eye(matrix.shape[1], dtype=matrix.dtype), matrix.shape)
-    for k in range(matrix.shape[1] - 1):
-        pivot, later = matrix[:, k, k, None], np.arange(matrix.shape[1]) > k
-        below, beside = (jnp.where(later, x, 0) / pivot for x in (matrix[:, :, k], matrix[:, k, :]))
-        right = right - right[:, :, k, None] * beside[:, None]
-        left = left - below[:, :, None] * left[:, k, None]
-        matrix = matrix - below[:, :, None] * matrix[:, k, None]
-    return left / jnp.diagonal(matrix, axis1=1, axis2=2)[:, :, None], right
-
-
 def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) -> Solve:
     """The solution of a block tridiagonal system by cyclic reduction (G. H. Golub and C. F. Van
     Loan, *Matrix Computations*, Johns Hopkins 2013, 4.5), as a function of its right side.
@@ -532,7 +513,7 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     column `i + 1`, `preceding[i]` that in row `i + 1` and column `i`; the last of both are zero.
     """
     if following is None or preceding is None or len(diagonal) == 1:
-        return jtu.Partial(_in_halves, *_halves(diagonal))
+        return jtu.Partial(_in_halves, *inverse_factors(diagonal))
     if diagonal.shape[1] == 1:
         bands = (_before(preceding), diagonal, following)
         return jtu.Partial(lax.linalg.tridiagonal_solve, *(x.reshape(-1) for x in bands))
@@ -542,7 +523,7 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     to_right, odd_right = _even_and_odd(following)
     # These couple the odd block to the one before, and the next even block to the odd one.
     odd_left, to_left = _even_and_odd(preceding)
-    left, right = _halves(odd)
+    left, right = inverse_factors(odd)
     from_right, from_left = _times(to_right, right), _before(_times(to_left, right))
     odd_left, odd_right = _times(left, odd_left), _times(left, odd_right)
     middle = middle - _times(from_right, odd_left) - _times(from_left, _before(odd_right))
@@ -553,7 +534,7 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     return jtu.Partial(_substituted, coarse, (left, right), couplings)
 
 
-def _in_halves(left: Array, right: Array, b: Array) -> Array:
+def _ininverse_factors(left: Array, right: Array, b: Array) -> Array:
     return _times(right, _times(left, b))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import NUM_REFINEMENTS, ROUNDOFF
@@ -27,6 +28,28 @@ def lu_solution(factors: tuple[Array, Array], b: Array) -> Array:
     x = jnp.reshape(b, (len(b), -1)).at[permutation].get(mode="promise_in_bounds")
     x = lax.linalg.triangular_solve(both, x, left_side=True, lower=True, unit_diagonal=True)
     return lax.linalg.triangular_solve(both, x, left_side=True).reshape(b.shape)
+
+
+def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
+    """Two matrices of which `right left` is the inverse, by Gaussian elimination that is written out
+    in operations with rows, for a few of them. LAPACK takes longer for such matrices, and its
+    threads wait for each other on a busy machine. There is no search for pivots, which positive
+    definite matrices such as Gram matrices do not need.
+
+    We do not multiply the two: where constraints depend on each other, the elements of the inverse
+    are as large as one over what is added to the diagonal, and the roundoff of the product would
+    spoil what the constraints determine. In the factors only a row of `left` is large.
+    """
+    size = matrix.shape[-1]
+    left = right = jnp.broadcast_to(jnp.eye(size, dtype=matrix.dtype), matrix.shape)
+    for k in range(size - 1):
+        pivot, later = matrix[..., k, k, None], np.arange(size) > k
+        below = jnp.where(later, matrix[..., :, k], 0) / pivot
+        beside = jnp.where(later, matrix[..., k, :], 0) / pivot
+        right = right - right[..., :, k, None] * beside[..., None, :]
+        left = left - below[..., :, None] * left[..., k, None, :]
+        matrix = matrix - below[..., :, None] * matrix[..., k, None, :]
+    return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
 
 
 def iterative_refinement(

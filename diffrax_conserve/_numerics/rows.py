@@ -32,10 +32,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import REGULARISATION_POWER, WRITTEN_OUT
+from .._constants import MAX_BLOCK, REGULARISATION_POWER, WRITTEN_OUT
 from .linear import (
     Solve,
     forward_elimination,
+    inverse_factors,
     iterative_refinement,
     lu_factors,
     lu_solution,
@@ -246,7 +247,10 @@ class DenseGram(AbstractGram):
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
         eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
         added = eps**REGULARISATION_POWER * len(matrix) ** 0.5 if least is None else least
-        return _Substitutions(lu_factors(matrix.astype(dtype) + added * one), unit)
+        matrix = matrix.astype(dtype) + added * one
+        if len(matrix) > MAX_BLOCK:
+            return _Substitutions(lu_factors(matrix), unit)
+        return _Inverses(*inverse_factors(matrix), unit)
 
 
 class _Inverses(eqx.Module):
