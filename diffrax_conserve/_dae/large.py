@@ -1,6 +1,10 @@
-"""What the reduction of large equations needs beside the `Structure`: the places of derivatives, and
-how slopes are eliminated such that each constraint stays a function of a few unknowns.
+"""What the reduction of large equations needs beside the `Structure`: the places of derivatives,
+and how slopes are eliminated such that each constraint stays a function of a few unknowns.
 """
+
+# The types of scipy's sparse arrays are incomplete.
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
 
 import dataclasses
 from collections.abc import Callable
@@ -22,7 +26,10 @@ class SparseMatrix:
         self.matrix.sum_duplicates()
         self.matrix.eliminate_zeros()
         at = sp.coo_array(self.matrix)
-        self.values, (self.rows, self.columns) = at.data, (np.asarray(x, np.int32) for x in at.coords)
+        self.values, (self.rows, self.columns) = (
+            at.data,
+            (np.asarray(x, np.int32) for x in at.coords),
+        )
         self._key = at.shape, *(x.tobytes() for x in (self.rows, self.columns, self.values))
 
     def __eq__(self, other: object) -> bool:

@@ -5,6 +5,10 @@ at numbers in general position. asdex finds their places, `_large.elimination` e
 can not do is refused with its reason, before it takes long.
 """
 
+# The types of scipy's sparse arrays are incomplete.
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
+
 import dataclasses
 import functools as ft
 from typing import Any
@@ -190,9 +194,7 @@ def _with_round(
     if constant and given.size == rows.size:
         at = np.searchsorted(np.sort(columns), needed)
         at = np.argsort(columns)[at]
-        one = sp.csr_array(
-            (np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns))
-        )
+        one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
         inverse = combinations(one, structure.mass[rows][:, columns])
         if inverse.nnz > _MOST_TERMS * max(1, len(at)):
             raise NotFound(

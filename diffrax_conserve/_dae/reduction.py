@@ -249,9 +249,7 @@ class Reduction:
             values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
 
-    def freely_moved(
-        self, t: Array, y: Float[Array, " n"]
-    ) -> tuple[Any, np.ndarray]:
+    def freely_moved(self, t: Array, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""
