@@ -382,8 +382,8 @@ class DAE(Hashable):
         matrix = self.mass.known if isinstance(self.mass, _Matrix) else None
         if matrix is not None and matrix.shape[0] != size:
             raise ValueError(
-                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers: pass a matrix "
-                "with a row for each equation and a column for each number of the state."
+                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers: pass a "
+                "matrix with a row for each equation and a column for each number of the state."
             )
 
         def equations(t: Array, vector: Array, slopes: Array) -> Array:
@@ -407,8 +407,9 @@ DAE.__init__.__doc__ = r"""**Arguments:**
 
 - `f`: with `mass`, called as `f(t, y, args)`, and returns as many numbers as `y` has; with
     `algebraic`, called as `f(t, x, z, args)`, and returns a value like `x`.
-- `mass`: the matrix $M$, or a function `mass(t, y, args)` that returns it. It acts on the
-    numbers of the state, in the order of the leaves.
+- `mass`: the matrix $M$, also as an array of `scipy.sparse` or a `jax.experimental.sparse.BCOO`,
+    or a function `mass(t, y, args)` that returns it. It acts on the numbers of the state, in the
+    order of the leaves.
 - `algebraic`: the algebraic equations, called as `algebraic(t, x, z, args)`; as many numbers as
     `z` has.
 - `residual`: called as `residual(t, y, dy, args)`; a PyTree with as many numbers as `y` has.

@@ -1,6 +1,10 @@
-"""What the reduction of large equations needs beside the `Structure`: the places of derivatives, and
-how slopes are eliminated such that each constraint stays a function of a few unknowns.
+"""What the reduction of large equations needs beside the `Structure`: the places of derivatives,
+and how slopes are eliminated such that each constraint stays a function of a few unknowns.
 """
+
+# The types of scipy's sparse arrays are incomplete.
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
 
 import dataclasses
 from collections.abc import Callable

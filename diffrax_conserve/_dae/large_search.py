@@ -5,6 +5,10 @@ at numbers in general position. asdex finds their places, `_large.elimination` e
 can not do is refused with its reason, before it takes long.
 """
 
+# The types of scipy's sparse arrays are incomplete.
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
+
 import dataclasses
 import functools as ft
 from typing import Any

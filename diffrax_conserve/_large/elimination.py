@@ -8,8 +8,13 @@ the matrix of numbers in general position is eliminated, in an order in which li
   are all of most mass matrices.
 - What is left falls into parts that share no row and no column. Small parts are eliminated with the
   largest pivot, all parts of one shape together.
-- A large part is factored by SuperLU, with roundoff added so that it is no error if it is singular. Its small pivots tell what is left over, which is eliminated in the same way.
+- A large part is factored by SuperLU, with roundoff added so that it is no error if it is singular.
+  Its small pivots tell what is left over, which is eliminated in the same way.
 """
+
+# The types of scipy's sparse arrays are incomplete.
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
 
 from typing import Any
 

@@ -26,10 +26,11 @@ def test_rank_is_that_of_a_dense_matrix(dense, seed):
     """Large parts by SuperLU too, of a matrix of integers, whose rank is exact."""
     rng = np.random.default_rng(seed)
     m, n, k = rng.integers(1, 30, 3)
+    digits = lambda size: rng.integers(1, 9, size)  # noqa: E731
     factors = [
-        sp.random_array(shape, density=0.15, rng=rng, data_sampler=lambda size: rng.integers(1, 9, size))
+        sp.random_array(shape, density=0.15, rng=rng, data_sampler=digits)
         for shape in ((m, k), (k, n))
-    ]  # fmt: skip
+    ]
     matrix = sp.csr_array(factors[0] @ factors[1], dtype=float)
     before, elimination._DENSE = elimination._DENSE, dense
     try:
