@@ -51,6 +51,7 @@ LAYERS = (
 CONFINED = {
     "asdex": {"_large"},
     "hypothesis": {"testing"},
+    "klujax": {"_large"},
     "matplotlib": {"reproduce", "_diagnostics"},
 }
 

@@ -7,7 +7,8 @@ can not do is refused with its reason, before it takes long.
 
 # The types of scipy's sparse arrays are incomplete.
 # pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
-# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportOptionalIterable=false, reportAssignmentType=false
 
 import dataclasses
 import functools as ft

@@ -14,7 +14,8 @@ the matrix of numbers in general position is eliminated, in an order in which li
 
 # The types of scipy's sparse arrays are incomplete.
 # pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
-# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportOptionalIterable=false, reportAssignmentType=false
 
 from typing import Any
 

@@ -31,8 +31,8 @@ def lu_solution(factors: tuple[Array, Array], b: Array) -> Array:
 
 
 def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
-    """Two matrices of which `right left` is the inverse, by Gaussian elimination that is written out
-    in operations with rows, for a few of them. LAPACK takes longer for such matrices, and its
+    """Two matrices of which `right left` is the inverse, by Gaussian elimination, written out in
+    operations with rows, for a few of them. LAPACK takes longer for such matrices, and its
     threads wait for each other on a busy machine. There is no search for pivots, which positive
     definite matrices such as Gram matrices do not need.
 

@@ -28,12 +28,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
-from .._large.sparse import Pattern, SparseRows, pattern_of
+from .._large.sparse import Pattern, pattern_of
 from .._manifold import evaluate, is_entry, named_entries
 from .._tree import key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows
+from .sparse_rows import SparseRows
 
 # The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
 # within their tolerances; all are noise. They are ordered such that the level of a state is the

@@ -29,11 +29,12 @@ from jaxtyping import Array, Float
 from .._constants import LEAST_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
-from .._large.sparse import SparseRows, pattern_of
+from .._large.sparse import pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import ravel, tree_stop_gradient
 from .problem import functions_of
 from .rows import AbstractRows, DenseRows
+from .sparse_rows import SparseRows
 
 # The primitives of JAX that are sums, and sums of products.
 _SUMS = frozenset({"add", "add_any", "sub", "reduce_sum", "cumsum"})

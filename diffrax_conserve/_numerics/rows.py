@@ -1,7 +1,7 @@
 """The rows of a Jacobian, and their Gram matrices `U Vᵀ`, one row for each constraint.
 
 A projection needs few operations with them, which are two interfaces, `AbstractRows` and
-`AbstractGram`. Here are those of dense rows; sparse ones are in `_large.sparse`.
+`AbstractGram`. Here are those of dense rows; sparse ones are in `sparse_rows`.
 
 Gram matrices are singular where constraints depend on each other, as when an integral is given
 twice. The multipliers are then not unique, but the correction is, if the constraints do not

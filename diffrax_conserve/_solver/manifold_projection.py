@@ -340,7 +340,8 @@ class ManifoldProjection(ForwardingSolver):
         cannot_start = self._cannot_start(target, state, step, made_jump)
         length, first_step = step.t1 - step.t0, state.first_step.astype(jnp.result_type(step.t1))
         time = jnp.maximum(jnp.abs(step.t1), first_step)
-        final = cannot_start | is_final(length, time, target.changes, candidate)
+        changes = component_changes(step.y0, candidate)
+        final = cannot_start | is_final(length, time, changes, candidate)
         correction, too_far = y1 - candidate, jnp.asarray(False)
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
