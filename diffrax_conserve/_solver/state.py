@@ -31,7 +31,7 @@ class State(eqx.Module):
     """
 
     inner: Any
-    constants: Float[Array, " 2*m+1"]
+    constants: Float[Array, " constants"]
     gained: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
     end: Float[Array, ""]
