@@ -45,7 +45,7 @@ def client(smoke=False):
         ).y  # fmt: skip
 
     return Client(
-        package="soromox", problem="a soft-jointed arm of two links", solver=dfx.Tsit5(),
+        package="soromox", problem="an elastic arm of two links", solver=dfx.Tsit5(),
         manifold={"energy": dfc.FirstIntegral(energy)}, tolerance=1e-6, ts=ts, run=run,
         field=lambda t, y, args: robot.forward_dynamics(t, y, (jnp.zeros(LINKS),)), y0=start.y,
         quantities=lambda ys: tuple(jnp.split(ys, 2, axis=1)),
