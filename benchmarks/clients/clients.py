@@ -128,13 +128,7 @@ def tables(results):
 
 
 def filled(text, results):
-    for name, lines in tables(results).items():
-        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        new = "\n".join([begin, *lines, end])
-        text = re.sub(
-            f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, x=new: x, text, flags=re.DOTALL
-        )
-    return text
+    return measuring.filled(text, tables(results))
 
 
 def run_all(options):

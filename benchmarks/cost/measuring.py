@@ -14,6 +14,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -239,3 +240,13 @@ def _compiler_version() -> str:
 
 def print_machine(about: dict[str, Any]) -> None:
     print("\n".join(f"{key}: {value}" for key, value in about.items()), flush=True)
+
+
+def filled(text: str, tables: dict[str, list[str]]) -> str:
+    """The text of a page with the lines of each table between its two markers."""
+    for name, lines in tables.items():
+        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+        new = "\n".join([begin, *lines, end])
+        pattern = f"{re.escape(begin)}.*?{re.escape(end)}"
+        text = re.sub(pattern, lambda _, x=new: x, text, flags=re.DOTALL)
+    return text

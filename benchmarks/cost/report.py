@@ -6,7 +6,6 @@ the tables of the pages to the results.
 """
 
 import argparse
-import re
 import runpy
 from typing import Any
 
@@ -96,12 +95,7 @@ def tables(results: Results) -> dict[str, list[str]]:
 
 def filled(text: str, results: Results) -> str:
     """The text of a page with the current tables."""
-    for name, lines in tables(results).items():
-        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        table = "\n".join(lines)
-        pattern = f"{re.escape(begin)}.*?{re.escape(end)}"
-        text = re.sub(pattern, lambda _, x=f"{begin}\n{table}\n{end}": x, text, flags=re.DOTALL)
-    return text
+    return measuring.filled(text, tables(results))
 
 
 # ---- The figures ----

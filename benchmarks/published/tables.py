@@ -7,7 +7,6 @@ python benchmarks/published/tables.py --write   # puts each table between its tw
 import argparse
 import json
 import math
-import re
 
 import common
 import discrete_gradient
@@ -102,13 +101,7 @@ def tables(results):
 
 
 def filled(text, results):
-    for name, lines in tables(results).items():
-        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        new = "\n".join([begin, *lines, end])
-        text = re.sub(
-            f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, x=new: x, text, flags=re.DOTALL
-        )
-    return text
+    return common.measuring.filled(text, tables(results))
 
 
 def figure(results):
