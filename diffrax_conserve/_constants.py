@@ -39,7 +39,7 @@ NUM_REFINEMENTS = 2
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 AT_BOUND = 1e-10
 # Up to this many unknowns and constraints together a dense system is solved in each step: that of
-# the nearest point from far away, and a sparse one that would else be solved by iteration.
+# the nearest point from far away, and a sparse one that is too wide for blocks.
 MAX_DENSE_SYSTEM = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
@@ -62,6 +62,7 @@ DENSE_ROW_RATIO = 16
 # A Jacobian with more dense rows than this is treated as dense, because each costs one reverse pass
 # and a solve of the sparse system.
 MAX_DENSE_ROWS = 16
-# A block with more rows than this is replaced by an iteration: it is eliminated element by element,
-# so that compile time grows with its size.
+# Dense matrices and blocks of sparse ones with up to this many rows are eliminated row by row, so
+# that compile time grows with their size. Larger dense ones are factored by LAPACK. Sparse ones
+# whose blocks would be larger are factored by KLU, or solved by iteration.
 MAX_BLOCK = 16

@@ -34,7 +34,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_nothing
-from .._tree import ravel, tree_all_finite, tree_shapes, unravel
+from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
 from .newton import (
@@ -628,11 +628,11 @@ class ConstraintProjection(AbstractProjection):
             # Along a ladder of a thousand resistors the voltages underflow.
             problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
         y, settled = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
-        info = problem.report(candidate, y)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.
-        return y, problem.report(candidate, y, info.num_iterations, ok=info.ok | settled)
+        ok = settled | tree_stop_gradient(problem).holds(lax.stop_gradient(y))
+        return y, problem.report(candidate, y, ok=ok)
 
 
 @eqx.filter_jit

@@ -10,8 +10,10 @@ can not do is refused with its reason, before it takes long.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
 # pyright: reportOptionalIterable=false, reportAssignmentType=false
 
+import contextlib
 import dataclasses
 import functools as ft
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -32,6 +34,7 @@ MAX_INDEX = 3
 # A matrix of eliminated slopes with more than this many elements for each row is given up: each
 # constraint would contain so many unknowns.
 _MOST_TERMS = 64
+# So many equations are solved one after the other for a slope that a constraint needs.
 _LEVELS = 8
 
 
@@ -39,6 +42,20 @@ class NotFound(Exception):
     """Why the structure was not found."""
 
 
+@contextlib.contextmanager
+def _refusals() -> Iterator[None]:
+    """Gives what an elimination or asdex can not do as the reason why nothing was found."""
+    try:
+        yield
+    except TooFull:
+        raise NotFound(
+            "the matrices of their derivatives fill in too much when they are eliminated"
+        ) from None
+    except NotImplementedError as error:
+        raise NotFound(f"asdex, which finds the places of derivatives, says: {error}") from None
+
+
+@_refusals()
 def find_large_structure(
     equations: WithNumbers,
     numbers: Numbers,
@@ -51,30 +68,9 @@ def find_large_structure(
 ) -> Structure:
     """As `find_structure`. `unknown` are the numbers that may have any values, also where they are
     indices."""
-    try:
-        return _found(equations, numbers, others, t, y, mass, unknown, known)
-    except TooFull:
-        raise NotFound(
-            "the matrices of their derivatives fill in too much when they are eliminated"
-        ) from None
-    except NotImplementedError as error:
-        raise NotFound(f"asdex, which finds the places of derivatives, says: {error}") from None
-
-
-def _found(
-    equations: WithNumbers,
-    numbers: Numbers,
-    others: Numbers,
-    t: Array,
-    y: Array,
-    mass: sp.csr_array | None,
-    unknown: tuple[int, ...],
-    known: Structure | None,
-) -> Structure:
     n = y.size
-    places = _Places(equations, numbers, unknown)
-    by_slope = places.of(lambda given, t, y, s: equations(given, t, y, s), 2, n)
-    by_y = places.of(lambda given, t, y, s: equations(given, t, y, s), 1, n)
+    places = _Places(numbers, unknown)
+    by_slope, by_y = places.of(equations, 2, n), places.of(equations, 1, n)
     t, y, values, is_linear, absent = _general_position(equations, by_y, by_slope, numbers, t, y)
     matrix = other = _matrix(by_slope, values)
     if mass is None:
@@ -268,8 +264,7 @@ def _levels(
 class _Places:
     """Finds where derivatives have elements, whatever the unknown numbers are."""
 
-    def __init__(self, equations: WithNumbers, numbers: Numbers, unknown: tuple[int, ...]):
-        del equations
+    def __init__(self, numbers: Numbers, unknown: tuple[int, ...]):
         self.numbers, self.unknown = numbers, unknown
 
     def of(self, fn: Any, argument: int, n: int) -> SparseJacobian:

@@ -183,9 +183,9 @@ def _in_parts(matrix: sp.csr_array) -> list[Pivots]:
                 one, other = _of_large_part(matrix[rows][:, columns])
                 found.append((rows[one], columns[other]))
             continue
-        for first in range(0, len(labels_of), max(1, MOST_ELEMENTS // int(np.prod(shape)) // 8)):
-            last = first + max(1, MOST_ELEMENTS // int(np.prod(shape)) // 8)
-            rows, columns = (x[first:last] for x in lines)
+        at_once = max(1, MOST_ELEMENTS // int(np.prod(shape)) // 8)
+        for first in range(0, len(labels_of), at_once):
+            rows, columns = (x[first : first + at_once] for x in lines)
             found.append(_of_small_parts(matrix, rows, columns))
     return found
 

@@ -14,9 +14,9 @@ contradict each other. There are three ways to solve such a system.
   parallel are all kept, because a correction needs the direction in which they differ. A derivative
   does not need it, and would lose its digits in that direction; see `implicit`. Below double
   precision, the last iteration, which only polishes, does not need it either; see `iterate`.
-- More constraints: LU factors by LAPACK, with a small share of the diagonal added, so that no pivot
-  vanishes. In a derivative the share is the least pivot that counts, so that smaller ones have
-  hardly an effect.
+- More constraints: elimination without pivots for up to sixteen, otherwise LU factors by LAPACK,
+  with a small share of the diagonal added, so that no pivot vanishes. In a derivative the share is
+  the least pivot that counts, so that smaller ones have hardly an effect.
 - A sparse matrix: factors in blocks, with one share for corrections and derivatives.
 """
 
@@ -254,8 +254,8 @@ class DenseGram(AbstractGram):
 
 
 class _Inverses(eqx.Module):
-    """The inverses of the two factors of a small matrix, so that a solve is two products, which XLA
-    fuses with what is around them.
+    """Two matrices whose product is the inverse of a small matrix. A solve is two products,
+    which XLA fuses with what is around them.
 
     - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
     """
@@ -271,7 +271,7 @@ class _Inverses(eqx.Module):
 
 
 class _Substitutions(eqx.Module):
-    """The factors of a large matrix are LAPACK's, and a solve is two substitutions: to invert them
+    """The factors of a larger matrix by LAPACK. A solve is two substitutions: to invert the factors
     takes longer than the few solves of a step."""
 
     factors: tuple[Array, Array]
