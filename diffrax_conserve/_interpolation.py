@@ -20,12 +20,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, PyTree, Real
+from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike
 from ._numerics.iterate import any_lane, damped_newton
 from ._numerics.problem import Step
-from ._time import nonzero_length
+from ._time import FieldTime, nonzero_length
 from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
 
 
@@ -63,7 +63,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
 
     - `t0`, `t1`: the ends of the step, as times of the solver.
     - `inner`: the interpolant `u` of the wrapped solver.
-    - `direction`: -1 if the solver's time is the negative of that of the vector field, otherwise 1.
+    - `field_time`: the time of the vector field as a function of that of the solver, and back.
     - `shift`: the correction of the step, `y₁ - ŷ₁`.
     - `limit`: the length of the step in the metric, which a correction may exceed only if the moved
       interpolant is farther than this from the state at the start of the step.
@@ -74,7 +74,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
-    direction: Real[Array, ""]
+    field_time: FieldTime
     shift: Float[Array, " n"]
     limit: Float[Array, ""]
     error: Float[Array, " n"] | None
@@ -92,12 +92,12 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         u = self.inner.evaluate(t, left=left)
         share = (t - self.t0) / nonzero_length(self.t0, self.t1)
         moved = ravel(u) + share.astype(self.shift.dtype) * self.shift
-        return unravel(self.projected(t * self.direction, moved), u)
+        return unravel(self.projected(self.field_time(t), moved), u)
 
     def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
-        start, end = self.t0 * self.direction, self.t1 * self.direction
-        path = lambda t: ravel(self.inner.evaluate(t * self.direction))  # noqa: E731
+        start, end = self.field_time(self.t0), self.field_time(self.t1)
+        path = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
         target, first = self.target.unpack().advanced(start, t, path), path(start)
         step = Step(start, end, first, self.error)
         problem = target.problem(t, candidate, step)

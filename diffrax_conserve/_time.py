@@ -1,9 +1,26 @@
-"""The length of a step, as a divisor."""
+"""The times of a step: as those of the vector field, and their difference as a divisor."""
 
+from typing import final
+
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
-from ._custom_types import RealScalarLike
+from ._custom_types import IntScalarLike, RealScalarLike
+
+
+@final
+class FieldTime(eqx.Module):
+    """The time of the vector field as a function of that of the solver, and the other way round.
+
+    In a solve with `t1 < t0` diffrax negates all times before it calls the solver. The `direction`
+    is -1 then, otherwise 1, and its product with a time leads either way.
+    """
+
+    direction: IntScalarLike | Real[Array, ""]
+
+    def __call__(self, t: RealScalarLike) -> RealScalarLike:
+        return t * self.direction
 
 
 def nonzero_length(t0: RealScalarLike, t1: RealScalarLike) -> Float[Array, ""]:

@@ -24,6 +24,7 @@ from .._manifold import (
 from .._numerics.problem import measure, relative
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_solution
+from .._time import FieldTime
 from .._tree import ravel, tree_add, tree_shapes, tree_sub
 
 
@@ -224,6 +225,7 @@ def _gained(
             "`manifold` has a `rate`, whose integral is taken along the dense output, but `sol` "
             "has none. Ask for it by `saveat=SaveAt(t0=True, steps=True, dense=True)`."
         )
+    field_time = FieldTime(path.direction)
 
     def until(step: RealScalarLike, end: RealScalarLike) -> Values:
         info = jtu.tree_map(lambda x: x[step], path.infos)
@@ -231,10 +233,9 @@ def _gained(
         # A projected solver computes its balances along the dense output of the wrapped solver, so
         # we take the same.
         local = getattr(local, "inner", local)
-        # Times of the solver, which are the negative of the field's in a solve backwards in time.
-        sign = path.direction
-        states = lambda t: local.evaluate(t * sign)  # noqa: E731
-        return integrated_rates(manifold, path.ts[step] * sign, end * sign, states, args)
+        states = lambda t: local.evaluate(field_time(t))  # noqa: E731
+        times = field_time(path.ts[step]), field_time(end)
+        return integrated_rates(manifold, *times, states, args)
 
     def whole(step: Array) -> Values:
         # Of a batch with unlike numbers of steps, some are padding. These are replaced by the first
@@ -247,7 +248,7 @@ def _gained(
     sums = jtu.tree_map(lambda x: jnp.cumsum(x, axis=0), steps)
 
     def gained(t: RealScalarLike) -> Values:
-        t = t * path.direction
+        t = field_time(t)
         step = jnp.clip(jnp.searchsorted(path.ts, t) - 1, 0, path.ts_size - 2)
         before = jtu.tree_map(lambda x: jnp.where(step > 0, x[step - 1], 0), sums)
         return tree_add(before, until(step, t))

@@ -77,7 +77,8 @@ class Problem(eqx.Module):
         key, such as a key of a dictionary.
     - `step`: the [`diffrax_conserve.Step`][] of the solve; `None` outside a solve, as in
         [`diffrax_conserve.project`][], and for a projection whose `sees_step` is false.
-    - `functions`: the residual of each entry, as a function of the vector.
+    - `functions`, `sizes`: for each entry its residuals, as a function of the vector, and their
+        number.
     - `magnitude`: the part of the scale that does not depend on the state: the size of the
         conserved value, and `cancellation`.
     - `cancellation`: the part of the scale that the gradients do not show.
@@ -96,6 +97,7 @@ class Problem(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[Any, ...] = eqx.field(static=True)
     functions: tuple[Residual, ...]
+    sizes: tuple[int, ...] = eqx.field(static=True)
     magnitude: Float[Array, " m"]
     cancellation: Float[Array, " m"]
     pattern: Pattern | None = eqx.field(static=True)
@@ -174,9 +176,7 @@ class Problem(eqx.Module):
 
     def per_residual(self, of_entries: Sequence[Any]) -> np.ndarray:
         """One element for each residual, from one for each entry of the manifold."""
-        y = jax.eval_shape(ravel, self.like)
-        sizes = [eqx.filter_eval_shape(fn, y).size for fn in self.functions]
-        return np.repeat(np.asarray(of_entries), sizes)
+        return np.repeat(np.asarray(of_entries), self.sizes)
 
     def report(
         self,
@@ -302,6 +302,7 @@ def problem_of(
         names=tuple(name for name, _ in named_entries(manifold)),
         keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
         functions=tuple(residuals),
+        sizes=tuple(sizes),
         magnitude=lax.stop_gradient(jnp.abs(values) + cancellation),
         cancellation=cancellation,
         pattern=pattern_of(functions, sizes, vector),

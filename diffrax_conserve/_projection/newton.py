@@ -157,6 +157,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     tested = dataclasses.replace(
         problem,
         functions=(conditions,),
+        sizes=(y.size + scale.size,),
         magnitude=jnp.concatenate([sizes_of[0] + sizes_of[1], scale]),
         cancellation=jnp.concatenate([jnp.zeros_like(y), problem.cancellation]),
         changes=None,

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 from .._large.sparse import pattern_of
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
-from .._tree import ravel
 from .base import AbstractProjection, adapted
 
 
@@ -113,13 +112,13 @@ def _restricted(
     wanted = [key in keys for key in problem.keys]
     rows = np.flatnonzero(problem.per_residual(wanted))
     functions = tuple(it.compress(problem.functions, wanted))
-    y = jax.eval_shape(ravel, problem.like)
-    sizes = [eqx.filter_eval_shape(fn, y).size for fn in functions]
+    sizes = tuple(it.compress(problem.sizes, wanted))
     restricted = dataclasses.replace(
         problem,
         functions=functions,
+        sizes=sizes,
         magnitude=problem.magnitude[rows],
         cancellation=problem.cancellation[rows],
-        pattern=pattern_of(functions, sizes, y),
+        pattern=pattern_of(functions, sizes, jax.eval_shape(lambda: candidate)),
     )
     return adapted(restricted, projection, candidate)

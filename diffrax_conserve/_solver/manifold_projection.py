@@ -24,6 +24,7 @@ from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
+from .._time import FieldTime
 from .._tree import ravel, tree_add, unravel, without_pattern
 from .failure import (
     end_of_step,
@@ -225,7 +226,7 @@ class ManifoldProjection(ForwardingSolver):
         metric = start.metric(step.t0, step.y0)
         dense_info = dict(
             inner=proposal.dense_info,
-            direction=proposal.direction,
+            field_time=proposal.field_time,
             shift=y1 - candidate,
             limit=step_length(step.y0, y1, metric),
             error=step.error if self.projection.sees_step else None,
@@ -258,12 +259,13 @@ class ManifoldProjection(ForwardingSolver):
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, jumped
         )
-        sign = time_direction(terms, t0)
-        step = Step(t0 * sign, t1 * sign, ravel(y0), None if error is None else ravel(error))
+        field_time = FieldTime(time_direction(terms, t0))
+        error_vector = None if error is None else ravel(error)
+        step = Step(field_time(t0), field_time(t1), ravel(y0), error_vector)
         # The dense output of the step is rarely needed, so it is made when it is called.
         interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
-        path = lambda t: ravel(interpolation().evaluate(t * sign))  # noqa: E731
-        return _Proposal(step, ravel(y1), path, error, dense_info, inner, result, sign)
+        path = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
+        return _Proposal(step, ravel(y1), path, error, dense_info, inner, result, field_time)
 
     @property
     def _needs_made_jump(self) -> bool:
@@ -340,8 +342,7 @@ class ManifoldProjection(ForwardingSolver):
         cannot_start = self._cannot_start(target, state, step, made_jump)
         length, first_step = step.t1 - step.t0, state.first_step.astype(jnp.result_type(step.t1))
         time = jnp.maximum(jnp.abs(step.t1), first_step)
-        changes = component_changes(step.y0, candidate)
-        final = cannot_start | is_final(length, time, changes, candidate)
+        final = cannot_start | is_final(length, time, target.changes, candidate)
         correction, too_far = y1 - candidate, jnp.asarray(False)
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
@@ -407,7 +408,7 @@ class _Proposal(NamedTuple):
     - `path`: its dense output, as a function from times to states.
     - `error`, `dense_info`, `inner`, `result`: the error estimate, dense output, solver state and
       result, as the wrapped solver returns them.
-    - `direction`: -1 if the solver's time is the negative of that of the vector field, otherwise 1.
+    - `field_time`: the time of the vector field as a function of that of the solver, and back.
     """
 
     step: Step
@@ -417,7 +418,7 @@ class _Proposal(NamedTuple):
     dense_info: DenseInfo
     inner: Any
     result: dfx.RESULTS
-    direction: RealScalarLike
+    field_time: FieldTime
 
 
 def changes_along(path: Path, step: Step) -> Float[Array, "k n"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._balance import integrated_rates
 from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._numerics.metric import AbstractFactor, Identity, Preferring, factor_of
+from .._numerics.metric import AbstractFactor, Preferring, factor_of
 from .._numerics.problem import Problem, Step, problem_of
 from .._projection.base import AbstractProjection, adapted
 from .._tree import ravel, tree_stop_gradient, unravel
@@ -43,8 +43,8 @@ class Target(eqx.Module):
     values: Float[Array, " m"]
     cancellation: Float[Array, " m"]
     args: Args
-    changes: Float[Array, " n"] | None = None
-    factor: AbstractFactor = Identity()
+    changes: Float[Array, " n"]
+    factor: AbstractFactor
     gained: Float[Array, "2 m"] | None = None
     preferred: Float[Array, "k n"] | None = None
 

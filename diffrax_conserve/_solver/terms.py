@@ -10,6 +10,7 @@ from jaxtyping import Array, PyTree, Real
 
 from .._custom_types import RealScalarLike
 from .._projection.base import AbstractProjection
+from .._time import FieldTime
 from .diffrax_private import AdjointTerm, WrapTerm
 
 
@@ -23,10 +24,10 @@ def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[A
 def in_field_time(terms: PyTree[dfx.AbstractTerm], *times: RealScalarLike) -> tuple[Any, ...]:
     """The terms and times in the time of the vector field, without the sign of diffrax. They are
     for evaluating the vector field; a wrapped solver takes those that diffrax gives."""
-    direction = time_direction(terms, times[0])
+    field_time = FieldTime(time_direction(terms, times[0]))
     is_term = lambda x: isinstance(x, dfx.AbstractTerm)  # noqa: E731
     bare = lambda x: x.term if isinstance(x, WrapTerm) else x  # noqa: E731
-    return jtu.tree_map(bare, terms, is_leaf=is_term), *(t * direction for t in times)
+    return jtu.tree_map(bare, terms, is_leaf=is_term), *map(field_time, times)
 
 
 def is_backsolve(terms: PyTree[dfx.AbstractTerm]) -> bool:
