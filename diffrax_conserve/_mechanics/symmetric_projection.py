@@ -188,7 +188,7 @@ class SymmetricProjection(ForwardingSolver):
             ft.partial(solve_kkt, vector.size),
         )
         info = end.report(candidate, y1, num_iterations, ok=ok)
-        off = is_off_manifold(start, self.manifold, vector) | ~jnp.all(jnp.isfinite(state.values))
+        off = is_off_manifold(start, self.manifold, vector)
         cause = failure_cause(info.ok, off, state.values, y1 - candidate)
         y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
         y1, result = end_of_step(cause, y1, result)
@@ -241,14 +241,14 @@ def _solved(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = start.factor.scale_columns(start.linearise(y0)[1]).scaled()
+    sizes, first = start.gradients(y0).scaled()
     gram0, eps = first.gram(first), float(jnp.finfo(y0.dtype).eps)
 
     def stepped(multiplier: Array, rows: AbstractRows | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to
         compute that end, so they are those of the last unknowns, or at the candidate."""
         candidate, result = inner(y0 + start.factor.to_state(first.rmatvec(multiplier * sizes)))
-        rows = end.factor.scale_columns(end.linearise(candidate)[1]) if rows is None else rows
+        rows = end.gradients(candidate) if rows is None else rows
         y = candidate + end.factor.to_state(rows.rmatvec(multiplier))
         return _Unknowns(y, multiplier, candidate, result)
 

@@ -110,7 +110,7 @@ class MultiplierSystem(AbstractSystem):
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
-        return self.problem.factor.scale_columns(self.problem.linearise(start)[1])
+        return self.problem.gradients(start)
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
@@ -118,8 +118,7 @@ class MultiplierSystem(AbstractSystem):
         start = self._start(solved.ok)
         sizes, rows = self._along(start).unit()
         change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
-        multiplier = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
-        return solved.ok, multiplier / sizes
+        return solved.ok, rows.best_multiplier(change) / sizes
 
     def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
@@ -139,7 +138,7 @@ class MultiplierSystem(AbstractSystem):
         t_y, t_g = (-x for x in right)
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        row_norms, rows = problem.factor.scale_columns(problem.linearise(y)[1]).unit()
+        row_norms, rows = problem.gradients(y).unit()
         along, least = self._along(start).unit()[1], rows.least_pivot()
         change = rows.gram(along).row_space_correction(along, t_g / row_norms, least=least)
         return t_y - problem.factor.to_state(change)

@@ -174,13 +174,10 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     dtype = problem.magnitude.dtype
     roundoff = roundoff_pivot(dtype)
 
-    def scaled(jacobian: AbstractRows) -> Any:
-        return problem.factor.scale_columns(jacobian).scaled()
-
     def shared(y: Any) -> Any:
         """What the steps share: the order in which they eliminate the constraints, and in this
         order the directions, or the gradients at the candidate."""
-        rows = scaled(problem.linearise(y)[1])[1]
+        rows = problem.gradients(y).scaled()[1]
         along = rows if directions is None else directions
         order = order_of(rows.gram(along).matrix)
         return order, in_order(order, along.matrix)
@@ -191,7 +188,7 @@ def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = linearised if lanes else lax.optimization_barrier(linearised)
         level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = scaled(jacobian)
+        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
         rows, wrong = in_order(order, rows.matrix), in_order(order, wrong / sizes)
         may_switch = directions is None and max_steps > FROZEN_STEPS
         # In each step the counter goes down by one, but before the last step, which polishes, the

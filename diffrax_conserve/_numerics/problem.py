@@ -136,6 +136,10 @@ class Problem(eqx.Module):
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
         return jnp.concatenate(values), DenseRows(jnp.concatenate(rows))
 
+    def gradients(self, y: Float[Array, " n"]) -> AbstractRows:
+        """`G(y) S`, the gradients in the coordinates in which the metric is Euclidean."""
+        return self.factor.scale_columns(self.linearise(y)[1])
+
     def dense(self) -> "Problem":
         """The same problem, with the Jacobian computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)

@@ -110,6 +110,10 @@ class AbstractRows(eqx.Module):
         of about `ε`, half of the digits of what is divided by it are right."""
         return float(jnp.finfo(self.dtype).eps) ** 0.5
 
+    def best_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
+        """The `λ` for which `Uᵀ λ` is nearest to a change, without nearly dependent rows."""
+        return self.gram(self).solve(self.matvec(change), least=self.least_pivot())
+
 
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
+from .._constants import MAX_STEPS
 from .._hashable import Hashable
 from .._numerics.metric import factor_of
 from .._numerics.problem import Problem
@@ -30,9 +31,11 @@ class AbstractProjection(Hashable):
     # Whether corrections are along the gradients of the functions, from any candidate. Then dense
     # output tries the damped Newton method where the projection fails.
     follows_gradients: ClassVar[bool] = False
-    # The tolerances, `None` for that of roundoff. No annotations, so that these are no fields.
+    # The tolerances, `None` for that of roundoff, and the number of iterations of the damped Newton
+    # method. No annotations, so that these are no fields.
     rtol = None
     atol = None
+    max_steps = MAX_STEPS
 
     @property
     def needs_signed_error(self) -> bool:

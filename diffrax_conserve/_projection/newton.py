@@ -145,7 +145,6 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions = _Conditions(given, base, lengths)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
-    best_multiplier = rows.gram(rows).solve(rows.matvec(change), least=rows.least_pivot())
     scale = problem.scale(jacobian, y)
     eps = float(jnp.finfo(y.dtype).eps)
 
@@ -165,7 +164,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         rtol=tolerance(ROUNDOFF * eps, problem.rtol),
         atol=tolerance(0.0, problem.atol),
     )
-    return conditions, jnp.concatenate([jnp.zeros_like(y), best_multiplier]), tested
+    return conditions, jnp.concatenate([jnp.zeros_like(y), rows.best_multiplier(change)]), tested
 
 
 def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:

@@ -111,8 +111,7 @@ def _damped_along(
 ) -> Solved:
     """The damped iteration along the gradients at the candidate."""
     del directions
-    rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
-    return damped_newton(problem, candidate, rows, max_steps=max_steps)
+    return damped_newton(problem, candidate, problem.gradients(candidate), max_steps=max_steps)
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**
