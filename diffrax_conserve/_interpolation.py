@@ -5,7 +5,7 @@ A value always belongs to its time. If the interpolant cannot be projected at a 
 there is the interpolant itself, and not the state of a time nearby that could be projected.
 
 The ends of a step are evaluated in the same way, although their projected states are known. To
-return these by a comparison of times would give a value that is constant in time, and the root
+return these where the time is that of an end would give a zero derivative by the time, and the root
 finder of an event needs the slope.
 """
 
@@ -87,8 +87,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
         # A time exactly at an end is inside, so that the slope there is that of the interpolant.
-        first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
-        t = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
+        y_start, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
+        t = jnp.where(t0 < y_start, y_start, jnp.where(t0 > last, last, t0))
         u = self.inner.evaluate(t, left=left)
         share = (t - self.t0) / nonzero_length(self.t0, self.t1)
         moved = ravel(u) + share.astype(self.shift.dtype) * self.shift
@@ -98,35 +98,35 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
         start, end = self.field_time(self.t0), self.field_time(self.t1)
         path = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
-        target, first = self.target.unpack().advanced(start, t, path), path(start)
-        step = Step(start, end, first, self.error)
+        target, y_start = self.target.unpack().add_rates(start, t, path), path(start)
+        step = Step(start, end, y_start, self.error)
         problem = target.problem(t, candidate, step)
         metric, projection = problem.factor, target.projection
-        away = metric.length(candidate - first)
-        limit = lax.stop_gradient(jnp.maximum(self.limit, away))
+        distance = metric.norm(candidate - y_start)
+        limit = lax.stop_gradient(jnp.maximum(self.limit, distance))
 
-        def near(y: Array, ok: Array) -> Array:
+        def is_accepted(y: Array, ok: Array) -> Array:
             """Whether a projection succeeded without leading too far away."""
-            return ok & (metric.length(y - candidate) <= limit)
+            return ok & (metric.norm(y - candidate) <= limit)
 
         y, info = projection.solve(problem, candidate)
-        ok = near(y, info.ok)
+        ok = is_accepted(y, info.ok)
         y = projection.clip(jnp.where(ok, y, candidate), problem.like)
         # A second attempt would lose the bounds.
         if not projection.follows_gradients or projection.has_bounds:
             return y
-        still, start = tree_stop_gradient((problem, candidate))
+        primal_problem, start = tree_stop_gradient((problem, candidate))
 
-        def again() -> tuple[Array, Array]:
-            found = damped_newton(still, start, max_steps=projection.max_steps)
-            return found.y, near(found.y, found.ok)
+        def second_attempt() -> tuple[Array, Array]:
+            found = damped_newton(primal_problem, start, max_steps=projection.max_steps)
+            return found.y, is_accepted(found.y, found.ok)
 
         # A condition that is the same for all lanes of a batch remains a branch, which is skipped
         # if no lane needs it.
-        found, better = lax.cond(any_lane(~ok), again, lambda: (start, ok))
+        found, better = lax.cond(any_lane(~ok), second_attempt, lambda: (start, ok))
         # The derivative of the second attempt is that of the interpolant.
-        nothing = y - lax.stop_gradient(y)  # zero, but with a derivative
-        return lax.stop_gradient(jnp.where(better & ~ok, found, y)) + nothing
+        zero = y - lax.stop_gradient(y)  # zero, but with a derivative
+        return lax.stop_gradient(jnp.where(better & ~ok, found, y)) + zero
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ import numpy as np
 import pytest
 
 from diffrax_conserve._numerics.metric import Identity
-from diffrax_conserve._numerics.problem import relative
+from diffrax_conserve._numerics.problem import relative_to_scale
 from diffrax_conserve._tree import ravel
 
 ROOT = Path(__file__).parents[1]
@@ -182,17 +182,17 @@ def decide_success_by_the_scale_at_the_candidate(package):
     for name in ("SimplifiedNewton", "Newton"):
         package.around(f"{name}.solve")(wrong)
     # One more iteration would bring such a state to roundoff after all.
-    package.around("after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
+    package.around("left_after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
 
 
 def polish_along_nearly_parallel_gradients(package):
-    package.around("FewGram.row_space_correction")(
-        lambda given, *x, least=None, **y: given(*x, **y)
+    package.around("PivotedGram.row_space_correction")(
+        lambda given, *x, pivot_tolerance=None, **y: given(*x, **y)
     )
 
 
 def divide_by_every_pivot_in_derivatives(package):
-    package.replace("AbstractRows.least_pivot", lambda rows: 0.0)
+    package.replace("AbstractRows.derivative_pivot_tolerance", lambda rows: 0.0)
 
 
 def return_a_state_that_was_not_projected_as_nan(package):
@@ -225,11 +225,11 @@ def divide_by_the_roundoff_of_a_pivot(package):
 
 
 def eliminate_in_the_given_order(package):
-    package.replace("in_order", lambda order, each: each)
+    package.replace("permuted", lambda order, each: each)
 
 
 def cross_kinks_in_full_steps(package):
-    package.replace("_share", lambda *arguments: 1.0)
+    package.replace("_line_search", lambda *arguments: 1.0)
 
 
 def differentiate_at_constant_unknowns(package):
@@ -238,14 +238,14 @@ def differentiate_at_constant_unknowns(package):
 
 
 def never_give_up(package):
-    package.replace("is_final", lambda *arguments: jnp.asarray(False))
+    package.replace("is_shortest_step", lambda *arguments: jnp.asarray(False))
 
 
 def give_up_once_a_step_is_short(package):
-    @package.around("is_final")
-    def _(is_final, state, t0, t1, moved, candidate):
+    @package.around("is_shortest_step")
+    def _(is_shortest_step, state, t0, t1, moved, candidate):
         short = jnp.all(moved <= 1e-3 * jnp.abs(ravel(candidate)))
-        return short | is_final(state, t0, t1, moved, candidate)
+        return short | is_shortest_step(state, t0, t1, moved, candidate)
 
 
 def forget_the_roundoff_that_is_not_in_the_gradient(package):
@@ -331,8 +331,8 @@ def integrate_rates_forwards_in_a_solve_backwards(package):
 def forget_how_the_state_changed_in_the_last_step(package):
     @package.around("ManifoldProjection._target")
     def _(made, *given):
-        target, units, preferred = made(*given)
-        return target, units, jax.tree.map(jnp.zeros_like, preferred)
+        target, units, displacements = made(*given)
+        return target, units, jax.tree.map(jnp.zeros_like, displacements)
 
 
 def let_a_moving_constraint_run_forwards_in_a_solve_backwards(package):
@@ -356,7 +356,9 @@ def take_one_dae_for_another_of_the_same_shapes(package):
 
 
 def forget_the_sign_of_a_defect_of_an_invariant(package):
-    package.in_module_of("check_invariance", "relative", lambda *x: jnp.maximum(relative(*x), 0))
+    package.in_module_of(
+        "check_invariance", "relative_to_scale", lambda *x: jnp.maximum(relative_to_scale(*x), 0)
+    )
 
 
 def leave_the_arrays_of_a_part_that_is_given_again_in_the_file(package):

@@ -33,7 +33,7 @@ from .._projection.base import AbstractProjection, adapted, check_projection
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
-from .._solver.manifold_projection import ManifoldProjection, or_nothing
+from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
@@ -222,7 +222,7 @@ class DAE(Hashable):
                     "`DAE` it starts from a state that satisfies the equations. Pass "
                     "`SimplifiedNewton()` or `Newton()`."
                 )
-            kept["further"] = or_nothing(manifold)
+            kept["further"] = or_trivial(manifold)
             back = Staged(("equations", back), ("further", further))
         return ManifoldProjection(solver, kept, projection=back)
 
@@ -631,7 +631,7 @@ class ConstraintProjection(AbstractProjection):
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.
-        ok = settled | tree_stop_gradient(problem).holds(lax.stop_gradient(y))
+        ok = settled | tree_stop_gradient(problem).is_on_manifold(lax.stop_gradient(y))
         return y, problem.report(candidate, y, ok=ok)
 
 
@@ -697,7 +697,7 @@ def _solved_for(
         sparse = SparseNewton(jacobian)
         newton = ft.partial(newton, residual, sparse=sparse)
         found = root(residual, newton, y[free], sparse.solve, sparse.jacobian)
-    return moved(found.y), found.ok & jnp.asarray(False if found.more is None else found.more)
+    return moved(found.y), found.ok & jnp.asarray(False if found.aux is None else found.aux)
 
 
 @final

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
 from .._large.klu import Places, SparseJacobian
-from .._numerics.iterate import Solved, after_step, any_lane, iterate, keep_done
+from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_step
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import DenseRows
@@ -158,7 +158,7 @@ def at_rest_near(
     eps = float(jnp.finfo(z.dtype).eps)
     linearised = _Factored.at if sparse is None else sparse.at
 
-    def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+    def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
         # The unknowns, the share of the correction to try next, and whether they have converged.
         z, share, _ = now
         factored = linearised(residual, z)
@@ -186,7 +186,9 @@ def at_rest_near(
         longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
         share = jnp.where(better, longer, shorter)
         at_rest = (settled | (~going & (before < jnp.inf))) & factored.regular()
-        return keep_done(counter, (z, share, settled), now), after_step(at_rest, going, counter)
+        return keep_done(tests_left, (z, share, settled), now), left_after_step(
+            at_rest, going, tests_left
+        )
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(False)
     (z, _, settled), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)

@@ -15,7 +15,7 @@ from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, after_step, iterate, keep_done
+from .._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
@@ -186,7 +186,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             scale = finder.atol + finder.rtol * jnp.abs(y)
             return finder.norm(jax.vmap(lambda x: unravel(x, y0))(change / scale))
 
-        def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+        def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
             y, before = now
             change = correction(seen(stages(y)))
             new = y + change
@@ -195,7 +195,9 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             # A change by the roundoff of the state cannot become smaller.
             rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
             settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-            return keep_done(counter, (new, now_size), now), after_step(settled, rate < 2, counter)
+            return keep_done(tests_left, (new, now_size), now), left_after_step(
+                settled, rate < 2, tests_left
+            )
 
         def newton(guess: Array) -> Solved:
             begin = guess, jnp.asarray(jnp.inf, start.dtype)

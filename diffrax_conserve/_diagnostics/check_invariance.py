@@ -30,7 +30,7 @@ from .._manifold import (
     rate_of,
     slope_of,
 )
-from .._numerics.problem import problem_of, relative
+from .._numerics.problem import problem_of, relative_to_scale
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import AbstractRows
 from .._options import ONE_STATE, check_function, one_of
@@ -269,10 +269,10 @@ def _relative_sizes(
         _, _, hidden = cancellation_terms(excess, vector)
         terms = jnp.where(hidden > 4 * terms, hidden, terms)
     # An integral that is not finite counts as not conserved, though its derivative may vanish.
-    defect = jnp.where(jnp.isfinite(residual), relative(excess(vector), terms), jnp.nan)
+    defect = jnp.where(jnp.isfinite(residual), relative_to_scale(excess(vector), terms), jnp.nan)
     violation = jnp.zeros_like(residual)
     if isinstance(entry, Constraint):
-        violation = relative(residual, problem.scale(jacobian, vector))
+        violation = relative_to_scale(residual, problem.scale(jacobian, vector))
     defect, violation = (jnp.max(jnp.abs(x), initial=0) for x in (defect, violation))
     return (
         defect,

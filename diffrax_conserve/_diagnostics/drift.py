@@ -21,7 +21,7 @@ from .._manifold import (
     is_entry,
     named_entries,
 )
-from .._numerics.problem import measure, relative
+from .._numerics.problem import relative_to_scale, residuals_and_scales
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_solution
 from .._time import FieldTime
@@ -85,14 +85,14 @@ def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
         ```
     """
     ts, ys, values, residual = _residuals(sol, manifold, args, "drift")
-    _, scale = measure(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
+    _, scale = residuals_and_scales(manifold, values, ts[0], jtu.tree_map(lambda y: y[0], ys), args)
 
     def own(scale: Array) -> Array:
         most = jnp.max(scale, initial=0)
         return jnp.where(scale < jnp.finfo(scale.dtype).eps ** 0.5 * most, most, scale)
 
     scale = jtu.tree_map(own, scale)
-    return jax.vmap(lambda t, y: relative(residual(t, y), scale))(ts, ys)
+    return jax.vmap(lambda t, y: relative_to_scale(residual(t, y), scale))(ts, ys)
 
 
 def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bool[Array, " times"]:
@@ -195,25 +195,25 @@ def _residuals(
             "`manifold` cannot be evaluated at the saved states. Pass the `args` of the solve, "
             "which a solution does not keep. Save the states themselves, without `SaveAt(fn=...)`."
         ) from error
-    gained = _gained(sol, manifold, args, values)
+    integral_until = _rate_integral(sol, manifold, args, values)
 
     # A given `value` holds at the start of the solve, from which the rates are integrated. Without
     # one the value is known at the first saved time, so what was gained before is subtracted.
-    def at_start(entry: Any, value: Values, gained: Values) -> Values:
-        return value if has_value(entry) else tree_sub(value, gained)
+    def at_start(entry: Any, value: Values, integral_until: Values) -> Values:
+        return value if has_value(entry) else tree_sub(value, integral_until)
 
-    values = jtu.tree_map(at_start, manifold, values, gained(t0), is_leaf=is_entry)
+    values = jtu.tree_map(at_start, manifold, values, integral_until(t0), is_leaf=is_entry)
 
     def residual(t: Array, y: Y) -> Values:
         padded = jnp.isinf(t)
         t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b, a), (t, y), (t0, y0))
-        found = tree_sub(evaluate(manifold, t, y, args), tree_add(values, gained(t)))
+        found = tree_sub(evaluate(manifold, t, y, args), tree_add(values, integral_until(t)))
         return jtu.tree_map(lambda x: jnp.where(padded, 0, x), found)
 
     return sol.ts, sol.ys, values, residual
 
 
-def _gained(
+def _rate_integral(
     sol: dfx.Solution, manifold: Manifold, args: Args, values: Values
 ) -> Callable[[RealScalarLike], Values]:
     """The integral of the rates of the manifold up to a time, as a function of that time."""
@@ -247,10 +247,10 @@ def _gained(
     steps = jax.vmap(whole)(jnp.arange(path.ts.size - 1))
     sums = jtu.tree_map(lambda x: jnp.cumsum(x, axis=0), steps)
 
-    def gained(t: RealScalarLike) -> Values:
+    def integral_until(t: RealScalarLike) -> Values:
         t = field_time(t)
         step = jnp.clip(jnp.searchsorted(path.ts, t) - 1, 0, path.ts_size - 2)
         before = jtu.tree_map(lambda x: jnp.where(step > 0, x[step - 1], 0), sums)
         return tree_add(before, until(step, t))
 
-    return gained
+    return integral_until

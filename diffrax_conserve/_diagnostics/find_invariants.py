@@ -341,12 +341,12 @@ def _sampled(
 ) -> _Samples:
     @eqx.filter_jit
     @jax.vmap
-    def measure(t: Array, y: Any) -> tuple[Array, Array, Array]:
+    def residuals_and_scales(t: Array, y: Any) -> tuple[Array, Array, Array]:
         at = lambda x: functions(unravel(x, y))  # noqa: E731
         slope = ravel(slope_of(vector_field, t, y, args))
         return at(ravel(y)), jax.jacfwd(at)(ravel(y)).T, slope
 
-    values, gradients, slopes = map(np.asarray, measure(ts, ys))
+    values, gradients, slopes = map(np.asarray, residuals_and_scales(ts, ys))
     measured = {name: (values[:, j], gradients[:, :, j]) for j, name in enumerate(names)}
     for name, xs in {"vector_field": (slopes,), **measured}.items():
         finite = np.all([np.isfinite(x).reshape(len(ts), -1).all(axis=1) for x in xs], axis=0)
@@ -355,7 +355,9 @@ def _sampled(
                 f"`{name}`, or its derivative, is not finite at state {np.argmin(finite)} of "
                 "`states`. Give states inside its domain."
             )
-    if np.all(ts == ts[0]) and np.any(np.asarray(measure(ts + LATER, ys)[2]) != slopes):
+    if np.all(ts == ts[0]) and np.any(
+        np.asarray(residuals_and_scales(ts + LATER, ys)[2]) != slopes
+    ):
         raise ValueError(
             "`vector_field` depends on time, but `t` is one time, at which something may be "
             "conserved that is not at others. Give one time for each state, such as "
@@ -365,7 +367,7 @@ def _sampled(
     largest = np.abs(x).max(axis=0)
     apart = np.where(largest > 0, largest, largest.max()) / _BESIDE
     beside = x + apart * np.sin(np.arange(x.size)).reshape(x.shape)
-    moved = np.asarray(measure(ts, jax.vmap(unravel)(beside, ys))[2])
+    moved = np.asarray(residuals_and_scales(ts, jax.vmap(unravel)(beside, ys))[2])
     idle = (slopes == 0).all(axis=0) & (np.isfinite(moved) & (moved != 0)).any(axis=0)
     if idle.any():
         raise ValueError(

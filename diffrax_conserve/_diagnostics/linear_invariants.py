@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args
 from .._manifold import slope_of
-from .._numerics.metric import spread
+from .._numerics.metric import broadcast_option
 from .._tree import ravel, unravel
 
 # Slopes are taken at so many states for each component, and moved by this share of the size of the
@@ -36,7 +36,7 @@ def linear_invariants(
     their `sizes`.
     """
     like = jtu.tree_map(lambda y: y[0, 0], ys)
-    units = np.asarray(spread("sizes", sizes, like))
+    units = np.asarray(broadcast_option("sizes", sizes, like))
     times, states = _states(ts, ys, units)
     found = _measured(vector_field, entries, times, states, like, jnp.asarray(units), args)
     slopes, gradients = map(np.asarray, found)
@@ -77,7 +77,7 @@ def changes(
     leaves = jtu.tree_leaves(ys)
     if not len(invariants):
         return np.zeros(len(leaves[0]))
-    units = np.asarray(spread("sizes", sizes, jtu.tree_map(lambda y: y[0, 0], ys)))
+    units = np.asarray(broadcast_option("sizes", sizes, jtu.tree_map(lambda y: y[0, 0], ys)))
     x = np.asarray(jax.vmap(jax.vmap(ravel))(jtu.tree_map(jnp.asarray, ys))) / units
     moved = np.linalg.norm((x - x[:, :1]) @ invariants.T, axis=2)
     return moved.max(axis=1)

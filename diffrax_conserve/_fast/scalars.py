@@ -142,12 +142,13 @@ def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
 
 
 def written_out_loop(
-    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, counter: Array
+    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, tests_left: Array
 ) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
-    """The functions of a loop, `first = start(y)` and `y, counter = advance(first, y, counter)`, in
-    scalars, with `y` as a tuple of them. They are given back as they are if one is too large."""
+    """The functions of a loop, `first = start(y)` and `y, tests_left = advance(first, y,
+    tests_left)`, in scalars, with `y` as a tuple of them. They are returned as they are if one is
+    too large."""
     first = jax.eval_shape(start, y)
-    starts, advances = in_scalars(start, y), in_scalars(advance, first, y, counter)
+    starts, advances = in_scalars(start, y), in_scalars(advance, first, y, tests_left)
     if starts is None or advances is None:
         return start, advance, y
     return starts, advances, components(y)

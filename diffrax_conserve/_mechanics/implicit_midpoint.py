@@ -110,7 +110,7 @@ class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
         solved = root(relation, newton, guess, jnp.linalg.solve)
         y1 = jtu.tree_map(lambda y, k: y + k, y0, increment(solved.y))
         k1 = terms.vf_prod(t1, y1, args, control)
-        result = dfx.RESULTS.promote(solved.more)
+        result = dfx.RESULTS.promote(solved.aux)
         return y1, None, dict(y0=y0, y1=y1, k0=k0, k1=k1), None, result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:

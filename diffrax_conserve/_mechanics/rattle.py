@@ -26,14 +26,14 @@ from .._hashable import Hashable
 from .._interpolation import Packed
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, after_test, iterate, keep_done
+from .._numerics.iterate import Solved, iterate, keep_done, left_after_test
 from .._numerics.linear import Solve, iterative_refinement
-from .._numerics.metric import Diagonal, spread
+from .._numerics.metric import Diagonal, broadcast_option
 from .._numerics.problem import Problem, problem_of
 from .._numerics.rows import AbstractGram, AbstractRows, solve_dense
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
-from .._solver.failure import end_of_step, failure_cause, is_off_manifold
+from .._solver.failure import failure_cause, masked_step, starts_off_manifold
 from .._solver.state import initial_values
 from .._solver.terms import in_field_time, is_backsolve, is_ode
 from .._time import nonzero_length
@@ -178,10 +178,10 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
             return jax.jvp(fn, (t, q), (jnp.ones_like(t), drift(t, v, args)))[1]
 
         start, along = (t, q, v), (jnp.ones_like(t), drift(t, v, args), kick)
-        wrong = jax.jvp(slope, start, along)[1]
+        active = jax.jvp(slope, start, along)[1]
         _, jacobian = problem.linearise(ravel(q))
         gram = self._gram(problem, jacobian, self._drift(terms, t, v, args), ravel(v))
-        return unflatten(gram.solve(-wrong), values)
+        return unflatten(gram.solve(-active), values)
 
     def init(
         self,
@@ -215,10 +215,10 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         # and Schwarz `|∂_t g|` plus the length of a row of `G S` times the length of `S⁻¹ v`.
         squares = jax.tree.map(jnp.square, problem.factor.scale_columns(at.jacobian))
         lengths = jnp.sqrt(squares.matvec(jnp.ones_like(ravel(v))))
-        limit = lengths * problem.factor.length(drift(ravel(v))) + jnp.abs(rate)
+        limit = lengths * problem.factor.norm(drift(ravel(v))) + jnp.abs(rate)
         moves = rate + at.jacobian.matvec(drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
-        off = off | is_off_manifold(problem, self.constraint, ravel(q))
+        off = off | starts_off_manifold(problem, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
         return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off)
 
@@ -271,7 +271,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
         ok = found & keeps
         cause = failure_cause(ok, state.off, state.cancellation, jnp.concatenate([q1, v1]))
-        (q1, v1), result = end_of_step(cause, (q1, v1), dfx.RESULTS.successful)
+        (q1, v1), result = masked_step(cause, (q1, v1), dfx.RESULTS.successful)
         dense_info = dict(y0=y0, step=Packed(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
         state = _State(at, slope, multiplier, state.cancellation, state.off)
@@ -279,7 +279,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
     def _problem(self, t: RealScalarLike, q: Y, args: Args, cancellation: Array) -> Problem:
         values = jnp.zeros_like(cancellation)
-        metric = Diagonal(lax.rsqrt(spread("masses", self.masses, q)))
+        metric = Diagonal(lax.rsqrt(broadcast_option("masses", self.masses, q)))
         return problem_of(self.constraint, values, t, q, args, cancellation, factor=metric)
 
     def _drift(self, terms: Any, t: RealScalarLike, v: Y, args: Args) -> Any:
@@ -356,11 +356,11 @@ def _shake(
         x = solve(g)
         return x if len(g) <= WRITTEN_OUT else solve(at.jacobian.matvec(moves(x)))
 
-    def advance(x: Array, counter: Array) -> tuple[Array, Array]:
+    def advance(x: Array, tests_left: Array) -> tuple[Array, Array]:
         g = _barrier(problem.residual(_barrier(position(x))))
         level, _ = problem.level(g, scale)
-        counter = after_test(level, counter)
-        return keep_done(counter, x - change(g), x), counter
+        tests_left = left_after_test(level, tests_left)
+        return keep_done(tests_left, x - change(g), x), tests_left
 
     return iterate(advance, guess, max_steps=max_steps)
 
@@ -380,8 +380,8 @@ def _on_tangent(
     def iterated(product: Any, b: Array) -> Array:
         return iterative_refinement(solve, product, b)
 
-    wrong = rate + at.jacobian.matvec(drift(p))
-    x = lax.custom_linear_solve(product, -wrong, iterated, iterated, symmetric=True)
+    active = rate + at.jacobian.matvec(drift(p))
+    x = lax.custom_linear_solve(product, -active, iterated, iterated, symmetric=True)
     v = p + _impulse(problem, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
     # velocities is that of the terms, and not of their sum.

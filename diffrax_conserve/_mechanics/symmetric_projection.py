@@ -18,7 +18,7 @@ from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScala
 from .._interpolation import Packed
 from .._manifold import check_manifold
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, after_test, any_lane, iterate, keep_done
+from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_test
 from .._numerics.problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -31,10 +31,10 @@ from .._numerics.rows import AbstractRows, solve_kkt
 from .._projection.base import adapted
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
-from .._solver.failure import end_of_step, failure_cause, is_off_manifold
+from .._solver.failure import failure_cause, masked_step, starts_off_manifold
 from .._solver.state import initial_values
 from .._solver.statistics import ProjectionStatistics
-from .._solver.terms import check_nested, in_field_time, innermost, refuse_backsolve
+from .._solver.terms import check_root_finder, in_field_time, innermost, refuse_backsolve
 from .._solver.wrapper import ForwardingSolver
 from .._tree import ravel, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -133,7 +133,7 @@ class SymmetricProjection(ForwardingSolver):
         self.manifold = manifold
         self.projection = SimplifiedNewton(metric=metric, rtol=rtol, atol=atol, max_steps=max_steps)
         _check_symmetric(solver)
-        check_nested(self)
+        check_root_finder(self)
         check_manifold(manifold)
         refuse_rates(manifold, "a `SymmetricProjection`")
 
@@ -188,10 +188,10 @@ class SymmetricProjection(ForwardingSolver):
             ft.partial(solve_kkt, vector.size),
         )
         info = end.report(candidate, y1, num_iterations, ok=ok)
-        off = is_off_manifold(start, self.manifold, vector)
+        off = starts_off_manifold(start, self.manifold, vector)
         cause = failure_cause(info.ok, off, state.values, y1 - candidate)
         y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
-        y1, result = end_of_step(cause, y1, result)
+        y1, result = masked_step(cause, y1, result)
         dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
         statistics = state.statistics.add(info, None)
         state = _State(state.inner, state.values, state.cancellation, multiplier, statistics)
@@ -252,30 +252,30 @@ def _solved(
         y = candidate + end.factor.to_state(rows.rmatvec(multiplier))
         return _Unknowns(y, multiplier, candidate, result)
 
-    def advance(now: _Unknowns, counter: Array) -> tuple[_Unknowns, Array]:
+    def advance(now: _Unknowns, tests_left: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
         rows = end.factor.scale_columns(jacobian)
-        level, wrong = end.level(g, end.scale(jacobian, now.y))
+        level, active = end.level(g, end.scale(jacobian, now.y))
         # The residual of the equation for the state, with the gradients at that state.
         defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
-        off = end.factor.length(defect) / (eps * end.factor.length(jnp.abs(y0) + jnp.abs(now.y)))
+        off = end.factor.norm(defect) / (eps * end.factor.norm(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)
         solved = jnp.where(
             off <= NOISE, AT_ROUNDOFF, jnp.where(off <= ROUNDOFF, WITHIN_TOLERANCE, ABOVE_TOLERANCE)
         )
         solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)
-        counter = after_test(jnp.minimum(level, solved), counter)
+        tests_left = left_after_test(jnp.minimum(level, solved), tests_left)
         # Where the inner step has failed, there is nothing to go on with.
-        counter = jnp.where(now.result == dfx.RESULTS.successful, counter, -1)
+        tests_left = jnp.where(now.result == dfx.RESULTS.successful, tests_left, -1)
 
         def move() -> _Unknowns:
             scaled = rows.divide_rows(sizes)
             gram = jtu.tree_map(jnp.add, gram0, scaled.gram(scaled))
-            change = gram.solve((wrong + jacobian.matvec(defect)) / sizes) / sizes
+            change = gram.solve((active + jacobian.matvec(defect)) / sizes) / sizes
             return stepped(now.multiplier - change, rows)
 
-        moved = lax.cond(any_lane(counter > 0), move, lambda: now)
-        return keep_done(counter, moved, now), counter
+        moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)
+        return keep_done(tests_left, moved, now), tests_left
 
     found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
     y, multiplier, candidate, result = found.y

@@ -2,10 +2,10 @@
 
 Whatever solves the equations `F(x, p) = 0` for the unknowns `x`, its derivative by the parameters
 `p` is `ẋ = -(∂F/∂x)⁻¹ ∂F/∂p ṗ`. It holds for the unknowns that were computed, whatever the number
-of steps, and no step is unrolled. That is one rule, `solution`. A system of equations says how it
-is solved, what `F` is, and how a linear system with its derivative is solved. The parameters are
-the arrays of which it consists: the candidate, the values that are conserved, the metric, and the
-parameters of the user's functions.
+of steps, and no step is unrolled. That is one rule, `implicit_solution`. A system of equations
+tells how it is solved, what `F` is, and how a linear system with its derivative is solved. The
+parameters are the arrays of which it consists: the candidate, the values that are conserved, the
+metric, and the parameters of the user's functions.
 """
 
 import abc
@@ -29,7 +29,7 @@ class AbstractSystem(eqx.Module):
     """Equations for unknowns. What is not an array, such as an option, must be static."""
 
     @abc.abstractmethod
-    def found(self) -> Solved:
+    def solved(self) -> Solved:
         """The unknowns that solve the equations, as far as the iteration gets."""
 
     @abc.abstractmethod
@@ -37,28 +37,28 @@ class AbstractSystem(eqx.Module):
         """All unknowns `x`, of which an iteration may return only some."""
 
     @abc.abstractmethod
-    def defect(self, unknowns: Any) -> Any:
+    def equations(self, unknowns: Any) -> Any:
         """`F` at these unknowns. It is only differentiated, by the arrays of the system."""
 
     @abc.abstractmethod
-    def linear_solution(self, solved: Solved, right: Any) -> Any:
-        """`(∂F/∂x)⁻¹ right`, for the unknowns that the iteration returns."""
+    def solve_linearised(self, solved: Solved, rhs: Any) -> Any:
+        """`(∂F/∂x)⁻¹ rhs`, for the unknowns that the iteration returns."""
 
 
 @eqx.filter_custom_jvp
-def solution(system: AbstractSystem) -> Solved:
-    """What `system.found()` returns, with the derivative of the unknowns."""
-    return system.found()
+def implicit_solution(system: AbstractSystem) -> Solved:
+    """What `system.solved()` returns, with the derivative of the unknowns."""
+    return system.solved()
 
 
-@solution.def_jvp
+@implicit_solution.def_jvp
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     (system,), (t_system,) = primals, tangents
-    solved = solution(system)
+    solved = implicit_solution(system)
     x = system.unknowns(solved)
-    defect, t_defect = eqx.filter_jvp(lambda system: system.defect(x), (system,), (t_system,))
-    right = tree_tangents(defect, t_defect)
-    tangent = system.linear_solution(solved, jtu.tree_map(jnp.negative, right))
+    equations, t_defect = eqx.filter_jvp(lambda system: system.equations(x), (system,), (t_system,))
+    rhs = tree_tangents(equations, t_defect)
+    tangent = system.solve_linearised(solved, jtu.tree_map(jnp.negative, rhs))
     none = jtu.tree_map(lambda _: None, solved)
     return solved, none._replace(y=tangent)
 
@@ -69,8 +69,8 @@ class MultiplierSystem(AbstractSystem):
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
     The equations are `y = ŷ + S Uᵀ λ` and `g(y) = 0`. The first gives the state, so that the only
-    unknowns are the multipliers `λ`. But what is wanted is the derivative of the state. So `defect`
-    returns both sides that depend on the parameters, `ŷ + S Uᵀ λ` and `g` there.
+    unknowns are the multipliers `λ`. But what is wanted is the derivative of the state. So
+    `equations` returns both sides that depend on the parameters, `ŷ + S Uᵀ λ` and `g` there.
 
     Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
     derivative would divide the error of the candidate's derivative by the sine of their angle. In
@@ -96,7 +96,7 @@ class MultiplierSystem(AbstractSystem):
     )
     max_steps: int = eqx.field(static=True, kw_only=True)
 
-    def found(self) -> Solved:
+    def solved(self) -> Solved:
         given = self.problem, self.candidate, self.directions
         return self.iteration(*given, max_steps=self.max_steps)
 
@@ -106,21 +106,21 @@ class MultiplierSystem(AbstractSystem):
             return self.candidate
         return jnp.where(ok, self.candidate, self.fallback)
 
-    def _along(self, start: Array) -> AbstractRows:
+    def _directions_at(self, start: Array) -> AbstractRows:
         """The rows of `U`."""
         if self.directions is not None:
             return self.directions
         return self.problem.gradients(start)
 
     def unknowns(self, solved: Solved) -> tuple[Array, Array]:
-        """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `defect`
+        """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
-        sizes, rows = self._along(start).unit()
+        row_norms, rows = self._directions_at(start).unit()
         change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
-        return solved.ok, rows.best_multiplier(change) / sizes
+        return solved.ok, rows.best_multiplier(change) / row_norms
 
-    def defect(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
+    def equations(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
         start = self._start(ok)
         if self.directions is not None:
@@ -129,18 +129,22 @@ class MultiplierSystem(AbstractSystem):
             _, vjp = jax.vjp(self.problem.residual, start)
             change = self.problem.factor.scale_gradient(vjp(multiplier)[0])
         end = start + self.problem.factor.to_state(change)
-        # The second equation at the end of the correction, so that its tangent contains the first.
+        # Both are evaluated at the state, so that the tangent of `g` contains that of the state.
         return end, self.problem.residual(end)
 
-    def linear_solution(self, solved: Solved, right: tuple[Array, Array]) -> Array:
+    def solve_linearised(self, solved: Solved, rhs: tuple[Array, Array]) -> Array:
         """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
-        t_y, t_g = (-x for x in right)
+        t_y, t_g = (-x for x in rhs)
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
         row_norms, rows = problem.gradients(y).unit()
-        along, least = self._along(start).unit()[1], rows.least_pivot()
-        change = rows.gram(along).row_space_correction(along, t_g / row_norms, least=least)
+        directions = self._directions_at(start).unit()[1]
+        change = rows.gram(directions).row_space_correction(
+            directions,
+            t_g / row_norms,
+            pivot_tolerance=rows.derivative_pivot_tolerance(),
+        )
         return t_y - problem.factor.to_state(change)
 
 
@@ -169,18 +173,18 @@ class SquareSystem(AbstractSystem):
     solve: Callable[[Array, Float[Array, " n"]], Float[Array, " n"]] = eqx.field(static=True)
     jacobian: Callable[[Any], Callable[[Array], Array]] = eqx.field(static=True)
 
-    def found(self) -> Solved:
+    def solved(self) -> Solved:
         return self.iterate(self.guess)
 
     def unknowns(self, solved: Solved) -> Any:
         return solved.y
 
-    def defect(self, unknowns: Any) -> Any:
+    def equations(self, unknowns: Any) -> Any:
         return self.residual(unknowns)
 
-    def linear_solution(self, solved: Solved, right: Any) -> Any:
+    def solve_linearised(self, solved: Solved, rhs: Any) -> Any:
         matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, solved.y))))
-        return unflatten(self.solve(matrix(_flat(solved.y)), _flat(right)), solved.y)
+        return unflatten(self.solve(matrix(_flat(solved.y)), _flat(rhs)), solved.y)
 
 
 def root(
@@ -195,7 +199,7 @@ def root(
     systems, where the matrix is `jacobian(residual)(unknowns)` with flat unknowns. The arrays over
     which the functions close, such as parameters, have their derivatives too."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
-    return solution(SquareSystem(residual, iterate, guess, solve, jacobian))
+    return implicit_solution(SquareSystem(residual, iterate, guess, solve, jacobian))
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:

@@ -33,14 +33,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import AT_BOUND, BACKTRACKING_FACTOR, FROZEN_STEPS, ROUNDOFF, WRITTEN_OUT
 from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
-from .linear import in_order, order_of, roundoff_pivot
+from .linear import permuted, pivot_order, roundoff_pivot_tolerance
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
     NOT_FINITE,
     WITHIN_TOLERANCE,
     Problem,
-    relative,
+    relative_to_scale,
 )
 from .rows import AbstractRows, DenseRows
 
@@ -54,75 +54,76 @@ class Solved(NamedTuple):
     - `y`: the unknowns. In a projection they are the state.
     - `ok`: whether they solve the equations.
     - `num_iterations`: the number of steps.
-    - `more`: what else was found, without a derivative.
+    - `aux`: what else was found, without a derivative.
     """
 
     y: Any
     ok: Bool[Array, ""]
     num_iterations: Int[Array, ""]
-    more: Any = None
+    aux: Any = None
 
 
 # ---- The loop ----
 
 
-class _Now(NamedTuple):
+class _LoopState(NamedTuple):
     """What the loop carries. It carries little, because for small systems moving the carry costs
     more than the arithmetic."""
 
     y: Any
-    counter: Array
+    tests_left: Array
     num_iterations: Array
 
 
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
-    """Advances the unknowns until the counter says that they are done.
+    """Advances the unknowns until no test is left.
 
-    The counter is the number of tests that are left. The unknowns are tested before each step and
-    after the last one, so that there is one more test than there are steps. When the iteration
-    ends, the counter is zero if the unknowns passed their last test, and -1 if they did not.
-    `after_test` computes it.
+    `tests_left` is the number of tests that are left. The unknowns are tested before each step and
+    after the last one, so that it starts at `max_steps + 1`. When the iteration ends, it is zero if
+    the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which the counter is not positive, as they are.
+    are done, for which no test is left, as they are.
     """
 
-    def body(now: _Now) -> _Now:
-        y, counter = advance(now.y, now.counter)
-        return _Now(y, counter, now.num_iterations + (counter > 0).astype(int))
+    def body(now: _LoopState) -> _LoopState:
+        y, tests_left = advance(now.y, now.tests_left)
+        return _LoopState(y, tests_left, now.num_iterations + (tests_left > 0).astype(int))
 
-    start = _Now(y, tests(max_steps), jnp.asarray(0))
-    end = lax.while_loop(lambda now: any_lane(now.counter > 0), body, start)
-    return Solved(end.y, end.counter == 0, end.num_iterations)
+    start = _LoopState(y, initial_tests(max_steps), jnp.asarray(0))
+    end = lax.while_loop(lambda now: any_lane(now.tests_left > 0), body, start)
+    return Solved(end.y, end.tests_left == 0, end.num_iterations)
 
 
-def tests(max_steps: int) -> Int[Array, ""]:
-    """The counter at the start of an iteration, in a byte if it fits."""
+def initial_tests(max_steps: int) -> Int[Array, ""]:
+    """The number of tests at the start of an iteration, in a byte if it fits."""
     fits = max_steps + 1 < jnp.iinfo(jnp.int8).max
     return jnp.asarray(max_steps + 1, jnp.int8 if fits else jnp.int32)
 
 
-def after_test(level: Array, counter: Array, *, polish: bool = True) -> Array:
-    """The counter after unknowns of this `level` were tested.
+def left_after_test(level: Array, tests_left: Array, *, polish: bool = True) -> Array:
+    """The number of tests that are left after unknowns of this `level` were tested.
 
-    Unknowns that are settled are done. Of those that are merely within the tolerance, one more step
-    brings the residual to roundoff, where `polish` asks for it; should that step leave the
+    At `AT_ROUNDOFF` the iteration ends. Where the unknowns are merely within the tolerance, one
+    more step brings the residual to roundoff, if `polish` asks for it; should that step leave the
     tolerance, another tries to return to it. A residual that is not finite cannot recover, but one
     more step takes the NaN to the unknowns, where everybody sees it. If no test is left and the
     unknowns do not solve the equations, the iteration has failed.
     """
-    then = jnp.where(level == NOT_FINITE, jnp.minimum(counter - 1, 1), counter - 1)
+    then = jnp.where(level == NOT_FINITE, jnp.minimum(tests_left - 1, 1), tests_left - 1)
     then = jnp.where((level < WITHIN_TOLERANCE) & (then == 0), -1, then)
-    then = jnp.where(level == WITHIN_TOLERANCE, jnp.where(counter > 2, 2, 0) if polish else 0, then)
+    then = jnp.where(
+        level == WITHIN_TOLERANCE, jnp.where(tests_left > 2, 2, 0) if polish else 0, then
+    )
     then = jnp.where(level == AT_ROUNDOFF, 0, then)
-    return jnp.where(counter > 0, then, counter).astype(counter.dtype)
+    return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 
 
-def after_step(settled: Array, hopeful: Array, counter: Array) -> Array:
-    """The counter after a step, in an iteration that tests not the unknowns but the lengths of its
-    steps: `settled` if the step was so short that it is the last, `hopeful` if another may help."""
-    then = jnp.where(settled, 0, jnp.where(hopeful & (counter > 1), counter - 1, -1))
-    return jnp.where(counter > 0, then, counter).astype(counter.dtype)
+def left_after_step(converged: Array, hopeful: Array, tests_left: Array) -> Array:
+    """The number of tests that are left after a step, in an iteration that tests the lengths of its
+    steps: `converged` if the step is so short that it is the last, `hopeful` if more may help."""
+    then = jnp.where(converged, 0, jnp.where(hopeful & (tests_left > 1), tests_left - 1, -1))
+    return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 
 
 @jax.custom_batching.custom_vmap
@@ -142,9 +143,9 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array
     return any_lane(jnp.any(flags)), False
 
 
-def keep_done(counter: Array, moved: Any, y: Any) -> Any:
+def keep_done(tests_left: Array, moved: Any, y: Any) -> Any:
     """The moved unknowns where the iteration goes on, and the others where it is done."""
-    return jtu.tree_map(lambda a, b: jnp.where(counter > 0, a, b), moved, y)
+    return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
 
 
 # ---- For candidates nearby ----
@@ -158,69 +159,76 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
-    Up to four constraints may have other `directions` instead; without them the rows are the
-    gradients at each state, if those at the candidate have failed for `FROZEN_STEPS` steps."""
+    For up to four constraints, `directions` takes their place; without `directions`, the rows are
+    the gradients at the current state after `FROZEN_STEPS` iterations."""
     if problem.magnitude.size > WRITTEN_OUT:
-        return _of_many(problem, candidate, max_steps)
-    return alone_or_in_lanes(ft.partial(_of_few, max_steps=max_steps))(
+        return _with_frozen_jacobian(problem, candidate, max_steps)
+    return alone_or_in_lanes(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
         (problem, candidate, directions)
     )
 
 
-def _of_few(given: Any, lanes: bool, *, max_steps: int) -> Solved:
+def _with_fresh_jacobians(given: Any, lanes: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     problem, candidate, directions = given
     dtype = problem.magnitude.dtype
-    roundoff = roundoff_pivot(dtype)
+    roundoff = roundoff_pivot_tolerance(dtype)
 
-    def shared(y: Any) -> Any:
-        """What the steps share: the order in which they eliminate the constraints, and in this
-        order the directions, or the gradients at the candidate."""
+    def loop_invariants(y: Any) -> Any:
+        """The order in which all steps eliminate the constraints, and in this order the given
+        directions, or the gradients at the candidate."""
         rows = problem.gradients(y).scaled()[1]
-        along = rows if directions is None else directions
-        order = order_of(rows.gram(along).matrix)
-        return order, in_order(order, along.matrix)
+        fixed = rows if directions is None else directions
+        order = pivot_order(rows.gram(fixed).matrix)
+        return order, permuted(order, fixed.matrix)
 
-    def advance(common: Any, y: Any, counter: Array) -> tuple[Any, Array]:
-        order, at_candidate = common
+    def advance(invariants: Any, y: Any, tests_left: Array) -> tuple[Any, Array]:
+        order, fixed = invariants
         linearised = problem.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = linearised if lanes else lax.optimization_barrier(linearised)
-        level, wrong = problem.level(g, problem.scale(jacobian, y))
-        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
-        rows, wrong = in_order(order, rows.matrix), in_order(order, wrong / sizes)
+        level, active = problem.level(g, problem.scale(jacobian, y))
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        rows, active = permuted(order, rows.matrix), permuted(order, active / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
-        # In each step the counter goes down by one, but before the last step, which polishes, the
-        # test sets it to two. So we look at it before the test. Should the last step leave the
-        # tolerance, the one that tries to return is along the gradients at its state.
-        frozen = counter > max_steps + 1 - FROZEN_STEPS
-        along = jnp.where(frozen, at_candidate, rows) if may_switch else at_candidate
-        counter = after_test(level, counter)
+        # Before the step that polishes the test sets the number of tests to two, so we compute the
+        # number of steps from its value before the test. Should that step leave the tolerance, the
+        # one that tries to return is along the gradients at its state.
+        frozen = tests_left > max_steps + 1 - FROZEN_STEPS
+        current = jnp.where(frozen, fixed, rows) if may_switch else fixed
+        tests_left = left_after_test(level, tests_left)
         # A step that only polishes is as long as roundoff over the sine of the angle between
         # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
         # constraint whose gradient is more nearly parallel to others takes no part in it. In
         # float64 it is short in any case, and a batch is faster without the distinction.
-        least = None
+        pivot_tolerance = None
         if dtype != jnp.float64:
-            least = jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-        rows, along = DenseRows(rows), DenseRows(along)
-        change = rows.gram(along).row_space_correction(along, wrong, least=least, ordered=True)
-        moved = y - problem.factor.to_state(change)
-        return keep_done(counter, moved, y), counter
+            pivot_tolerance = jnp.where(
+                level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2)
+            )
+        rows, current = DenseRows(rows), DenseRows(current)
+        change = rows.gram(current).row_space_correction(
+            current, active, pivot_tolerance=pivot_tolerance, presorted=True
+        )
+        newton_point = y - problem.factor.to_state(change)
+        return keep_done(tests_left, newton_point, y), tests_left
 
     if lanes:
-        start, step, y = written_out_loop(shared, advance, candidate, tests(max_steps))
+        tests_left = initial_tests(max_steps)
+        found, step, y = written_out_loop(loop_invariants, advance, candidate, tests_left)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        start, step, y = shared, advance, lax.optimization_barrier(candidate)
-    found = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
-    return found._replace(y=joined(candidate, found.y))
+        found, step, y = loop_invariants, advance, lax.optimization_barrier(candidate)
+    solved = iterate(ft.partial(step, found(y)), y, max_steps=max_steps)
+    return solved._replace(y=joined(candidate, solved.y))
 
 
 @eqx.filter_jit
-def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) -> Solved:
+def _with_frozen_jacobian(
+    problem: Problem, candidate: Float[Array, " n"], max_steps: int
+) -> Solved:
     """The matrix is that at the candidate, factored once, so that a step evaluates only residuals.
 
     They are compared with the scales at the candidate, because those at each state would need a
@@ -229,26 +237,26 @@ def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) ->
     candidate = lax.optimization_barrier(candidate)
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
-    along = problem.factor.scale_columns(jacobian)
-    sizes, rows = along.scaled()
+    gradients = problem.factor.scale_columns(jacobian)
+    row_scales, rows = gradients.scaled()
     solve = rows.gram(rows).factorise()
     _, vjp = jax.vjp(problem.residual, candidate)
 
-    def along_gradients(multiplier: Array) -> Array:
+    def combination(multiplier: Array) -> Array:
         """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
         if problem.pattern is not None:
             return problem.factor.to_state(problem.factor.scale_gradient(vjp(multiplier)[0]))
-        return problem.factor.to_state(along.rmatvec(multiplier))
+        return problem.factor.to_state(gradients.rmatvec(multiplier))
 
-    def advance(y: Array, counter: Array) -> tuple[Array, Array]:
-        level, wrong = problem.level(problem.residual(y), scale)
-        counter = after_test(level, counter)
-        move = lambda: y - along_gradients(solve(wrong / sizes) / sizes)  # noqa: E731
-        moved = lax.cond(any_lane(counter > 0), move, lambda: y)
-        return keep_done(counter, moved, y), counter
+    def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
+        level, active = problem.level(problem.residual(y), scale)
+        tests_left = left_after_test(level, tests_left)
+        move = lambda: y - combination(solve(active / row_scales) / row_scales)  # noqa: E731
+        moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
+        return keep_done(tests_left, moved, y), tests_left
 
     y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
-    return Solved(y, ok & problem.holds(y), num_iterations)
+    return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
 
 
 # ---- For starts far away ----
@@ -256,7 +264,7 @@ def _of_many(problem: Problem, candidate: Float[Array, " n"], max_steps: int) ->
 
 class _Descent(NamedTuple):
     """The state to be tested, and the best one so far with its largest residual, relative to the
-    scales at the first state. A scale grows with the state, so that by their own scales residuals
+    scales at the start. A scale grows with the state, so that by their own scales residuals
     far away would look smaller than they are."""
 
     y: Float[Array, " n"]
@@ -279,26 +287,26 @@ def damped_newton(
     case the result depends on the path.
     """
 
-    def advance(now: _Descent, counter: Array) -> tuple[_Descent, Array]:
+    def advance(now: _Descent, tests_left: Array) -> tuple[_Descent, Array]:
         y, first = now.y, now.largest == jnp.inf
         g, jacobian = lax.optimization_barrier(problem.linearise(y))
-        here = problem.scale(jacobian, y)
-        level, wrong = problem.level(g, here)
+        scale_at_y = problem.scale(jacobian, y)
+        level, active = problem.level(g, scale_at_y)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
         level = jnp.where(first, level, jnp.maximum(level, ABOVE_TOLERANCE))
-        counter = after_test(level, counter, polish=polish)
-        scale = jnp.where(first, here, now.scale)
-        residuals = jnp.abs(relative(g, scale))
-        better = jnp.all(residuals <= now.largest)  # false if one is NaN
-        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
-        along = rows if directions is None else directions
-        change = rows.gram(along).row_space_correction(along, wrong / sizes)
-        further = y - problem.factor.to_state(change)
-        shorter = now.best + BACKTRACKING_FACTOR * (y - now.best)
-        best = jnp.where(better, y, now.best)
-        largest = jnp.where(better, jnp.max(residuals), now.largest)
-        moved = keep_done(counter, jnp.where(better, further, shorter), y)
-        return _Descent(moved, best, largest, scale), counter
+        tests_left = left_after_test(level, tests_left, polish=polish)
+        scale = jnp.where(first, scale_at_y, now.scale)
+        residuals = jnp.abs(relative_to_scale(g, scale))
+        is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        current = rows if directions is None else directions
+        change = rows.gram(current).row_space_correction(current, active / row_scales)
+        newton_point = y - problem.factor.to_state(change)
+        backtracked = now.best + BACKTRACKING_FACTOR * (y - now.best)
+        best = jnp.where(is_smaller, y, now.best)
+        largest = jnp.where(is_smaller, jnp.max(residuals), now.largest)
+        moved = keep_done(tests_left, jnp.where(is_smaller, newton_point, backtracked), y)
+        return _Descent(moved, best, largest, scale), tests_left
 
     begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), problem.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
@@ -319,37 +327,39 @@ def projected_newton(
     of the function along the step.
     """
 
-    def advance(z: Array, counter: Array) -> tuple[Array, Array]:
+    def advance(z: Array, tests_left: Array) -> tuple[Array, Array]:
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         level, _ = problem.level(g, problem.scale(jacobian, z))
-        counter = after_test(level, counter, polish=False)
-        sizes, rows = problem.factor.scale_columns(jacobian).scaled()
+        tests_left = left_after_test(level, tests_left, polish=False)
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
-        multiplier = rows.gram(directions).solve(g / sizes)
+        multiplier = rows.gram(directions).solve(g / row_scales)
         change = problem.factor.to_state(directions.rmatvec(multiplier))
-        share = _share(problem, z, multiplier, change, counter > 0)
-        return keep_done(counter, z - share * change, z), counter
+        step_fraction = _line_search(problem, z, multiplier, change, tests_left > 0)
+        return keep_done(tests_left, z - step_fraction * change, z), tests_left
 
     return iterate(advance, start, max_steps=max_steps)
 
 
-def _share(problem: Problem, z: Array, multiplier: Array, change: Array, goes_on: Array) -> Array:
-    """The share of a Newton step at which the convex function is least, by bisection of its descent
-    along the step, the product of the residuals with what is subtracted from the multipliers."""
+def _line_search(
+    problem: Problem, z: Array, multiplier: Array, change: Array, goes_on: Array
+) -> Array:
+    """The fraction of a Newton step at which the convex function is least. It is found by bisection
+    of the directional derivative, `descent`, whose sign tells the side of the minimum."""
 
-    def descent(share: Array | float) -> Array:
-        return jnp.sum(multiplier * problem.residual(z - share * change))
+    def descent(step_fraction: Array | float) -> Array:
+        return jnp.sum(multiplier * problem.residual(z - step_fraction * change))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2
-        further = descent(middle) >= 0
-        return jnp.where(further, middle, ends[0]), jnp.where(further, ends[1], middle)
+        descends = descent(middle) >= 0
+        return jnp.where(descends, middle, ends[0]), jnp.where(descends, ends[1], middle)
 
     # A full step is kept if it goes hardly past the minimum. If all components that it moves are
     # beyond their bounds, where `clip` has the derivative `AT_BOUND`, the step is far too long.
     ends = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
     in_full = (descent(1.0) >= -(AT_BOUND**0.5) * descent(0.0)) | ~goes_on
     bisected = lambda: lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, ends)[1]  # noqa: E731
-    share = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
-    return jnp.where(in_full, ends[1], share)
+    step_fraction = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
+    return jnp.where(in_full, ends[1], step_fraction)

@@ -63,8 +63,8 @@ def iterative_refinement(
     return x
 
 
-# For each pair of places, without the first place, whether their constraints are exchanged.
-Order = tuple[Bool[Array, ""], ...]
+# One flag for each comparison of pivots `(k, i)`, `1 ≤ k < i`: whether these rows are exchanged.
+PivotOrder = tuple[Bool[Array, ""], ...]
 
 
 def forward_elimination(
@@ -72,45 +72,52 @@ def forward_elimination(
     b: Array,
     rows: Array,
     *,
-    least: float | Array | None = None,
-    ordered: bool = False,
-) -> tuple[Array, Array, Order]:
+    pivot_tolerance: float | Array | None = None,
+    presorted: bool = False,
+) -> tuple[Array, Array, PivotOrder]:
     """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination, and the
     order of the pivots. The transpose of the first times the second is `rowsᵀ gram⁻¹ b`.
 
     Divided by the element on the diagonal of `gram`, the pivot of a constraint is the squared sine
     of the angle between its gradient and the span of the gradients before it. The next constraint
     is that with the largest: if a nearly parallel gradient came earlier, its roundoff would be
-    magnified in the pivots of those that could replace it. The arguments may be `ordered` in this
-    way already. A pivot of at most `least` times the element on the diagonal, by default roundoff,
-    counts as infinite, so that its multiplier is zero."""
+    magnified in the pivots of those that could replace it. The arguments may be `presorted` in this
+    way already. A pivot of at most `pivot_tolerance` times the element on the diagonal, by default
+    roundoff, counts as infinite, so that its multiplier is zero."""
     m = len(gram)
-    least = roundoff_pivot(gram.dtype) if least is None else least
+    pivot_tolerance = (
+        roundoff_pivot_tolerance(gram.dtype) if pivot_tolerance is None else pivot_tolerance
+    )
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
-    right, reduced, order = list(b), list(rows), []
+    right, reduced_rows, order = list(b), list(rows), []
     for k in range(m):
-        for i in range(k + 1, m) if k and not ordered else ():  # at first all are equal
+        for i in (
+            range(k + 1, m) if k and not presorted else ()
+        ):  # the first pivots, divided by the diagonal, are one
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             order.append(larger)
-            for each in (*matrix[k:], matrix, size, right, reduced):
+            for each in (*matrix[k:], matrix, size, right, reduced_rows):
                 _exchange(each, k, i, larger)
-        pivot = jnp.where(jnp.abs(matrix[k][k]) > least * size[k], matrix[k][k], jnp.inf)
+        pivot = jnp.where(jnp.abs(matrix[k][k]) > pivot_tolerance * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
-            right[i], reduced[i] = right[i] - below * right[k], reduced[i] - beside * reduced[k]
+            right[i], reduced_rows[i] = (
+                right[i] - below * right[k],
+                reduced_rows[i] - beside * reduced_rows[k],
+            )
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         right[k] = right[k] / pivot
-    return jnp.stack(reduced), jnp.stack(right), tuple(order)
+    return jnp.stack(reduced_rows), jnp.stack(right), tuple(order)
 
 
-def order_of(gram: Float[Array, "m m"]) -> Order:
+def pivot_order(gram: Float[Array, "m m"]) -> PivotOrder:
     """The order in which the elimination takes the constraints, whatever the right side is."""
     return forward_elimination(gram, gram[0], gram)[2]
 
 
-def in_order(order: Order, each: Array) -> Array:
+def permuted(order: PivotOrder, each: Array) -> Array:
     """One element or row for each constraint, in this order."""
     if not order:
         return each
@@ -128,6 +135,6 @@ def _exchange(x: list[Any], k: int, i: int, exchanged: Bool[Array, ""]) -> None:
     x[i] = jtu.tree_map(ft.partial(jnp.where, exchanged), first, second)
 
 
-def roundoff_pivot(dtype: Any) -> float:
+def roundoff_pivot_tolerance(dtype: Any) -> float:
     """The largest share of the diagonal that a pivot can be by roundoff alone."""
     return ROUNDOFF * float(jnp.finfo(dtype).eps)

@@ -55,7 +55,7 @@ class AbstractFactor(eqx.Module):
     def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S⁻¹ change`."""
 
-    def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
+    def norm(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         """The length of a change of the state in the metric."""
         return jnp.linalg.norm(self.to_metric(change))
 
@@ -134,8 +134,8 @@ class Matrices(AbstractFactor):
 
 
 @final
-class Preferring(AbstractFactor):
-    """The factor `S (P + δ (1 - P))`, where `S` is the factor of another metric, the `own` one, and
+class PreferredSubspace(AbstractFactor):
+    """The factor `S (P + δ (1 - P))`, where `S` is the `base_factor`, that of another metric, and
     `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, as measured by `S`.
 
     In this metric a correction leaves the span only where none within it reaches the manifold,
@@ -144,21 +144,23 @@ class Preferring(AbstractFactor):
     is added to the diagonal of a large Gram matrix too.
     """
 
-    own: AbstractFactor
+    base_factor: AbstractFactor
     basis: Float[Array, "k n"]
     is_dense: ClassVar[bool] = True
 
     @classmethod
-    def along(cls, own: AbstractFactor, changes: Float[Array, "k n"]) -> "Preferring":
+    def spanned_by(
+        cls, base_factor: AbstractFactor, changes: Float[Array, "k n"]
+    ) -> "PreferredSubspace":
         """Prefers the span of given changes of the state, by the Gram-Schmidt process. Each change
         is made orthogonal to those before it twice, because the roundoff that is left after the
         first time grows with the ratio of its lengths before and after. If at most a share `δ` of
         the change is new, it is left out: the new part has too few digits to conserve what the
         other changes conserve."""
-        changes = jax.vmap(own.to_metric)(changes)
+        changes = jax.vmap(base_factor.to_metric)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
-        least = _outside(changes.dtype) ** 2
+        least = _COMPLEMENT_DAMPING(changes.dtype) ** 2
 
         def add(basis: Array, k: Array) -> tuple[Array, None]:
             new = changes[k]
@@ -169,30 +171,36 @@ class Preferring(AbstractFactor):
             new = jnp.where(is_new, new * lax.rsqrt(jnp.where(is_new, square, 1)), 0)
             return basis.at[k].set(new), None
 
-        return cls(own, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
+        return cls(base_factor, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
     def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
-        return self._shared(self.own.scale_gradient(gradient), _outside(gradient.dtype))
+        return self._damped_complement(
+            self.base_factor.scale_gradient(gradient), _COMPLEMENT_DAMPING(gradient.dtype)
+        )
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.own.to_state(self._shared(change, _outside(change.dtype)))
+        return self.base_factor.to_state(
+            self._damped_complement(change, _COMPLEMENT_DAMPING(change.dtype))
+        )
 
     def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self._shared(self.own.to_metric(change), 1 / _outside(change.dtype))
+        return self._damped_complement(
+            self.base_factor.to_metric(change), 1 / _COMPLEMENT_DAMPING(change.dtype)
+        )
 
-    def length(self, change: Float[Array, " n"]) -> Float[Array, ""]:
+    def norm(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         """In the own metric: a preference says where a correction leads, and not how long it is."""
-        return self.own.length(change)
+        return self.base_factor.norm(change)
 
-    def _shared(self, x: Float[Array, "*m n"], outside: float) -> Float[Array, "*m n"]:
+    def _damped_complement(self, x: Float[Array, "*m n"], outside: float) -> Float[Array, "*m n"]:
         """`x (P + outside (1 - P))`."""
         product = ft.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
         within = product(product(x, self.basis.T), self.basis)
         return within + outside * (x - within)
 
 
-def _outside(dtype: Any) -> float:
-    """`δ` of `Preferring`."""
+def _COMPLEMENT_DAMPING(dtype: Any) -> float:
+    """`δ` of `PreferredSubspace`."""
     return float(jnp.finfo(dtype).eps) ** (REGULARISATION_POWER / 2)
 
 
@@ -247,14 +255,14 @@ def factor_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> Abstr
         return given
 
     _check_prefix("metric", values, like)
-    units = 1 / jnp.sqrt(spread("metric", jtu.tree_map(weights, values, like), like))
+    units = 1 / jnp.sqrt(broadcast_option("metric", jtu.tree_map(weights, values, like), like))
     if not matrices:
         return Diagonal(units)
     lower = (jnp.linalg.cholesky(jnp.asarray(x, units.dtype)) for x in matrices.values())
     return Matrices(Diagonal(units), tuple(lower), tuple(matrices))
 
 
-def spread(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
+def broadcast_option(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:
     """An option of numbers or arrays for the parts of a state, as a vector like the state."""
 
     def spread_leaf(given: ArrayLike, leaf: Any) -> Any:

@@ -162,9 +162,8 @@ class Problem(eqx.Module):
         and the residuals that are to be corrected, with zeros for those that are noise."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
-        # A tolerance that has underflowed would be met by a residual that has underflowed too,
-        # whatever the state is, and an infinite one is met by everything. So neither is ever met.
-        # If the scale is exactly zero, all terms are zero, and so is the residual.
+        # A tolerance that has underflowed, or is infinite, would accept any state, so it counts as
+        # not met. If the scale is exactly zero, all terms are zero, and so is the residual.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         on = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be
@@ -173,7 +172,7 @@ class Problem(eqx.Module):
         beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(ABOVE_TOLERANCE), jnp.int8(NOT_FINITE))
         return jnp.min(jnp.where(on, within, beyond)), jnp.where(noise, 0, g)
 
-    def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
+    def is_on_manifold(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
@@ -202,7 +201,7 @@ class Problem(eqx.Module):
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
         after, jacobian = problem.linearise(y)
         scale = problem.scale(jacobian, y)
-        sizes = [jnp.abs(relative(g, scale)) for g in (problem.residual(candidate), after)]
+        sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
         success = problem.level(after, scale)[0] >= WITHIN_TOLERANCE if ok is None else ok
@@ -218,10 +217,10 @@ class Problem(eqx.Module):
             num_iterations=jnp.asarray(num_iterations),
             residual_before=before,
             residual_after=after,
-            correction=problem.factor.length(y - candidate),
-            roundoff=jnp.max(relative(problem.cancellation, scale)),
-            # An iteration that diverged makes every residual large. So we look for the entry whose
-            # residual is large both before and after: of both the smaller one counts.
+            correction=problem.factor.norm(y - candidate),
+            roundoff=jnp.max(relative_to_scale(problem.cancellation, scale)),
+            # An iteration that diverged makes every residual large. So the entry is named whose
+            # residual is large both before and after, by the minimum of both.
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
             names=self.names,
         )
@@ -232,7 +231,7 @@ def component_changes(start: Float[Array, " n"], end: Float[Array, " n"]) -> Flo
     return jnp.abs(end - start)
 
 
-def step_length(
+def step_norm(
     start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
 ) -> Float[Array, ""]:
     """The length of a step in the metric, with which the length of a correction is compared.
@@ -241,17 +240,17 @@ def step_length(
     the roundoff of the residuals alone moves a state by about that much. Without this floor a step
     at rest would have no length, and every correction would be longer than it.
     """
-    least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
-    return factor.length(jnp.maximum(jnp.abs(end - start), least))
+    floor = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
+    return factor.norm(jnp.maximum(jnp.abs(end - start), floor))
 
 
-def relative(residual: Any, scale: Any) -> Any:
+def relative_to_scale(residual: Any, scale: Any) -> Any:
     """Residuals divided by their scales. A scale of zero counts as one, so that a residual that is
     exactly zero stays zero instead of becoming NaN."""
     return jtu.tree_map(lambda g, s: g / jnp.where(s > 0, s, jnp.ones_like(s)), residual, scale)
 
 
-def measure(
+def residuals_and_scales(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Values, Values]:
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
@@ -314,7 +313,7 @@ def problem_of(
     )
 
 
-class _Known:
+class _Concrete:
     """An array in a box, which JAX takes for a leaf that is no array. So no transformation replaces
     it by a tracer, and its numbers remain known."""
 
@@ -332,9 +331,9 @@ class _Converted(eqx.Module):
     def __init__(self, fn: Any):
         def known(x: Any) -> Any:
             constant = hasattr(x, "dtype") and not isinstance(x, jax.core.Tracer)
-            return _Known(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
+            return _Concrete(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
 
         self.fn = jtu.tree_map(known, fn)
 
     def __call__(self, y: Array) -> Array:
-        return jtu.tree_map(lambda x: x.value if isinstance(x, _Known) else x, self.fn)(y)
+        return jtu.tree_map(lambda x: x.value if isinstance(x, _Concrete) else x, self.fn)(y)

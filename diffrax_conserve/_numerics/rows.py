@@ -68,8 +68,8 @@ class AbstractRows(eqx.Module):
         """`U diag(x)`."""
 
     @abc.abstractmethod
-    def divide_rows(self: Rows, sizes: Float[Array, " m"]) -> Rows:
-        """`diag(sizes)⁻¹ U`."""
+    def divide_rows(self: Rows, row_scales: Float[Array, " m"]) -> Rows:
+        """`diag(row_scales)⁻¹ U`."""
 
     @abc.abstractmethod
     def largest(self) -> Float[Array, " m"]:
@@ -88,38 +88,41 @@ class AbstractRows(eqx.Module):
         return jtu.tree_map(jnp.abs, self).matvec(x)
 
     def scaled(self: Rows) -> tuple[Float[Array, " m"], Rows]:
-        """The largest element of each row, or one if all are zero, and the rows divided by it.
+        """The scales of the rows, and the rows divided by them. A scale is the largest element of
+        its row, or one if all are zero.
 
         The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
-        they do not in usual units, so there the sizes are one, which saves time.
+        they do not in usual units, so there the row_scales are one, which saves time.
         """
         if self.dtype == jnp.float64:
             return jnp.ones(len(self)), self
-        sizes = self.largest()
-        sizes = jnp.where(sizes > 0, sizes, 1)
-        return sizes, self.divide_rows(sizes)
+        row_scales = self.largest()
+        row_scales = jnp.where(row_scales > 0, row_scales, 1)
+        return row_scales, self.divide_rows(row_scales)
 
     def unit(self: Rows) -> tuple[Float[Array, " m"], Rows]:
-        """What the rows were divided by, and the rows, now of the length one, so that the pivots of
-        their Gram matrix are squares of sines. Sparse rows are only `scaled`, because the pivots of
-        a sparse matrix are not compared with `least`."""
+        """The norms of the rows, and the rows divided by them, so that the pivots of their Gram
+        matrix are squares of sines. Sparse rows are only `scaled`, because the pivots of a sparse
+        matrix are not compared with `pivot_tolerance`."""
         return self.scaled()
 
-    def least_pivot(self) -> float:
+    def derivative_pivot_tolerance(self) -> float:
         """The least pivot of unit rows that counts in a derivative, `√ε`. As a pivot has an error
         of about `ε`, half of the digits of what is divided by it are right."""
         return float(jnp.finfo(self.dtype).eps) ** 0.5
 
     def best_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
         """The `λ` for which `Uᵀ λ` is nearest to a change, without nearly dependent rows."""
-        return self.gram(self).solve(self.matvec(change), least=self.least_pivot())
+        return self.gram(self).solve(
+            self.matvec(change), pivot_tolerance=self.derivative_pivot_tolerance()
+        )
 
 
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
-    In all methods `least` is the least pivot that counts, by default roundoff. Sparse matrices
-    ignore it.
+    In all methods `pivot_tolerance` is the least pivot that counts, by default roundoff. Sparse
+    matrices ignore it.
     """
 
     @abc.abstractmethod
@@ -127,29 +130,29 @@ class AbstractGram(eqx.Module):
         """`U Vᵀ x`."""
 
     @abc.abstractmethod
-    def factorise(self, *, least: float | Array | None = None) -> Solve:
+    def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         """`(U Vᵀ)⁻¹ b` as a function of `b`, which is a PyTree of the factors. The share of the
         diagonal that is added to a large matrix makes an error, which `solve` removes by iterative
         refinement, and an iteration by its further steps."""
 
     def solve(
-        self, b: Float[Array, " m"], *, least: float | Array | None = None
+        self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None
     ) -> Float[Array, " m"]:
         """`(U Vᵀ)⁻¹ b`."""
-        return iterative_refinement(self.factorise(least=least), self.matvec, b)
+        return iterative_refinement(self.factorise(pivot_tolerance=pivot_tolerance), self.matvec, b)
 
     def row_space_correction(
         self,
-        along: Any,
+        directions: Any,
         b: Float[Array, " m"],
         *,
-        least: float | Array | None = None,
-        ordered: bool = False,
+        pivot_tolerance: float | Array | None = None,
+        presorted: bool = False,
     ) -> Float[Array, " n"]:
-        """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V` that changes `U x` by `b`. `along`: the
-        rows `V`. `ordered`: see `forward_elimination`."""
-        del ordered
-        return along.rmatvec(self.solve(b, least=least))
+        """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V` that changes `U x` by `b`.
+        `directions`: the rows `V`. `presorted`: see `forward_elimination`."""
+        del presorted
+        return directions.rmatvec(self.solve(b, pivot_tolerance=pivot_tolerance))
 
 
 @final
@@ -162,22 +165,22 @@ class DenseRows(AbstractRows):
         return len(self.matrix)
 
     def matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        return _combination(x, self.matrix.T)
+        return _transposed_product(x, self.matrix.T)
 
     def rmatvec(self, multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
-        return _combination(multiplier, self.matrix)
+        return _transposed_product(multiplier, self.matrix)
 
-    def gram(self, others: "DenseRows") -> "FewGram | DenseGram":
+    def gram(self, others: "DenseRows") -> "PivotedGram | RegularisedGram":
         if len(self) > WRITTEN_OUT:
             product = jnp.matmul(self.matrix, others.matrix.T, precision=lax.Precision.HIGHEST)
-            return DenseGram(product)
-        return FewGram(jnp.sum(self.matrix[:, None, :] * others.matrix[None], axis=2))
+            return RegularisedGram(product)
+        return PivotedGram(jnp.sum(self.matrix[:, None, :] * others.matrix[None], axis=2))
 
     def scale_columns(self, x: Float[Array, " n"]) -> "DenseRows":
         return DenseRows(self.matrix * jnp.broadcast_to(x, self.matrix.shape))
 
-    def divide_rows(self, sizes: Float[Array, " m"]) -> "DenseRows":
-        return DenseRows(self.matrix / sizes[:, None])
+    def divide_rows(self, row_scales: Float[Array, " m"]) -> "DenseRows":
+        return DenseRows(self.matrix / row_scales[:, None])
 
     def largest(self) -> Float[Array, " m"]:
         return jnp.max(jnp.abs(self.matrix), axis=1)
@@ -190,67 +193,71 @@ class DenseRows(AbstractRows):
         return jnp.sum(jnp.abs(self.matrix) * x[None], axis=1)
 
     def unit(self) -> tuple[Float[Array, " m"], "DenseRows"]:
-        sizes, rows = self.scaled()
+        row_scales, rows = self.scaled()
         lengths = jnp.linalg.norm(rows.matrix, axis=1)
         lengths = jnp.where(lengths > 0, lengths, 1)
-        return sizes * lengths, rows.divide_rows(lengths)
+        return row_scales * lengths, rows.divide_rows(lengths)
 
 
 @final
-class FewGram(AbstractGram):
+class PivotedGram(AbstractGram):
     """The Gram matrix of up to four rows."""
 
     matrix: Float[Array, "m m"]
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
-        return _combination(x, self.matrix.T)
+        return _transposed_product(x, self.matrix.T)
 
-    def factorise(self, *, least: float | Array | None = None) -> Solve:
-        del least
-        matrix, unit = _of_unit_diagonal(self.matrix)
+    def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
+        del pivot_tolerance
+        matrix, unit = _equilibrated(self.matrix)
         one = jnp.eye(len(matrix), dtype=matrix.dtype)
         above, below, _ = forward_elimination(matrix, one, one)
         return _Inverses(below, above.T, unit)
 
     def solve(
-        self, b: Float[Array, " m"], *, least: float | Array | None = None
+        self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None
     ) -> Float[Array, " m"]:
         one = DenseRows(jnp.eye(len(b), dtype=b.dtype))
-        return self.row_space_correction(one, b, least=least)
+        return self.row_space_correction(one, b, pivot_tolerance=pivot_tolerance)
 
     def row_space_correction(
         self,
-        along: DenseRows,
+        directions: DenseRows,
         b: Float[Array, " m"],
         *,
-        least: float | Array | None = None,
-        ordered: bool = False,
+        pivot_tolerance: float | Array | None = None,
+        presorted: bool = False,
     ) -> Float[Array, " n"]:
         """If gradients are nearly parallel, the multipliers `(U Vᵀ)⁻¹ b` are large and cancel in
         the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
         then they do not cancel. So we do not form the multipliers. With the factors `U Vᵀ = L R` we
         compute `(R⁻ᵀ V)ᵀ (L⁻¹ b)`: the elimination takes the differences of nearly parallel rows
         before anything is large."""
-        sides, right, _ = forward_elimination(
-            self.matrix, b, along.matrix, least=least, ordered=ordered
+        reduced_rows, right, _ = forward_elimination(
+            self.matrix, b, directions.matrix, pivot_tolerance=pivot_tolerance, presorted=presorted
         )
-        return _combination(right, sides)
+        return _transposed_product(right, reduced_rows)
 
 
 @final
-class DenseGram(AbstractGram):
+class RegularisedGram(AbstractGram):
     """The Gram matrix of more rows."""
 
     matrix: Float[Array, "m m"]
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
-        return _combination(x, self.matrix.T)
+        return _transposed_product(x, self.matrix.T)
 
-    def factorise(self, *, least: float | Array | None = None) -> Solve:
-        matrix, unit = _of_unit_diagonal(self.matrix)
+    def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
+        matrix, unit = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
         eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
-        added = eps**REGULARISATION_POWER * len(matrix) ** 0.5 if least is None else least
+        added = (
+            eps**REGULARISATION_POWER * len(matrix) ** 0.5
+            if pivot_tolerance is None
+            else pivot_tolerance
+        )
         matrix = matrix.astype(dtype) + added * one
         if len(matrix) > MAX_BLOCK:
             return _Substitutions(lu_factors(matrix), unit)
@@ -270,7 +277,7 @@ class _Inverses(eqx.Module):
 
     def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         x = (b * self.unit).astype(self.below.dtype)
-        x = _combination(_combination(x, self.below.T), self.above.T)
+        x = _transposed_product(_transposed_product(x, self.below.T), self.above.T)
         return x.astype(b.dtype) * self.unit
 
 
@@ -286,7 +293,7 @@ class _Substitutions(eqx.Module):
         return lu_solution(self.factors, x).astype(b.dtype) * self.unit
 
 
-def _of_unit_diagonal(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:
+def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:
     """The matrix with its rows and columns multiplied by units such that the diagonal is one, and
     the units."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
@@ -294,7 +301,7 @@ def _of_unit_diagonal(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, 
     return matrix * unit[:, None] * unit, unit
 
 
-def _combination(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+def _transposed_product(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
     """`rowsᵀ x`. A short sum is written out, so that XLA fuses it with what is around it."""
     if len(rows) > WRITTEN_OUT:
         return jnp.matmul(x, rows, precision=lax.Precision.HIGHEST)
@@ -303,7 +310,7 @@ def _combination(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Arra
 
 def solve_dense(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """`matrix⁻¹ b`."""
-    return (FewGram(matrix) if len(b) <= WRITTEN_OUT else DenseGram(matrix)).solve(b)
+    return (PivotedGram(matrix) if len(b) <= WRITTEN_OUT else RegularisedGram(matrix)).solve(b)
 
 
 def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
@@ -317,12 +324,14 @@ def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Flo
     units of the multipliers.
     """
     row_norms, rows = DenseRows(matrix[n:, :n]).unit()
-    column_norms, along = DenseRows(matrix[:n, n:].T).unit()
+    column_norms, directions = DenseRows(matrix[:n, n:].T).unit()
     columns = DenseRows(rows.matrix.T)
     factors = lu_factors(matrix[:n, :n] + columns.gram(columns).matrix)
-    along = DenseRows(lu_solution(factors, along.matrix.T).T)
+    directions = DenseRows(lu_solution(factors, directions.matrix.T).T)
     second = b[n:] / row_norms
     first = lu_solution(factors, b[:n] + rows.rmatvec(second))
-    wrong = rows.matvec(first) - second
-    multiplier = rows.gram(along).solve(wrong, least=rows.least_pivot())
-    return jnp.concatenate([first - along.rmatvec(multiplier), multiplier / column_norms])
+    defect = rows.matvec(first) - second
+    multiplier = rows.gram(directions).solve(
+        defect, pivot_tolerance=rows.derivative_pivot_tolerance()
+    )
+    return jnp.concatenate([first - directions.rmatvec(multiplier), multiplier / column_norms])

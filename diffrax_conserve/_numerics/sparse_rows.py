@@ -56,10 +56,10 @@ class SparseRows(AbstractRows):
         largest = jnp.max(jnp.abs(take(self.colours, self.pattern.elements)), axis=2)
         return self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
 
-    def divide_rows(self, sizes: Float[Array, " m"]) -> "SparseRows":
+    def divide_rows(self, row_scales: Float[Array, " m"]) -> "SparseRows":
         owned = self.pattern.owners < len(self)
-        size = jnp.where(owned, take(sizes, self.pattern.owners), 1)
-        dense = self.dense / sizes[self.pattern.dense_rows, None]
+        size = jnp.where(owned, take(row_scales, self.pattern.owners), 1)
+        dense = self.dense / row_scales[self.pattern.dense_rows, None]
         return SparseRows(self.colours / size, dense, self.pattern)
 
     def apply(self, linear: Callable[[Array], Array], n: int) -> "SparseRows":
@@ -141,10 +141,10 @@ class BlockGram(AbstractGram):
         below = jnp.einsum("dij,ij->d", self.rows, blocks) + self.corner @ dense
         return self.pattern.joined(products, below)
 
-    def factorise(self, *, least: float | Array | None = None) -> Solve:
+    def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         """Dense rows are eliminated last, by their Schur complement
         `corner - rows sparse⁻¹ columns`."""
-        del least
+        del pivot_tolerance
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
         added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** REGULARISATION_POWER

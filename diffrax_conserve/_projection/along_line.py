@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._constants import MAX_STEPS
-from .._numerics.implicit import MultiplierSystem, solution
+from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.metric import Diagonal
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
@@ -104,7 +104,7 @@ class AlongLine(AbstractProjection):
         s = lax.stop_gradient(jnp.where(line == 0, least, jnp.abs(line)))
         along = dataclasses.replace(problem, factor=Diagonal(s))
         row = DenseRows((line / s)[None])
-        y, ok, count, _ = solution(
+        y, ok, count, _ = implicit_solution(
             MultiplierSystem(along, candidate, row, max_steps=self.max_steps)
         )
         if self.direction == "step":

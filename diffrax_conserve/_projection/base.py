@@ -25,8 +25,8 @@ class AbstractProjection(Hashable):
     """
 
     metric: eqx.AbstractVar[PyTree[Any] | None]
-    # Whether `Problem.step` is set. If it is, dense output stores the error estimate too, which
-    # costs memory.
+    # Whether the projection reads `Problem.step`. Then dense output stores the error estimate too,
+    # which costs memory.
     sees_step: ClassVar[bool] = True
     # Whether corrections are along the gradients of the functions, from any candidate. Then dense
     # output tries the damped Newton method where the projection fails.

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
-from .._numerics.implicit import MultiplierSystem, nan_tangent_unless, root, solution
+from .._numerics.implicit import MultiplierSystem, implicit_solution, nan_tangent_unless, root
 from .._numerics.iterate import Solved, damped_newton
 from .._numerics.metric import Identity
 from .._numerics.problem import Problem
@@ -105,7 +105,7 @@ def _some_point(problem: Problem, given: _Given, max_steps: int) -> Solved:
     derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
     if given.bounds is not None:
         return project_within(given.bounds, problem, given.candidate, max_steps=max_steps)
-    return solution(
+    return implicit_solution(
         MultiplierSystem(problem, given.candidate, iteration=damped_newton, max_steps=max_steps)
     )
 
@@ -185,11 +185,11 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     # So we start once more, with the result as the base: now the change itself is roundoff.
     begin = first, jnp.asarray(False), jnp.asarray(0), jnp.asarray(2)
     base, ok, count, _ = lax.while_loop(lambda now: now[-1] > 0, approach, begin)
-    ok = ok & still.problem.holds(still.clip(base))
+    ok = ok & still.problem.is_on_manifold(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
     found = root(
         conditions, lambda x: Solved(x, ok, count), start, ft.partial(solve_kkt, first.size)
     )
     y = conditions.state(found.y)
-    return nan_tangent_unless(y, ok | ~still.problem.holds(lax.stop_gradient(y))), count
+    return nan_tangent_unless(y, ok | ~still.problem.is_on_manifold(lax.stop_gradient(y))), count

@@ -97,7 +97,7 @@ def _projected(
     # the scale at the result is less than half of the cancellation at the candidate.
     shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(ravel(usable)))
     judged = problem(there)
-    ok = tree_stop_gradient(judged).holds(lax.stop_gradient(y))
+    ok = tree_stop_gradient(judged).is_on_manifold(lax.stop_gradient(y))
     ok = ok | info.ok & jnp.all(at_candidate <= 2 * (shown + there))
     return unravel(y, candidate), judged.report(vector, y, info.num_iterations, ok=ok)
 

@@ -7,7 +7,7 @@ from typing import final
 
 from jaxtyping import Array, Float
 
-from .._numerics.implicit import MultiplierSystem, solution
+from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .options import NEWTON_OPTIONS
@@ -62,7 +62,7 @@ class SimplifiedNewton(AbstractNewton):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         bounds = self.bounds(problem.like)
         if bounds is None:
-            y, ok, count, _ = solution(
+            y, ok, count, _ = implicit_solution(
                 MultiplierSystem(problem, candidate, max_steps=self.max_steps)
             )
         else:

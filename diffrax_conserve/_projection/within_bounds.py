@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._constants import AT_BOUND, MAX_STEPS
-from .._numerics.implicit import MultiplierSystem, solution
+from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.iterate import Solved, projected_newton
-from .._numerics.metric import positive_weights, spread
+from .._numerics.metric import broadcast_option, positive_weights
 from .._numerics.problem import Problem
 from .._printing import is_traced
 from .base import AbstractProjection
@@ -41,7 +41,7 @@ class Bounds(eqx.Module):
         """The bounds of a state of given shapes, of which `None` is none."""
         low = -np.inf if lower is None else lower
         high = np.inf if upper is None else upper
-        return cls(spread("lower", low, like), spread("upper", high, like))
+        return cls(broadcast_option("lower", low, like), broadcast_option("upper", high, like))
 
     def clip(self, z: Float[Array, " n"], *, slope: float = AT_BOUND) -> Float[Array, " n"]:
         """`z` within the bounds, with the derivative `slope` where it is beyond them. A component
@@ -75,7 +75,7 @@ def project_within(
     """
     rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
     within = bounds.compose(problem)
-    return solution(
+    return implicit_solution(
         MultiplierSystem(
             within, candidate, rows, iteration=projected_newton, max_steps=2 * max_steps
         )

@@ -20,7 +20,7 @@ from .diffrax_private import member, register
 _ENTRY = (
     "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
 )
-FIRST = register(
+FIRST_RESULT = register(
     "a step cannot start: its state is off the manifold. At the start of a solve it must satisfy "
     "each `Constraint`: `y0, info = diffrax_conserve.project(manifold, y0, t=t0, args=args)`, of a "
     "`DAE` `y0 = dae.consistent(x, z, t=t0, args=args)`; a quantity that keeps the "
@@ -48,30 +48,33 @@ FIRST = register(
     "change or leave out one of them. Or the quantity is not conserved, as `check_invariance` "
     "tells, or a first step of fixed length is too long. " + _ENTRY,
 )
-# The causes of a failure, in the order of their messages above, of which `FIRST` is the first. Zero
-# is no failure.
+# The causes of a failure, in the order of their messages above, of which `FIRST_RESULT` is the
+# first. Zero is no failure.
 _START, _NOT_FINITE, _TOO_FAR, _NOT_REACHED, _NO_STATE = range(1, 6)
 
 
-def is_off_manifold(problem: Problem, manifold: Manifold, y: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a residual at a state exceeds its tolerance, and also `√ε` of its scale. An integral
-    with a `value` of its own does not count: a solve may start elsewhere. Nor does one whose scale
-    is NaN, as that of the speed is at rest. `√ε` is usually much larger than the tolerance of a
-    projection, because initial states are often given with a few digits less. The scale contains
-    the changes of the state in a step, because all terms may be roundoff at one state, such as
-    those of `q · v = 0` where a component of a pendulum passes zero.
+def starts_off_manifold(
+    problem: Problem, manifold: Manifold, y: Float[Array, " n"]
+) -> Bool[Array, ""]:
+    """Whether a residual at a state exceeds its tolerance, and also `√ε` of its scale.
+
+    Integrals with a `value` of their own are not tested, because the first projection moves the
+    state there, nor those whose scale is NaN, as that of the speed is at rest. `√ε` is usually much
+    larger than the tolerance of a projection, because initial states are often given with a few
+    digits less. The scale contains the changes of the state in a step, because all terms may be
+    roundoff at one state, such as those of `q · v = 0` where a component of a pendulum passes zero.
     """
     g, jacobian = problem.linearise(y)
     scale = problem.scale(jacobian, y)
     limit = jnp.maximum(float(jnp.finfo(y.dtype).eps) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
-    counts = problem.per_residual([must_start_on(entry) for entry in entries])
+    counts = problem.per_residual([binds_start(entry) for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
     unknown = jnp.isnan(limit) & ~is_constraint
     return jnp.any(counts & ~unknown & ~(jnp.abs(g) <= limit))
 
 
-def must_start_on(entry: Any) -> bool:
+def binds_start(entry: Any) -> bool:
     """Whether the first state of a solve must be on an entry of the manifold."""
     return isinstance(entry, Constraint) or entry.value is None
 
@@ -80,21 +83,25 @@ def failure_cause(
     ok: Bool[Array, ""],
     cannot_start: Bool[Array, ""],
     values: Float[Array, " m"],
-    found: Float[Array, " n"],
+    must_be_finite: Float[Array, " n"],
     too_far: BoolScalarLike = False,
-    hopeless: BoolScalarLike = False,
+    unreachable: BoolScalarLike = False,
 ) -> Int[Array, ""]:
-    """Why a step failed, 0 if it did not. `found`: the state at its end, or the correction, which
-    must be finite. `hopeless`: a shorter step would hardly help."""
+    """Why a step failed, 0 if it did not.
+
+    - `must_be_finite`: the state at its end, or the correction.
+    - `unreachable`: whether the failure says that there is no state on the manifold, instead of
+      advising shorter steps.
+    """
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
-    finite, known = jnp.abs(jnp.sum(found)) < jnp.inf, jnp.all(jnp.isfinite(values))
-    cause = jnp.where(ok, 0, jnp.where(hopeless, _NO_STATE, _NOT_REACHED))
+    finite, known = jnp.abs(jnp.sum(must_be_finite)) < jnp.inf, jnp.all(jnp.isfinite(values))
+    cause = jnp.where(ok, 0, jnp.where(unreachable, _NO_STATE, _NOT_REACHED))
     cause = jnp.where(ok & too_far, _TOO_FAR, cause)
     cause = jnp.where(cannot_start, _START, cause)
     return jnp.where(known & (finite | (cause == 0)), cause, _NOT_FINITE)
 
 
-def is_final(
+def is_shortest_step(
     length: RealScalarLike,
     time: RealScalarLike,
     change: Float[Array, " n"],
@@ -108,23 +115,23 @@ def is_final(
     do, because many solves start at zero, beside which every step is long.
     """
     size, eps = jnp.abs(candidate), lambda x: float(jnp.finfo(jnp.result_type(x)).eps)
-    still = jnp.all(change <= ROUNDOFF * eps(size) * size)
-    return still | (jnp.abs(length) <= ROUNDOFF * eps(length) * time)
+    at_rest = jnp.all(change <= ROUNDOFF * eps(size) * size)
+    return at_rest | (jnp.abs(length) <= ROUNDOFF * eps(length) * time)
 
 
-def end_of_step(
+def masked_step(
     cause: Int[Array, ""], y: PyTree[Array], result: dfx.RESULTS
 ) -> tuple[Any, dfx.RESULTS]:
-    """The state and the result of a step. The state at the end of a step that failed is NaN: in a
-    batch its lane is evaluated until the last lane ends, and a projection of NaN ends after one
-    iteration. If the wrapped solver has failed by itself, its own `result` is kept, unless the step
-    could not start."""
+    """The state and the result of a step. The state at the end of a step that failed is NaN. In a
+    batch the lanes that have failed are evaluated until the last one ends, and with NaN each
+    projection ends after one iteration. If the wrapped solver has failed by itself, its own
+    `result` is kept, unless the step could not start."""
     failed = (cause > 0) & ((result == dfx.RESULTS.successful) | (cause == _START))
-    result = dfx.RESULTS.where(failed, member(FIRST - 1 + cause), result)
+    result = dfx.RESULTS.where(failed, member(FIRST_RESULT - 1 + cause), result)
     return jtu.tree_map(lambda y: jnp.where(cause > 0, jnp.nan, y), y), result
 
 
-def reported_error(cause: Int[Array, ""], final: Bool[Array, ""], error: Any) -> Any:
+def error_for_controller(cause: Int[Array, ""], final: Bool[Array, ""], error: Any) -> Any:
     """The error estimate that a step reports.
 
     diffrax looks at the result of a step only if the step is accepted. So a failed step reports a

@@ -18,7 +18,7 @@ from .._interpolation import MakeManifoldInterpolation, Packed
 from .._manifold import Constraint, check_manifold, named_entries
 from .._numerics.iterate import any_lane
 from .._numerics.metric import Diagonal, Identity
-from .._numerics.problem import Step, component_changes, step_length
+from .._numerics.problem import Step, component_changes, step_norm
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
@@ -27,20 +27,20 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._time import FieldTime
 from .._tree import ravel, tree_add, unravel, without_pattern
 from .failure import (
-    end_of_step,
+    binds_start,
+    error_for_controller,
     failure_cause,
-    is_final,
-    is_off_manifold,
-    must_start_on,
-    reported_error,
+    is_shortest_step,
+    masked_step,
+    starts_off_manifold,
 )
-from .state import State, initial_values, units_after
+from .state import State, initial_values, updated_units
 from .statistics import ProjectionStatistics
 from .target import Path, Target
 from .terms import (
     check_direction,
-    check_nested,
     check_projects_nothing,
+    check_root_finder,
     in_field_time,
     innermost,
     is_ode,
@@ -49,19 +49,19 @@ from .terms import (
 )
 from .wrapper import ForwardingSolver
 
-# So many changes of the state are taken from the dense output of a step. If the dense output is a
-# polynomial of at most this degree in time, as for most solvers, they span all changes in the step.
-_CHANGES = 4
+# The number of displacements `y(t) - y₀` that are taken from the dense output of a step. If it is a
+# polynomial of at most this degree in time, as for most solvers, they span all of them.
+_NUM_DISPLACEMENTS = 4
 
 
-def _nothing(t: RealScalarLike, y: Y, args: Args) -> Array:
+def _trivial(t: RealScalarLike, y: Y, args: Args) -> Array:
     """A constraint that every state satisfies."""
     return jnp.zeros(())
 
 
-def or_nothing(manifold: Manifold) -> Manifold:
+def or_trivial(manifold: Manifold) -> Manifold:
     """The manifold; if it is empty, because bounds alone are kept, that of all states."""
-    return manifold if named_entries(manifold) else Constraint(_nothing)
+    return manifold if named_entries(manifold) else Constraint(_trivial)
 
 
 @final
@@ -136,7 +136,7 @@ class ManifoldProjection(ForwardingSolver):
     """
 
     solver: dfx.AbstractSolver[Any]  # pyright: ignore[reportIncompatibleVariableOverride]
-    manifold: Manifold = eqx.field(converter=or_nothing)
+    manifold: Manifold = eqx.field(converter=or_trivial)
     projection: AbstractProjection = option(SimplifiedNewton())
     max_correction: RealScalarLike | None = option(None)
     keep_linear: bool = option(False, static=True)
@@ -149,10 +149,10 @@ class ManifoldProjection(ForwardingSolver):
                 "`diffrax.Tsit5()`, or of a network its solver, such as `DeepONetSolver(network)`."
             )
         check_projects_nothing(self.solver)
-        check_nested(self.solver)
+        check_root_finder(self.solver)
         check_projection(self.projection)
-        free = isinstance(self.manifold, Constraint) and self.manifold.fn is _nothing
-        check_manifold(() if free and not self.projection.has_bounds else self.manifold)
+        has_no_entries = isinstance(self.manifold, Constraint) and self.manifold.fn is _trivial
+        check_manifold(() if has_no_entries and not self.projection.has_bounds else self.manifold)
         check_direction(self.solver, self.projection)
         check_number("max_correction", self.max_correction, above=0.0)
 
@@ -182,25 +182,29 @@ class ManifoldProjection(ForwardingSolver):
         check_state(y0, kind=jnp.inexact)
         _, t = in_field_time(terms, t0)
         values, cancellation = initial_values(self.manifold, t, y0, args)
-        if self.keep_linear and values.size > 2 * _CHANGES:
+        if self.keep_linear and values.size > 2 * _NUM_DISPLACEMENTS:
             raise ValueError(
-                f"`keep_linear` has {2 * _CHANGES} directions, but `manifold` has {values.size} "
-                "scalar constraints. Leave it out, and add the linear invariants to `manifold`: "
-                "`diffrax_conserve.compare` tells which there are."
+                f"`keep_linear` has {2 * _NUM_DISPLACEMENTS} directions, but `manifold` has "
+                f"{values.size} scalar constraints. Leave it out, and add the linear invariants to "
+                "`manifold`: `diffrax_conserve.compare` tells which there are."
             )
         y = ravel(y0)
-        first_step = jnp.abs(jnp.atleast_1d(t1 - t0))
+        first_step_size = jnp.abs(jnp.atleast_1d(t1 - t0))
         statistics = ProjectionStatistics.zero(
             self.manifold, values.dtype, self.projection.has_bounds
         )
         return State(
             inner=self.solver.init(terms, t0, t1, y0, args),
-            constants=jnp.concatenate([values, cancellation, first_step.astype(values.dtype)]),
-            gained=jnp.zeros((2, values.size), values.dtype) if has_rates(self.manifold) else None,
+            constants=jnp.concatenate([values, cancellation, first_step_size.astype(values.dtype)]),
+            rate_integrals=jnp.zeros((2, values.size), values.dtype)
+            if has_rates(self.manifold)
+            else None,
             units=jnp.zeros_like(y),
-            end=jnp.full((), jnp.inf, y.dtype),
+            last_checksum=jnp.full((), jnp.inf, y.dtype),
             statistics=statistics,
-            preferred=first_changes(terms, t0, t1, y0, args) if self.keep_linear else None,
+            displacements=first_displacements(terms, t0, t1, y0, args)
+            if self.keep_linear
+            else None,
         )
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
@@ -215,35 +219,35 @@ class ManifoldProjection(ForwardingSolver):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
         state = self._checked(solver_state)
-        proposal = self._proposal(terms, t0, t1, y0, args, state.inner, made_jump)
-        step, candidate = proposal.step, proposal.candidate
-        # Dense output starts from this target, to integrate balances to any time in the step.
-        state, start = self._target(terms, state, proposal, y0, args)
-        target = start.advanced(step.t0, step.t1, proposal.path)
+        wrapped = self._wrapped_step(terms, t0, t1, y0, args, state.inner, made_jump)
+        step, candidate = wrapped.step, wrapped.candidate
+        # Dense output stores the target at the start, and integrates the rates from there.
+        state, start = self._target(terms, state, wrapped, y0, args)
+        target = start.add_rates(step.t0, step.t1, wrapped.path)
         y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
-        cause, final = self._verdict(start, state, proposal, y1, info, made_jump)
-        y1, result = end_of_step(cause, y1, proposal.result)
+        cause, final = self._verdict(start, state, wrapped, y1, info, made_jump)
+        y1, result = masked_step(cause, y1, wrapped.result)
         metric = start.metric(step.t0, step.y0)
         dense_info = dict(
-            inner=proposal.dense_info,
-            field_time=proposal.field_time,
+            inner=wrapped.dense_info,
+            field_time=wrapped.field_time,
             shift=y1 - candidate,
-            limit=step_length(step.y0, y1, metric),
+            limit=step_norm(step.y0, y1, metric),
             error=step.error if self.projection.sees_step else None,
             target=Packed(start),
         )
-        length = None if step.error is None else metric.length(step.error)
+        error_norm = None if step.error is None else metric.norm(step.error)
         state = dataclasses.replace(
             state,
-            inner=proposal.inner,
-            gained=target.gained,
-            end=_number_of(y1)[0],
-            statistics=state.statistics.add(info, length),
+            inner=wrapped.inner,
+            rate_integrals=target.rate_integrals,
+            last_checksum=_checksum(y1)[0],
+            statistics=state.statistics.add(info, error_norm),
         )
-        error = reported_error(cause, final, proposal.error)
+        error = error_for_controller(cause, final, wrapped.error)
         return unravel(y1, y0), error, dense_info, state, result
 
-    def _proposal(
+    def _wrapped_step(
         self,
         terms: PyTree[dfx.AbstractTerm],
         t0: RealScalarLike,
@@ -252,12 +256,12 @@ class ManifoldProjection(ForwardingSolver):
         args: Args,
         inner: Any,
         made_jump: BoolScalarLike,
-    ) -> "_Proposal":
+    ) -> "_WrappedStep":
         """The step of the wrapped solver. From here on states are vectors, and times those of the
         vector field."""
-        jumped = made_jump if self._needs_made_jump else True
+        inner_made_jump = made_jump if self._keeps_slope else True
         y1, error, dense_info, inner, result = self.solver.step(
-            terms, t0, t1, y0, args, inner, jumped
+            terms, t0, t1, y0, args, inner, inner_made_jump
         )
         field_time = FieldTime(time_direction(terms, t0))
         error_vector = None if error is None else ravel(error)
@@ -265,10 +269,10 @@ class ManifoldProjection(ForwardingSolver):
         # The dense output of the step is rarely needed, so it is made when it is called.
         interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         path = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
-        return _Proposal(step, ravel(y1), path, error, dense_info, inner, result, field_time)
+        return _WrappedStep(step, ravel(y1), path, error, dense_info, inner, result, field_time)
 
     @property
-    def _needs_made_jump(self) -> bool:
+    def _keeps_slope(self) -> bool:
         """Whether the wrapped solver gets the `made_jump` of diffrax, and not `True` in every step.
 
         A solver with the property "first same as last" keeps the slope at the candidate for the
@@ -298,7 +302,7 @@ class ManifoldProjection(ForwardingSolver):
         self,
         terms: PyTree[dfx.AbstractTerm],
         state: State,
-        proposal: "_Proposal",
+        wrapped: "_WrappedStep",
         like: Y,
         args: Args,
     ) -> tuple[State, Target]:
@@ -307,12 +311,12 @@ class ManifoldProjection(ForwardingSolver):
         Noise has no metric of motion: with noise the metric decides which equation is solved, and
         that must not depend on the path.
         """
-        step, candidate, preferred = proposal.step, proposal.candidate, state.preferred
+        step, candidate, displacements = wrapped.step, wrapped.candidate, state.displacements
         changes = component_changes(step.y0, candidate)
-        units = units_after(state.units, changes, candidate, like)
-        if preferred is not None:
-            new = changes_along(proposal.path, step)
-            preferred = jnp.concatenate([new, preferred[:_CHANGES]])
+        units = updated_units(state.units, changes, candidate, like)
+        if displacements is not None:
+            new = displacements_along(wrapped.path, step)
+            displacements = jnp.concatenate([new, displacements[:_NUM_DISPLACEMENTS]])
         target = Target(
             self.projection,
             self.manifold,
@@ -322,36 +326,45 @@ class ManifoldProjection(ForwardingSolver):
             args,
             changes=changes,
             factor=Diagonal(units) if is_ode(terms) else Identity(),
-            gained=state.gained,
-            preferred=preferred,
+            rate_integrals=state.rate_integrals,
+            displacements=displacements,
         )
-        state = dataclasses.replace(state, units=units, preferred=preferred)
-        return state, target.following(step.t0, step.y0)
+        state = dataclasses.replace(state, units=units, displacements=displacements)
+        return state, target.absorb_rate_roundoff(step.t0, step.y0)
 
     def _verdict(
         self,
         target: Target,
         state: State,
-        proposal: "_Proposal",
+        wrapped: "_WrappedStep",
         y1: Float[Array, " n"],
         info: ProjectionInfo,
         made_jump: BoolScalarLike,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
-        step, candidate = proposal.step, proposal.candidate
+        step, candidate = wrapped.step, wrapped.candidate
         cannot_start = self._cannot_start(target, state, step, made_jump)
-        length, first_step = step.t1 - step.t0, state.first_step.astype(jnp.result_type(step.t1))
-        time = jnp.maximum(jnp.abs(step.t1), first_step)
-        final = cannot_start | is_final(length, time, target.changes, candidate)
+        step_size, first_step_size = (
+            step.t1 - step.t0,
+            state.first_step_size.astype(jnp.result_type(step.t1)),
+        )
+        time = jnp.maximum(jnp.abs(step.t1), first_step_size)
+        final = cannot_start | is_shortest_step(step_size, time, target.changes, candidate)
         correction, too_far = y1 - candidate, jnp.asarray(False)
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
             limit = jnp.asarray(self.max_correction, correction.dtype)
-            limit = limit * step_length(step.y0, candidate, metric)
-            too_far = metric.length(correction) > limit
-        first = jnp.isinf(state.end)
-        given = info.ok, cannot_start, state.values, correction, too_far
-        return failure_cause(*given, hopeless=first | final), final
+            limit = limit * step_norm(step.y0, candidate, metric)
+            too_far = metric.norm(correction) > limit
+        is_first_step = jnp.isinf(state.last_checksum)
+        return failure_cause(
+            info.ok,
+            cannot_start,
+            state.values,
+            must_be_finite=correction,
+            too_far=too_far,
+            unreachable=is_first_step | final,
+        ), final
 
     def _cannot_start(
         self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
@@ -359,38 +372,38 @@ class ManifoldProjection(ForwardingSolver):
         """Whether a conserved value is not finite, or a step starts off the manifold. The second is
         tested if the state is not the end of the last step, as at the start of a solve, and after a
         jump of the vector field, because a constraint may jump with it."""
-        lost = ~jnp.all(jnp.isfinite(state.values))
+        invalid_values = ~jnp.all(jnp.isfinite(state.values))
         entries = [entry for _, entry in named_entries(self.manifold)]
-        if not any(map(must_start_on, entries)):
-            return lost
-        # A sum can have the roundoff of another order. A state that is NaN has failed already.
-        number, size = _number_of(step.y0)
+        if not any(map(binds_start, entries)):
+            return invalid_values
+        # XLA may add in another order, so we compare up to roundoff. A state that is NaN, for which
+        # the comparison is false, has failed already.
+        checksum, size = _checksum(step.y0)
         roundoff = ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size
-        fresh = (jnp.abs(number - state.end) > roundoff) | made_jump
+        starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
         problem = target.problem(step.t0, step.y0)
         off = lax.cond(
-            any_lane(fresh),
-            lambda: is_off_manifold(problem, entries, step.y0),
+            any_lane(starts_elsewhere),
+            lambda: starts_off_manifold(problem, entries, step.y0),
             lambda: jnp.asarray(False),
         )
-        return lost | (fresh & off)
+        return invalid_values | (starts_elsewhere & off)
 
 
-def _number_of(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """A number by which a state is recognised, a sum of its components in general position, and the
-    sum of their sizes."""
+def _checksum(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """A weighted sum of the components, by which a state is recognised, and that of their sizes."""
     terms = without_pattern(y.size, y.dtype) * y
     return jnp.sum(terms), jnp.sum(jnp.abs(terms))
 
 
-def first_changes(
+def first_displacements(
     terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
 ) -> Float[Array, "k n"]:
-    """Two steps of Euler's method, in the place of the changes in the step before the first. A
-    method of one stage has a single slope in its first step, along which what is conserved hardly
-    changes, so that a correction would undo the step."""
+    """The displacements of two steps of Euler's method, because no step comes before the first. A
+    method of one stage has a single slope in its first step, along which integrals hardly change,
+    so that a correction in the span of it would undo the step."""
     y = ravel(y0)
-    changes = jnp.zeros((2 * _CHANGES, y.size), y.dtype)
+    changes = jnp.zeros((2 * _NUM_DISPLACEMENTS, y.size), y.dtype)
     if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):
         return changes
     control = terms.contr(t0, t1)
@@ -400,7 +413,7 @@ def first_changes(
     return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
 
 
-class _Proposal(NamedTuple):
+class _WrappedStep(NamedTuple):
     """What the wrapped solver proposes.
 
     - `step`: the step, as a projection sees it.
@@ -421,11 +434,11 @@ class _Proposal(NamedTuple):
     field_time: FieldTime
 
 
-def changes_along(path: Path, step: Step) -> Float[Array, "k n"]:
+def displacements_along(path: Path, step: Step) -> Float[Array, "k n"]:
     """The changes of the state from the start of a step, in the dense output of the wrapped solver,
     after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
     that they are orthogonal to each `c` with `c · f = 0`."""
-    shares = (k / _CHANGES for k in range(1, _CHANGES + 1))
+    shares = (k / _NUM_DISPLACEMENTS for k in range(1, _NUM_DISPLACEMENTS + 1))
     times = (step.t0 + share * (step.t1 - step.t0) for share in shares)
     return jnp.stack([path(t) - step.y0 for t in times])
 

@@ -19,24 +19,25 @@ class State(eqx.Module):
     """What later steps need.
 
     - `inner`: the state of the wrapped solver.
-    - `constants`: `values` and `cancellation` as in a `Target`, and `first_step`, the length of the
-      first step that was tried, a scale of the times of the solve. They are one array, because in a
-      gradient each array of the state is saved and restored.
-    - `gained`: as in a `Target`.
-    - `units`: the unit of each component in the metric of motion, see `units_after`, the largest of
-      all steps so far; zero before the first step.
-    - `end`: a number by which the state is recognised at which the last step ended; infinite before
-      the first step.
-    - `preferred`: the changes of the state in the last two steps, if linear invariants are kept.
+    - `constants`: `values` and `cancellation` as in a `Target`, and `first_step_size`, the
+      length of the first step that was tried, a scale of the times of the solve. They are one
+      array, because in a gradient each array of the state is saved and restored.
+    - `rate_integrals`: as in a `Target`.
+    - `units`: the unit of each component in the metric of motion, see `updated_units`, the largest
+      of all steps so far; zero before the first step.
+    - `last_checksum`: a checksum of the state at the end of the last step; infinite before the
+      first step.
+    - `displacements`: those in the last two steps, as in a `Target`; `None` unless linear
+      invariants are kept.
     """
 
     inner: Any
     constants: Float[Array, " constants"]
-    gained: Float[Array, "2 m"] | None
+    rate_integrals: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
-    end: Float[Array, ""]
+    last_checksum: Float[Array, ""]
     statistics: ProjectionStatistics
-    preferred: Float[Array, "k n"] | None = None
+    displacements: Float[Array, "k n"] | None = None
 
     @property
     def values(self) -> Float[Array, " m"]:
@@ -47,21 +48,20 @@ class State(eqx.Module):
         return self.constants[len(self.constants) // 2 : -1]
 
     @property
-    def first_step(self) -> Float[Array, ""]:
+    def first_step_size(self) -> Float[Array, ""]:
         return self.constants[-1]
 
 
 def initial_values(
     manifold: Manifold, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """The values that a solve from here conserves, and the part of their scales that the gradients
-    do not show."""
+    """The values that a solve from here conserves, and the `cancellation` of their scales."""
     values = conserved_values(manifold, t, y, args)
     _, _, cancellation = cancellation_scale(manifold, t, y, args)
     return ravel(values).astype(cancellation.dtype), cancellation
 
 
-def units_after(
+def updated_units(
     units: Float[Array, " n"], change: Float[Array, " n"], end: Float[Array, " n"], like: Y
 ) -> Float[Array, " n"]:
     """The units of the metric of motion after a step to `end` that changed the components by

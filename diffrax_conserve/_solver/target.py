@@ -1,4 +1,4 @@
-"""What a step of a solver aims at: the manifold, with the conserved values of the solve."""
+"""The manifold, the conserved values and the metric with which a step is projected."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._balance import integrated_rates
 from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._numerics.metric import AbstractFactor, Preferring, factor_of
+from .._numerics.metric import AbstractFactor, PreferredSubspace, factor_of
 from .._numerics.problem import Problem, Step, problem_of
 from .._projection.base import AbstractProjection, adapted
 from .._tree import ravel, tree_stop_gradient, unravel
@@ -22,19 +22,19 @@ Path = Callable[[RealScalarLike], Float[Array, " n"]]
 
 class Target(eqx.Module):
     """Everything that a projection needs except the time and the candidate. Within a step only
-    `gained` depends on the time, see `advanced`, so that dense output uses the same target. Times
-    are those of the vector field, and states are vectors.
+    `rate_integrals` depends on the time, see `add_rates`, so that dense output uses the same
+    target. Times are those of the vector field, and states are vectors.
 
     - `like`: the shapes and dtypes of the state.
     - `values`: the conserved values at the start of the solve.
-    - `cancellation`: the part of the scales that the gradients do not show.
+    - `cancellation`: as in a `Problem`.
     - `changes`: how far each component moves in the step.
     - `factor`: the factor of the metric where the projection has none of its own: of the metric of
       motion, or with noise of the Euclidean one.
-    - `gained`: in the first row the integrals of the rates since the start of the solve, in the
-      second what rounding has added to them; `None` if no entry has a rate.
-    - `preferred`: changes of the state in this step and the last one, if corrections are to stay
-      in their span; see `Preferring`.
+    - `rate_integrals`: in the first row the integrals of the rates since the start of the solve, in
+      the second the compensation, what rounding has added to them; `None` if no entry has a rate.
+    - `displacements`: how the state has moved within this step and the last one, at a few times, if
+      corrections are to stay in their span; see `PreferredSubspace`.
     """
 
     projection: AbstractProjection
@@ -45,26 +45,26 @@ class Target(eqx.Module):
     args: Args
     changes: Float[Array, " n"]
     factor: AbstractFactor
-    gained: Float[Array, "2 m"] | None = None
-    preferred: Float[Array, "k n"] | None = None
+    rate_integrals: Float[Array, "2 m"] | None = None
+    displacements: Float[Array, "k n"] | None = None
 
-    def advanced(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "Target":
+    def add_rates(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "Target":
         """The target at a time `end` in a step, given the `path` of the solution from `start`.
 
         The integral over the step is added to the integrals so far by compensated summation (W.
         Kahan, "Further remarks on reducing truncation errors", *Comm. ACM* 8 (1965), 40). So their
         roundoff does not grow with the number of steps.
         """
-        if self.gained is None:
+        if self.rate_integrals is None:
             return self
-        last, excess = self.gained
+        last, compensation = self.rate_integrals
         states = lambda t: unravel(path(t), self.like)  # noqa: E731
         more = integrated_rates(self.manifold, start, end, states, self.args)
-        more = ravel(more).astype(last.dtype) - excess
+        more = ravel(more).astype(last.dtype) - compensation
         total = last + more
-        return dataclasses.replace(self, gained=jnp.stack([total, (total - last) - more]))
+        return dataclasses.replace(self, rate_integrals=jnp.stack([total, (total - last) - more]))
 
-    def following(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
+    def absorb_rate_roundoff(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
         """The target with values that a state `y` on the manifold can keep.
 
         The rate of a balance may vanish, for example when friction has stopped a pendulum. Its
@@ -73,16 +73,16 @@ class Target(eqx.Module):
         tolerance, but more than half of what counts as noise, the conserved value is moved until
         the residual is half of what counts as noise.
         """
-        if self.gained is None:
+        if self.rate_integrals is None:
             return self
         problem, y = tree_stop_gradient((self.problem(t, y), y))
         residual, jacobian = problem.linearise(y)
         limit = problem.tolerance(problem.scale(jacobian, y))
-        within = (self.gained[0] != 0) & (jnp.abs(residual) <= limit)
+        within = (self.rate_integrals[0] != 0) & (jnp.abs(residual) <= limit)
         noise = NOISE / ROUNDOFF * limit / 2
         follow = jnp.where(within, residual - jnp.clip(residual, -noise, noise), 0)
-        # The next integral is added minus the second row, so that it is larger by `follow`.
-        return dataclasses.replace(self, gained=self.gained.at[1].add(-follow))
+        # `add_rates` subtracts the second row from the next integral, which is larger by `follow`.
+        return dataclasses.replace(self, rate_integrals=self.rate_integrals.at[1].add(-follow))
 
     def problem(
         self, t: RealScalarLike, y: Float[Array, " n"], step: Step | None = None
@@ -90,19 +90,19 @@ class Target(eqx.Module):
         """The problem at a time, with the metric at a state, and the step if the projection uses
         it."""
         values, cancellation = self.values, self.cancellation
-        if self.gained is not None:
-            # An energy that has been lost leaves a small value, which is a difference of large
-            # numbers and has their roundoff. So its scale is at least that of the start.
-            values = values + self.gained[0]
-            lost = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
-            cancellation = cancellation + lost
+        if self.rate_integrals is not None:
+            # After dissipation a conserved value is a small difference of large numbers, and has
+            # their roundoff. So its scale is at least that of the start.
+            values = values + self.rate_integrals[0]
+            decrease = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
+            cancellation = cancellation + decrease
         step = step if self.projection.sees_step else None
         fields = dict(factor=self.factor, changes=self.changes, step=step)
         problem = problem_of(self.manifold, values, t, self.like, self.args, cancellation, **fields)
         problem = adapted(problem, self.projection, y)
-        if self.preferred is None:
+        if self.displacements is None:
             return problem
-        factor = Preferring.along(problem.factor, self.preferred)
+        factor = PreferredSubspace.spanned_by(problem.factor, self.displacements)
         return dataclasses.replace(problem, factor=factor)
 
     def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:

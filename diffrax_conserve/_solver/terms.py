@@ -66,7 +66,7 @@ def _nested(terms: Any) -> list[Any]:
 
 
 def check_projects_nothing(solver: dfx.AbstractSolver) -> None:
-    for layer in _layers(solver):
+    for layer in _wrapped_solvers(solver):
         if hasattr(layer, "manifold") and hasattr(layer, "projection"):
             raise ValueError(
                 f"`solver` contains a `{type(layer).__name__}`, whose manifold an outer projection "
@@ -75,7 +75,7 @@ def check_projects_nothing(solver: dfx.AbstractSolver) -> None:
             )
 
 
-def check_nested(solver: dfx.AbstractSolver) -> None:
+def check_root_finder(solver: dfx.AbstractSolver) -> None:
     inner = innermost(solver)
     if (
         inner is not solver
@@ -91,7 +91,7 @@ def check_nested(solver: dfx.AbstractSolver) -> None:
 
 
 def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) -> None:
-    if projection.needs_signed_error and dfx.HalfSolver in map(type, _layers(solver)):
+    if projection.needs_signed_error and dfx.HalfSolver in map(type, _wrapped_solvers(solver)):
         raise ValueError(
             '`AlongLine(direction="error")` moves along the error estimate, which '
             "`diffrax.HalfSolver` gives without its sign. Wrap a solver with an embedded method, "
@@ -100,11 +100,11 @@ def check_direction(solver: dfx.AbstractSolver, projection: AbstractProjection) 
 
 
 def innermost(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    return _layers(solver)[-1]
+    return _wrapped_solvers(solver)[-1]
 
 
-def _layers(solver: Any) -> list[dfx.AbstractSolver]:
+def _wrapped_solvers(solver: Any) -> list[dfx.AbstractSolver]:
     """The solver, the one that it wraps, and so on."""
     # Not by `isinstance`, which diffrax forwards to the wrapped solver.
     wraps = issubclass(type(solver), dfx.AbstractWrappedSolver)
-    return [solver, *(_layers(solver.solver) if wraps else [])]
+    return [solver, *(_wrapped_solvers(solver.solver) if wraps else [])]

@@ -16,7 +16,7 @@ from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
-from .._numerics.iterate import after_test, iterate, keep_done
+from .._numerics.iterate import iterate, keep_done, left_after_test
 from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
 from .._numerics.rows import solve_dense
 from .._projection.closed_form import ClosedForm
@@ -206,15 +206,15 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
         # A sum of products, because a matrix product rounds differently in a batch.
         return target - jnp.sum(weights * state(multiplier), axis=1)
 
-    def advance(multiplier: Array, counter: Array) -> tuple[Array, Array]:
+    def advance(multiplier: Array, tests_left: Array) -> tuple[Array, Array]:
         left = missing(multiplier)
         met = jnp.all(jnp.abs(left) <= small * jnp.abs(target))
-        counter = after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), counter)
+        tests_left = left_after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), tests_left)
         gram = jnp.sum(weights[:, None, :] * weights * state(multiplier), axis=2)
         change = solve_dense(gram, left)
         # An exponent changes by at most one in a step.
         longest = jnp.max(jnp.abs(jnp.sum(change[:, None] * weights, axis=0)), initial=1)
-        return keep_done(counter, multiplier + change / longest, multiplier), counter
+        return keep_done(tests_left, multiplier + change / longest, multiplier), tests_left
 
     # Errors of ten per cent decrease as 1e-1, 5e-3, 1e-5, 1e-10, roundoff.
     newton = lambda guess: iterate(advance, guess, max_steps=MAX_STEPS)  # noqa: E731

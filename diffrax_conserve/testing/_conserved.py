@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Real
 from .._balance import refuse_rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import check_manifold, conserved_values, evaluate, has_value, named_entries
-from .._numerics.problem import measure
+from .._numerics.problem import residuals_and_scales
 from .._options import check_solution
 from .._projection.project import given_values
 from .._tree import ravel, tree_all_finite
@@ -259,8 +259,8 @@ def _measure(
     padded = jnp.isinf(t)
     t, y = jtu.tree_map(lambda a, b: jnp.where(padded, b.astype(a.dtype), a), (t, y), (t0, y0))
     target = conserved_values(manifold, t0, y0, args) if values is None else values
-    _, initial_scale = measure(manifold, target, t0, y0, args)
-    residual, scale = map(ravel, measure(manifold, target, t, y, args))
+    _, initial_scale = residuals_and_scales(manifold, target, t0, y0, args)
+    residual, scale = map(ravel, residuals_and_scales(manifold, target, t, y, args))
     return (
         tree_all_finite((t, y)),
         jnp.where(padded, 0, residual),

@@ -100,7 +100,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     y0, args = jax.tree.map(jnp.float32, (Y0, (1e-6, 0.0)))
     saveat = dfx.SaveAt(t1=True, solver_state=True)
     solution = solve(y0, args, t1=200.0, dt0=0.01, saveat=saveat, max_steps=None)
-    gained = float(solution.solver_state.gained[0, 0])
+    gained = float(solution.solver_state.rate_integrals[0, 0])
     options = dict(manifold=None, solver=dfx.Dopri8()) | PRECISE
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, **options)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))

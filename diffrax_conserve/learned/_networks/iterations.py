@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ..._numerics.problem import Problem, relative
+from ..._numerics.problem import Problem, relative_to_scale
 from .trainable import LayerSchedule
 
 
@@ -35,7 +35,7 @@ def iterated(
         g, jacobian = problem.linearise(y)
         if radius is None:
             return multipliers - rows.gram(rows).solve(g)
-        ratio = relative(g, problem.scale(jacobian, y))
+        ratio = relative_to_scale(g, problem.scale(jacobian, y))
         damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
         damped = 1 + damping * jnp.eye(g.size, dtype=dtype)
         gram = jtu.tree_map(lambda matrix: matrix * damped, jacobian.gram(rows))

@@ -10,7 +10,7 @@ from ..._balance import refuse_rates
 from ..._constants import MAX_STEPS
 from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
-from ..._numerics.implicit import MultiplierSystem, solution
+from ..._numerics.implicit import MultiplierSystem, implicit_solution
 from ..._numerics.iterate import Solved, damped_newton
 from ..._numerics.problem import Problem, problem_of
 from ..._options import check_counts
@@ -80,7 +80,9 @@ class ConservativeLayer(eqx.Module):
             # The start is on the manifold, so the functions are finite there.
             known = ravel(start[1]).astype(vector.dtype)
             options: Any = dict(iteration=_damped_along, max_steps=MAX_STEPS)
-            projected = solution(MultiplierSystem(problem, vector, fallback=known, **options))
+            projected = implicit_solution(
+                MultiplierSystem(problem, vector, fallback=known, **options)
+            )
             y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._numerics.implicit import root
-from ..._numerics.iterate import Solved, after_step, iterate, keep_done
+from ..._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import is_ode
@@ -216,13 +216,13 @@ def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
 def _newton(equations: StepEquations, start: Coefficients) -> Solved:
     tolerance = jnp.finfo(start.dtype).eps ** (2 / 3)
 
-    def advance(coefficients: Array, counter: Array) -> tuple[Array, Array]:
+    def advance(coefficients: Array, tests_left: Array) -> tuple[Array, Array]:
         states, residual = equations.states(coefficients), equations.residual(coefficients)
         change = equations.solve_linear(equations.jacobians(states), residual)
         size = jnp.max(jnp.abs(equations.states(change) - equations.y0))
         settled = size <= tolerance * jnp.max(jnp.abs(states))
-        then = after_step(settled, jnp.isfinite(size), counter)
-        return keep_done(counter, coefficients - change, coefficients), then
+        then = left_after_step(settled, jnp.isfinite(size), tests_left)
+        return keep_done(tests_left, coefficients - change, coefficients), then
 
     found = iterate(advance, start, max_steps=_MAX_STEPS)
     return found._replace(y=jnp.where(found.ok, found.y, 0))
